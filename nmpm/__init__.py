@@ -1,0 +1,31 @@
+"""Grid-based emulators of particle simulations, trained with Lightning, with a zoo of pretrained models.
+
+The public names are imported when first used, so that `import nmpm` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nmpm.emulator import Emulator as Emulator
+    from nmpm.particles import Particles as Particles
+    from nmpm.rollout import rollout as rollout
+    from nmpm.scene import Scene as Scene
+    from nmpm.zoo import Zoo as Zoo
+
+__version__ = "0.1.0"
+__all__ = ["Emulator", "Particles", "Scene", "Zoo", "rollout"]
+
+_HOMES = {
+    "Emulator": "nmpm.emulator",
+    "Particles": "nmpm.particles",
+    "Scene": "nmpm.scene",
+    "Zoo": "nmpm.zoo",
+    "rollout": "nmpm.rollout",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'nmpm' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,144 @@
+"""What a dataset's scenes have in common: where particles may be, what they are made of, what varies.
+
+A `Scene` says which grid channels a model needs and nothing else does: a scene of one material in a box has a
+velocity, a volume fraction and a wall channel; gravity becomes channels only where it varies, obstacles only where
+there are any.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+from nmpm.errors import ConfigError
+
+Boundary = Literal["wall", "periodic"]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The fixed facts of a family of scenes, in the dataset's physical units.
+
+    Args:
+        bounds: Where particles may be, (lower, upper) per axis, in domain length.
+        domain: What the grid covers, (lower, upper) per axis; contains the bounds and, at walls, a wall layer.
+        dt: Time between frames, in seconds.
+        materials: Names of the moving materials, in the order of their channels.
+        particle_volume: Volume of one particle, in length ** dim.
+        boundary: "wall" or "periodic" per axis; walls everywhere when left out.
+        gravity: External acceleration in length per second squared; None where it is not known.
+        gravity_varies: Whether each trajectory has its own gravity, so that the model must be told.
+        obstacles: Whether there are particles that do not move.
+
+    Raises:
+        ConfigError: if the facts contradict each other.
+    """
+
+    bounds: tuple[Interval, ...]
+    domain: tuple[Interval, ...]
+    dt: float
+    materials: tuple[str, ...]
+    particle_volume: float
+    boundary: tuple[Boundary, ...] = ()
+    gravity: tuple[float, ...] | None = None
+    gravity_varies: bool = False
+    obstacles: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.boundary:
+            object.__setattr__(self, "boundary", ("wall",) * self.dim)
+        self._check()
+
+    def _check(self) -> None:
+        if self.dim not in (1, 2, 3):
+            raise ConfigError(f"A scene has 1, 2 or 3 axes; bounds {self.bounds} have {self.dim}.")
+        for name in ("domain", "boundary") + (("gravity",) if self.gravity is not None else ()):
+            if len(getattr(self, name)) != self.dim:
+                raise ConfigError(
+                    f"Scene.{name} = {getattr(self, name)} needs one entry for each of {self.dim} axes."
+                )
+        for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(self.bounds, self.domain, strict=True)):
+            if not (outer_low <= low < high <= outer_high and math.isfinite(outer_high - outer_low)):
+                raise ConfigError(
+                    f"On axis {axis} the domain {(outer_low, outer_high)} must contain the bounds {(low, high)}."
+                )
+        for kind in self.boundary:
+            if kind not in get_args(Boundary):
+                raise ConfigError(f"Boundary {kind!r} is not one of {', '.join(get_args(Boundary))}.")
+        if not (self.dt > 0 and self.particle_volume > 0):
+            raise ConfigError(f"dt = {self.dt} and particle_volume = {self.particle_volume} must be positive.")
+        if not self.materials or len(set(self.materials)) != len(self.materials):
+            raise ConfigError(f"A scene needs at least one material, each named once; got {self.materials}.")
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions."""
+        return len(self.bounds)
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Whether each axis wraps."""
+        return tuple(kind == "periodic" for kind in self.boundary)
+
+    @property
+    def walled(self) -> bool:
+        """Whether the domain shows a solid: a wall layer or obstacles."""
+        return self.obstacles or self.bounds != self.domain
+
+    @property
+    def input_channels(self) -> tuple[str, ...]:
+        """Names of the grid channels the processor sees, in order."""
+        axes = "xyz"[: self.dim]
+        names = [f"{m}.velocity_{a}" for m in self.materials for a in axes]
+        names += [f"{m}.volume" for m in self.materials]
+        names += ["solid"] if self.walled else []
+        names += [f"gravity_{a}" for a in axes] if self.gravity_varies else []
+        return tuple(names)
+
+    @property
+    def output_channels(self) -> tuple[str, ...]:
+        """Names of the velocity channels the processor gives for each frame, in order."""
+        return self.input_channels[: self.dim * len(self.materials)]
+
+    def material_index(self, name: str) -> int:
+        """Channel position of a material.
+
+        Raises:
+            ConfigError: if the scene has no such material.
+        """
+        if name not in self.materials:
+            raise ConfigError(f"Material {name!r} is unknown to this scene, which has {', '.join(self.materials)}.")
+        return self.materials.index(name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The scene as plain lists, strings and numbers."""
+        plain = dataclasses.asdict(self)
+        return {key: _listed(value) for key, value in plain.items()}
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Self:
+        """The scene that `to_dict` described.
+
+        Raises:
+            ConfigError: if a key is unknown or missing.
+        """
+        known = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(plain) - known)
+        if unknown:
+            raise ConfigError(f"Scene has no key {', '.join(unknown)}; it has {', '.join(sorted(known))}.")
+        try:
+            return cls(**{key: _tupled(value) for key, value in plain.items()})
+        except TypeError as error:
+            raise ConfigError(f"Scene cannot be read: {error}.") from error
+
+
+def _listed(value: Any) -> Any:
+    return [_listed(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(_tupled(item) for item in value) if isinstance(value, tuple | list) else value
