@@ -1,0 +1,40 @@
+"""Trivial predictors: what an emulator must beat for its error to mean something."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+
+
+def still(particles: Particles, frames: int) -> Tensor:
+    """Nothing moves: (B, frames, N, D) positions."""
+    return particles.position.unsqueeze(1).expand(-1, frames, -1, -1)
+
+
+def free_fall(scene: Scene, particles: Particles, frames: int) -> Tensor:
+    """Every particle flies alone under the scene's gravity and stops at the walls: (B, frames, N, D) positions.
+
+    Frames are equal steps, v_i = v_0 + i g and x_i = x_{i-1} + v_i, as the data's velocities are differences. A
+    component that reaches a bound stays there.
+    """
+    step = torch.arange(1, frames + 1, device=particles.position.device).view(1, -1, 1, 1)
+    start, velocity = particles.position.unsqueeze(1), particles.velocity.unsqueeze(1)
+    gravity = particles.gravity[:, None, None]
+    path = start + velocity * step + gravity * (step * (step + 1) / 2)
+    columns = [
+        path[..., axis] if scene.periodic[axis] else _stopped(path[..., axis], *scene.bounds[axis])
+        for axis in range(scene.dim)
+    ]
+    return torch.stack(columns, dim=-1)
+
+
+def _stopped(path: Tensor, low: float, high: float) -> Tensor:
+    """A path (B, T, N) held at the first bound it reaches."""
+    below = (path <= low).cummax(dim=1).values
+    above = (path >= high).cummax(dim=1).values
+    first_below = below & (below.cumsum(1) >= above.cumsum(1))
+    path = torch.where(below | above, torch.full_like(path, high), path)
+    return torch.where(first_below, torch.full_like(path, low), path)

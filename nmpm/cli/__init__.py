@@ -1,0 +1,72 @@
+"""The command line. `nmpm --help` answers at once: what a command needs is imported when the command runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+
+from nmpm import __version__
+from nmpm.errors import NmpmError
+
+COMMANDS = {
+    "fit": ("nmpm.cli.training", "Train an emulator, then test the best checkpoint once."),
+    "validate": ("nmpm.cli.training", "Roll a checkpoint out over the valid split."),
+    "test": ("nmpm.cli.training", "Roll a checkpoint out over the test split; write table, picture and animation."),
+    "predict": ("nmpm.cli.training", "Roll a checkpoint out over the test split and write the trajectories."),
+    "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
+    "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
+    "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
+}
+
+USAGE = """usage: nmpm COMMAND [OPTIONS]
+
+Emulators of particle simulations on a grid: train them, judge them by rollouts, use pretrained ones.
+
+commands:
+{commands}
+
+first steps:
+  nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
+  nmpm fit --config goop.yaml --ckpt_path last go on after an interruption
+  nmpm fit --config waterdrop.yaml --data.path FOLDER
+                                               train on recorded data
+  nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
+  nmpm render out.h5                           draw what came out
+
+Add --help to any command for its options; fit --print_config prints a whole configuration.
+A --config that is not a file in the working directory is looked up among the shipped ones: {configs}.
+"""
+
+
+def usage() -> str:
+    """The top-level help."""
+    from nmpm.shipped import config_names
+
+    lines = [f"  {name:<10} {summary}" for name, (_, summary) in COMMANDS.items()]
+    return USAGE.format(commands="\n".join(lines), configs=", ".join(config_names()))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; errors that a user can mend are printed without a traceback.
+
+    Returns:
+        The exit status: 0 for success, 1 for an error, 2 for a wrong call.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help", "help"):
+        sys.stdout.write(usage())
+        return 0 if words else 2
+    if words[0] == "--version":
+        sys.stdout.write(f"nmpm {__version__}\n")
+        return 0
+    if words[0] not in COMMANDS:
+        sys.stderr.write(f"nmpm: there is no command {words[0]!r}; there are {', '.join(COMMANDS)}. See nmpm --help.\n")
+        return 2
+    command: Callable[[list[str]], None] = import_module(COMMANDS[words[0]][0]).run
+    try:
+        command(words)
+    except NmpmError as error:
+        sys.stderr.write(f"nmpm {words[0]}: {error}\n")
+        return 1
+    return 0

@@ -1,0 +1,93 @@
+"""`nmpm fit | validate | test | predict`: LightningCLI with the data's scene flowing into the model."""
+
+from __future__ import annotations
+
+import operator
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import set_parsing_settings
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.errors import ConfigError
+from nmpm.report import Report
+from nmpm.shipped import find_config
+from nmpm.training import EmulatorModule
+
+
+class EmulatorCLI(LightningCLI):
+    """Links what the model needs from the data and the other way round, and ends a fit with a test."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults(
+            {
+                "checkpoint.filename": "best",
+                "checkpoint.monitor": "valid/mse",
+                "checkpoint.save_last": True,
+                "checkpoint.enable_version_counter": False,
+            }
+        )
+        parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
+        parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
+        config = self.config_init[self.subcommand]["trainer"]
+        root = config.get("default_root_dir") or "runs/default"
+        kwargs["default_root_dir"] = root
+        if config.get("logger") in (None, True):
+            kwargs["logger"] = [CSVLogger(root, name="", version=""), TensorBoardLogger(root, name="", version="")]
+            kwargs.setdefault("callbacks", []).append(LearningRateMonitor("step"))
+        kwargs.setdefault("callbacks", []).append(Report())
+        return super().instantiate_trainer(**kwargs)
+
+    def _parse_ckpt_path(self) -> None:
+        """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""
+
+    def before_fit(self) -> None:
+        """Refuse to write a new run over an old one.
+
+        Raises:
+            ConfigError: if the folder holds a run and no checkpoint is to be continued.
+        """
+        folder = Path(self.trainer.default_root_dir)
+        if not self.config_init[self.subcommand].get("ckpt_path") and (folder / "checkpoints" / "last.ckpt").exists():
+            raise ConfigError(
+                f"{folder} already holds a run. Go on with it by adding --ckpt_path last, or choose another folder "
+                "with --trainer.default_root_dir."
+            )
+
+    def after_fit(self) -> None:
+        """Test the best checkpoint, once."""
+        checkpoint = self.trainer.checkpoint_callback
+        best = getattr(checkpoint, "best_model_path", "")
+        self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=best or None)
+
+
+def run(words: list[str]) -> None:
+    """Run a training command, e.g. ["fit", "--config", "goop.yaml"]."""
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    EmulatorCLI(
+        EmulatorModule,
+        TrajectoryDataModule,
+        args=_with_shipped_configs(words),
+        seed_everything_default=0,
+        parser_kwargs={"parser_mode": "omegaconf+"},
+        save_config_kwargs={"overwrite": True},
+    )
+
+
+def _with_shipped_configs(words: list[str]) -> list[str]:
+    """Replace the name behind each --config by the file that it means."""
+    found = list(words)
+    for index, word in enumerate(words):
+        if word in ("--config", "-c") and index + 1 < len(words):
+            found[index + 1] = str(find_config(words[index + 1]))
+        elif word.startswith("--config="):
+            found[index] = f"--config={find_config(word.removeprefix('--config='))}"
+    return found

@@ -1,0 +1,110 @@
+"""The regular grid that covers a scene's domain.
+
+n cells along an axis of extent L are L / n wide exactly and have their centres at lower + (i + 1/2) L / n. Inside the
+emulator, positions are in cells from the lower corner and velocities in cells per frame ("grid units"), so that
+neither the origin nor the unit of length matters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from nmpm.errors import ConfigError
+from nmpm.scene import Scene
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid of cells over a box.
+
+    Args:
+        shape: Number of cells along each axis, (x, y[, z]).
+        lower: The box's lower corner, in domain length.
+        spacing: Cell width along each axis, in domain length.
+        periodic: Whether each axis wraps.
+    """
+
+    shape: tuple[int, ...]
+    lower: tuple[float, ...]
+    spacing: tuple[float, ...]
+    periodic: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, scene: Scene, cells: int | Sequence[int]) -> Self:
+        """The grid over a scene's domain.
+
+        Args:
+            scene: The scene to cover.
+            cells: Cells along each axis, or along the longest one (the others follow, cells as square as they can be).
+
+        Raises:
+            ConfigError: if `cells` is not positive or names another number of axes than the scene has.
+        """
+        extents = [high - low for low, high in scene.domain]
+        shape = _shape(cells, extents)
+        return cls(
+            shape=shape,
+            lower=tuple(low for low, _ in scene.domain),
+            spacing=tuple(extent / n for extent, n in zip(extents, shape, strict=True)),
+            periodic=scene.periodic,
+        )
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Number of cells in all."""
+        return math.prod(self.shape)
+
+    @property
+    def cell_volume(self) -> float:
+        """Volume of a cell, in length ** dim."""
+        return math.prod(self.spacing)
+
+    def to_cells(self, position: Tensor) -> Tensor:
+        """Positions (..., D) in domain length → cells from the lower corner, float32.
+
+        The origin is taken off in the positions' own precision, so that float64 input far from 0 keeps its digits.
+        """
+        return ((position - position.new_tensor(self.lower)) / position.new_tensor(self.spacing)).float()
+
+    def to_cell_displacement(self, displacement: Tensor) -> Tensor:
+        """Displacements (..., D) in domain length → cells, float32."""
+        return (displacement / displacement.new_tensor(self.spacing)).float()
+
+    def to_length(self, cells: Tensor) -> Tensor:
+        """Positions (..., D) in cells → domain length."""
+        return cells * cells.new_tensor(self.spacing) + cells.new_tensor(self.lower)
+
+    def to_displacement(self, cells: Tensor) -> Tensor:
+        """Displacements (..., D) in cells → domain length."""
+        return cells * cells.new_tensor(self.spacing)
+
+    def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Cell centres along an axis, (n,), in domain length."""
+        return self.lower[axis] + (torch.arange(self.shape[axis], dtype=dtype) + 0.5) * self.spacing[axis]
+
+
+def _shape(cells: int | Sequence[int], extents: Sequence[float]) -> tuple[int, ...]:
+    if isinstance(cells, int):
+        width = max(extents) / max(cells, 1)
+        shape = tuple(max(1, round(extent / width)) for extent in extents)
+        valid = cells >= 1
+    else:
+        shape = tuple(cells)
+        valid = len(shape) == len(extents) and min(shape) >= 1
+    if not valid:
+        raise ConfigError(
+            f"A grid of {cells} cells does not fit a scene with {len(extents)} axes: give one positive number, "
+            "or one for each axis."
+        )
+    return shape

@@ -1,0 +1,65 @@
+"""The contract of grid processors: image-to-image networks that know nothing about particles.
+
+A processor comes in two parts. The *recipe*, a frozen dataclass of hyperparameters, is what configurations name and
+checkpoints store. Its `build` makes the *network* once the scene has said how many channels and axes there are:
+
+    forward(grid: (B, C_in, *S)) -> (B, m, C_out, *S)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from nmpm.grid import Grid
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """What the scene and the emulator demand of a network.
+
+    Args:
+        in_channels: C_in, channels of the grid state.
+        out_channels: C_out, velocity channels for each predicted frame.
+        frames: m, frames predicted by one call (time bundling).
+        periodic: Whether each space axis wraps; its length is the number of axes.
+    """
+
+    in_channels: int
+    out_channels: int
+    frames: int
+    periodic: tuple[bool, ...]
+
+    @property
+    def dim(self) -> int:
+        """Number of space axes."""
+        return len(self.periodic)
+
+
+class GridProcessor(nn.Module, ABC):
+    """A network from a grid state to the next m grid velocity fields."""
+
+    @abstractmethod
+    def forward(self, grid: Tensor) -> Tensor:
+        """Map (B, C_in, *S) to (B, m, C_out, *S)."""
+
+
+class Processor(ABC):
+    """A processor's recipe. Subclasses are frozen dataclasses of plain hyperparameters."""
+
+    @abstractmethod
+    def build(self, layout: GridLayout) -> GridProcessor:
+        """The network for a layout, freshly initialised from torch's random state.
+
+        Raises:
+            ConfigError: if the hyperparameters cannot make one.
+        """
+
+    def check_grid(self, grid: Grid) -> None:  # noqa: B027 (a processor without demands need say nothing)
+        """Say no, with the mend, to a grid that the network cannot take. Any grid is welcome unless overridden.
+
+        Raises:
+            ConfigError: if the grid does not suit.
+        """

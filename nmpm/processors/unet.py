@@ -1,0 +1,108 @@
+"""The paper's U-Net: pixel-wise perceptrons around convolutional levels of one width, skips concatenated.
+
+Source: Rochman-Sharabi, Lewin & Louppe, arXiv 2408.15753, section 3 and appendix; the parameter counts are those of
+its published code (875,280 at 4 input and 2 output channels, m = 8, depth 3; 1,117,200 at depth 4). That code's count
+holds one convolution of twice the width that its forward pass never reaches; here it joins the coarsest level with
+its skip, like its siblings above, so that each parameter works.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
+from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.convolution import Convolution, Upsampling, pointwise
+
+
+@dataclass(frozen=True)
+class UNet(Processor):
+    """Recipe of the paper's U-Net.
+
+    Args:
+        width: Channels of every level.
+        depth: Number of down-samplings by 2.
+        kernel: Width of the convolutions, odd.
+        perceptron: Widths of the hidden layers of the pixel-wise encoder and decoders.
+    """
+
+    width: int = 64
+    depth: int = 3
+    kernel: int = 3
+    perceptron: tuple[int, ...] = (64, 64, 64)
+
+    def build(self, layout: GridLayout) -> GridProcessor:
+        if self.width < 1 or self.depth < 0 or self.kernel % 2 == 0:
+            raise ConfigError(f"UNet needs width >= 1, depth >= 0 and an odd kernel; got {self}.")
+        return UNetNetwork(self, layout)
+
+    def check_grid(self, grid: Grid) -> None:
+        multiple = 2**self.depth
+        if min(grid.shape) < multiple:
+            raise ConfigError(
+                f"A grid of {grid.shape} cells is too small for a U-Net of depth {self.depth}, which halves it "
+                f"{self.depth} times: use at least {multiple} cells along each axis, or a smaller depth."
+            )
+        for axis, (cells, wraps) in enumerate(zip(grid.shape, grid.periodic, strict=True)):
+            if wraps and cells % multiple:
+                raise ConfigError(
+                    f"Axis {axis} is periodic, so its {cells} cells must be a multiple of {multiple} for a U-Net of "
+                    f"depth {self.depth}; the nearest is {round(cells / multiple) * multiple or multiple}."
+                )
+
+
+class UNetNetwork(GridProcessor):
+    """Level by level down, then up: a convolution at each, a strided one between."""
+
+    def __init__(self, recipe: UNet, layout: GridLayout) -> None:
+        super().__init__()
+        width, periodic = recipe.width, layout.periodic
+        self.multiple = 2**recipe.depth
+        hidden = recipe.perceptron
+        self.encoder = pointwise([layout.in_channels, *hidden, width], layout.dim)
+        self.down = nn.ModuleList(
+            Convolution(width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1)
+        )
+        self.coarsen = nn.ModuleList(Convolution(width, width, 4, periodic, stride=2) for _ in range(recipe.depth))
+        self.up = nn.ModuleList(
+            Convolution(2 * width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1)
+        )
+        self.refine = nn.ModuleList(Upsampling(width, periodic) for _ in range(recipe.depth))
+        self.decoders = nn.ModuleList(
+            pointwise([width, *hidden, layout.frames], layout.dim) for _ in range(layout.out_channels)
+        )
+
+    def forward(self, grid: Tensor) -> Tensor:
+        shape = grid.shape[2:]
+        hidden = self.encoder(_pad_to_multiple(grid, self.multiple))
+        skips = []
+        for convolve, coarsen in zip(self.down, self.coarsen, strict=False):
+            skips.append(_activate(convolve(hidden)))
+            hidden = _activate(coarsen(skips[-1]))
+        skips.append(hidden)
+        hidden = _activate(self.down[-1](hidden))
+        for level in range(len(self.refine), -1, -1):
+            hidden = _activate(self.up[level](torch.cat([hidden, skips[level]], dim=1)))
+            if level > 0:
+                hidden = _activate(self.refine[level - 1](hidden))
+        fields = torch.stack([decoder(hidden) for decoder in self.decoders], dim=2)
+        return fields[(..., *(slice(n) for n in shape))]
+
+
+def _activate(hidden: Tensor) -> Tensor:
+    return functional.leaky_relu(hidden, inplace=True)
+
+
+def _pad_to_multiple(grid: Tensor, multiple: int) -> Tensor:
+    """Extend each axis at its upper end to a multiple of cells, repeating the last one."""
+    for axis in range(2, grid.dim()):
+        missing = -grid.shape[axis] % multiple
+        if missing:
+            last = grid.narrow(axis, grid.shape[axis] - 1, 1)
+            grid = torch.cat([grid, last.expand(*grid.shape[:axis], missing, *grid.shape[axis + 1 :])], dim=axis)
+    return grid

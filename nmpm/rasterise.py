@@ -1,0 +1,73 @@
+"""From particles to the grid state that the processor sees: per material the mean velocity and the volume fraction,
+then whatever else the scene requires (`Scene.input_channels`)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nmpm.grid import Grid
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+from nmpm.transfer import Transfer
+
+
+def grid_state(
+    scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, cells: Tensor, velocity: Tensor, solid: Tensor
+) -> Tensor:
+    """The grid state in grid units, (B, C_in, *S).
+
+    Args:
+        scene, grid, transfer: What to rasterise for, onto and with.
+        particles: Gives materials, mask and gravity.
+        cells: (B, N, D) positions in cells.
+        velocity: (B, N, D) in cells per frame.
+        solid: (B, C_solid, *S).
+    """
+    membership = _membership(particles, len(scene.materials))
+    momentum = (membership.unsqueeze(-1) * velocity.unsqueeze(-2)).flatten(-2)
+    sums = transfer.p2g(torch.cat([momentum, membership], dim=-1), cells, grid)
+    momentum, count = sums.split([momentum.shape[-1], membership.shape[-1]], dim=1)
+    mean = momentum / _positive(count).repeat_interleave(scene.dim, dim=1)
+    volume = count * (scene.particle_volume / grid.cell_volume)
+    parts = [mean, volume, solid]
+    if scene.gravity_varies:
+        gravity = grid.to_cell_displacement(particles.gravity)
+        parts.append(gravity.reshape(*gravity.shape, *(1,) * grid.dim).expand(-1, -1, *grid.shape))
+    return torch.cat(parts, dim=1)
+
+
+def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Particles) -> Tensor:
+    """The share of each cell taken by walls and obstacles, (B, 1, *S) in [0, 1]; (B, 0, *S) where a scene has none."""
+    batch = particles.position.shape[0]
+    if not scene.walled:
+        return particles.position.new_zeros(batch, 0, *grid.shape)
+    walls = wall_fraction(scene, grid).to(particles.position.device)
+    if not scene.obstacles:
+        return walls.expand(batch, 1, *grid.shape)
+    ones = particles.obstacle_mask.unsqueeze(-1).float()
+    count = transfer.p2g(ones, grid.to_cells(particles.obstacle), grid)
+    return (walls + count * (scene.particle_volume / grid.cell_volume)).clamp(max=1.0)
+
+
+def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
+    """The share of each cell beyond the scene's bounds, (*S), exact for the box."""
+    free = torch.ones((), dtype=torch.float64)
+    for axis, (low, high) in enumerate(scene.bounds):
+        centre = grid.centres(axis)
+        half = grid.spacing[axis] / 2
+        overlap = (centre + half).clamp(max=high) - (centre - half).clamp(min=low)
+        share = (overlap / grid.spacing[axis]).clamp(0, 1)
+        free = free.unsqueeze(-1) * share
+    return (1 - free).float()
+
+
+def _membership(particles: Particles, materials: int) -> Tensor:
+    """(B, N, materials): one at each real particle's material, zero elsewhere."""
+    index = torch.arange(materials, device=particles.material.device)
+    return ((particles.material.unsqueeze(-1) == index) & particles.mask.unsqueeze(-1)).float()
+
+
+def _positive(count: Tensor) -> Tensor:
+    """Counts that can be divided by; empty cells have no momentum, so any positive number gives them velocity zero."""
+    return torch.where(count > 0, count, torch.ones_like(count))

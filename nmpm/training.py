@@ -1,0 +1,191 @@
+"""The LightningModule: unrolled training, full rollouts for validation and test, beside the trivial predictors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningModule
+from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from nmpm.baselines import free_fall, still
+from nmpm.decoders import Decoder, Residual
+from nmpm.emulator import Emulator
+from nmpm.losses import position_error
+from nmpm.metrics import EarthMover, RolloutError
+from nmpm.particles import Particles, Window
+from nmpm.processors import Processor, UNet
+from nmpm.rollout import rollout, unroll
+from nmpm.scene import Scene
+from nmpm.schedules import Schedule
+from nmpm.specs import from_spec, to_spec
+from nmpm.transfer import Linear, Transfer
+
+OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  # (jsonargparse knows this form)
+
+CALIBRATION_BATCHES = 4
+
+
+def adam(parameters: Iterable[Tensor]) -> Optimizer:
+    """The paper's optimizer."""
+    return torch.optim.Adam(parameters, lr=1e-3)
+
+
+class EmulatorModule(LightningModule):
+    """Trains an emulator on windows and judges it by rollouts.
+
+    Args:
+        scene: The facts of the scenes; from the command line it comes from the data.
+        cells: Grid cells along the longest axis, or along each.
+        frames: m, frames predicted by one call of the processor (time bundling).
+        unroll: K, calls that a training step backpropagates through; the training horizon is m K frames.
+        transfer: How particles and grid see each other.
+        processor: The network on the grid.
+        decoder: What the network's output means.
+        optimizer: Makes the optimizer from the parameters.
+        schedule: The learning rate's course over the training.
+        position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
+        grid_noise: Standard deviation of the noise on the normalised grid state in training.
+        horizons: Frames at which rollout errors are reported, beside the full rollout.
+        emd: Every how many frames to compute the exact earth mover's distance in tests; 0 for never (it is slow).
+        seed: Of the noise.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        cells: int | list[int] = 64,
+        frames: int = 8,
+        unroll: int = 2,
+        transfer: Transfer = Linear(),  # noqa: B008 (frozen)
+        processor: Processor = UNet(),  # noqa: B008
+        decoder: Decoder = Residual(),  # noqa: B008
+        optimizer: OptimizerCallable = adam,
+        schedule: Schedule = Schedule(),  # noqa: B008
+        position_noise: float = 0.0,
+        grid_noise: float = 0.0,
+        horizons: Sequence[int] = (1, 8, 32, 100),
+        emd: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        scene = scene if isinstance(scene, Scene) else Scene.from_dict(scene)
+        transfer, decoder = from_spec(transfer, Transfer), from_spec(decoder, Decoder)
+        processor = from_spec(processor, Processor)
+        self.emulator = Emulator(scene, cells, frames, transfer, processor, decoder, grid_noise)
+        self.unroll = unroll
+        self.make_optimizer = optimizer
+        self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
+        self.position_noise = position_noise
+        self.seed = seed
+        self.save_hyperparameters(
+            {
+                "scene": scene.to_dict(),
+                "cells": list(self.emulator.grid.shape),
+                "frames": frames,
+                "unroll": unroll,
+                "transfer": to_spec(transfer),
+                "processor": to_spec(processor),
+                "decoder": to_spec(decoder),
+                "schedule": to_spec(self.schedule)["init_args"],
+                "position_noise": position_noise,
+                "grid_noise": grid_noise,
+                "horizons": list(horizons),
+                "emd": emd,
+                "seed": seed,
+            },
+            logger=False,
+        )
+        names = ("model", "still", "free_fall")
+        self.valid_errors = nn.ModuleDict({name: RolloutError(horizons) for name in names})
+        self.test_errors = nn.ModuleDict({name: RolloutError(horizons) for name in names})
+        self.earth_mover = EarthMover(emd) if emd else None
+
+    def setup(self, stage: str) -> None:
+        if stage == "fit" and not self.emulator.calibrated:
+            loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]
+            self.emulator.calibrate(list(islice(loader, CALIBRATION_BATCHES)))
+
+    def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
+        """Make the step's randomness a function of the step, so that a resumed run repeats it."""
+        entropy = (self.seed, self.global_rank, self.trainer.fit_loop.total_batch_idx)
+        torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+
+    def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        bundles = unroll(self.emulator, self._perturbed(batch.initial), self.unroll)
+        predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
+        loss = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
+        self.log("train/loss", loss, prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
+        self._judge(batch, self.valid_errors)
+
+    def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        predicted = self._judge(batch, self.test_errors)
+        if self.earth_mover is not None:
+            self.earth_mover.update(predicted, batch.target, batch.mask, batch.material)
+        return predicted
+
+    def predict_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        """(B, T - 2, N, D) predicted positions."""
+        return rollout(self.emulator, batch.initial, batch.target.shape[1])
+
+    def on_validation_epoch_start(self) -> None:
+        _reset(self.valid_errors)
+
+    def on_test_epoch_start(self) -> None:
+        _reset(self.test_errors)
+
+    def on_validation_epoch_end(self) -> None:
+        self._report("valid", self.valid_errors)
+
+    def on_test_epoch_end(self) -> None:
+        self._report("test", self.test_errors)
+        if self.earth_mover is not None:
+            self.log_dict({f"test/{name}": value for name, value in self.earth_mover.compute().items()})
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        optimizer = self.make_optimizer(self.emulator.parameters())
+        total = self.trainer.estimated_stepping_batches
+        scheduler = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: self.schedule.factor(max(step, self._clock() * total), total)
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def _clock(self) -> float:
+        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine."""
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, Timer) and callback._duration:
+                return min(callback.time_elapsed() / callback._duration, 1.0)
+        return 0.0
+
+    def _perturbed(self, particles: Particles) -> Particles:
+        if self.position_noise <= 0:
+            return particles
+        noise = self.position_noise * torch.randn_like(particles.position)
+        return particles.moved(particles.position + noise, particles.velocity)
+
+    def _judge(self, batch: Window, errors: nn.ModuleDict) -> Tensor:
+        frames = batch.target.shape[1]
+        predicted = rollout(self.emulator, batch.initial, frames)
+        errors["model"].update(predicted, batch.target, batch.mask)
+        errors["still"].update(still(batch.initial, frames), batch.target, batch.mask)
+        errors["free_fall"].update(free_fall(self.emulator.scene, batch.initial, frames), batch.target, batch.mask)
+        return predicted
+
+    def _report(self, split: str, errors: nn.ModuleDict) -> None:
+        prefixes = {"model": split, "still": f"{split}/still", "free_fall": f"{split}/free_fall"}
+        for kind, metric in errors.items():
+            for name, value in metric.compute().items():
+                self.log(f"{prefixes[kind]}/{name}", value, prog_bar=(kind, name) == ("model", "mse"))
+
+
+def _reset(errors: nn.ModuleDict) -> None:
+    for metric in errors.values():
+        metric.reset()

@@ -1,0 +1,124 @@
+"""Transfers between particles and grid: the contract, and the two operations every kernel shares.
+
+A kernel gives each particle p a few nodes j and weights w_pj with sum_j w_pj = 1. Then
+
+    scatter (p2g)  S(v)_j = sum_p w_pj v_p          sums over particles, e.g. of mass and momentum
+    gather  (g2p)  G(f)_p = sum_j w_pj f_j          interpolation of a grid field
+
+With one kernel both ways the two are adjoint, <S(v), f> = <v, G(f)>. Positions are in cells (see `nmpm.grid`).
+Kernel support beyond the last centre of a wall axis is folded onto the border node, so that the weights sum to one
+everywhere; on a periodic axis it wraps.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nmpm.grid import Grid
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """Where each particle touches the grid.
+
+    Args:
+        node: (B, N, J) int64, flat index of the J nodes of each particle (last axis fastest).
+        weight: (B, N, J), summing to one over J.
+    """
+
+    node: Tensor
+    weight: Tensor
+
+
+class Transfer(ABC):
+    """How particles and grid see each other. Subclasses are stateless and give the two stencils."""
+
+    @abstractmethod
+    def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
+        """Nodes and weights for p2g of particles at `cells` (B, N, D)."""
+
+    @abstractmethod
+    def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
+        """Nodes and weights for g2p at `cells` (B, N, D)."""
+
+    def p2g(self, values: Tensor, cells: Tensor, grid: Grid) -> Tensor:
+        """Sum particle values (B, N, C) at `cells` (B, N, D) onto the nodes, (B, C, *S)."""
+        summed = scatter(self.scatter_stencil(cells, grid), values, grid.size)
+        return summed.transpose(1, 2).unflatten(2, grid.shape)
+
+    def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
+        """Interpolate a grid field (B, C, *S) at `cells` (B, N, D), (B, N, C)."""
+        return gather(self.gather_stencil(cells, grid), field.flatten(2).transpose(1, 2))
+
+
+def scatter(stencil: Stencil, values: Tensor, size: int) -> Tensor:
+    """Sum particle values onto nodes.
+
+    Args:
+        stencil: Of N particles and J nodes each.
+        values: (B, N, C).
+        size: Number of nodes.
+
+    Returns:
+        (B, size, C): sum_p w_pj v_p.
+    """
+    batch, count, channels = values.shape
+    touches = stencil.node.shape[-1]
+    source = (stencil.weight.unsqueeze(-1) * values.unsqueeze(2)).reshape(batch, count * touches, channels)
+    index = stencil.node.reshape(batch, count * touches, 1).expand(-1, -1, channels)
+    return values.new_zeros(batch, size, channels).scatter_add(1, index, source)
+
+
+def gather(stencil: Stencil, field: Tensor) -> Tensor:
+    """Interpolate a node field at particles.
+
+    Args:
+        stencil: Of N particles and J nodes each.
+        field: (B, size, C).
+
+    Returns:
+        (B, N, C): sum_j w_pj f_j.
+    """
+    batch, count, touches = stencil.node.shape
+    channels = field.shape[-1]
+    index = stencil.node.reshape(batch, count * touches, 1).expand(-1, -1, channels)
+    values = field.gather(1, index).reshape(batch, count, touches, channels)
+    return torch.einsum("bnj,bnjc->bnc", stencil.weight, values)
+
+
+def tensor_product(base: Tensor, weights: list[Tensor], grid: Grid) -> Stencil:
+    """The stencil of a kernel that is a product over axes.
+
+    Args:
+        base: (B, N, D) int64, lowest node touched along each axis, before folding or wrapping.
+        weights: K tensors (B, N, D): the one-dimensional weights of nodes base, base + 1, … along each axis.
+        grid: Gives shape and which axes wrap.
+
+    Returns:
+        A stencil of K ** D nodes.
+    """
+    batch, count, dim = base.shape
+    node = base.new_zeros(batch, count, 1)
+    weight = weights[0].new_ones(batch, count, 1)
+    along = torch.stack(weights, dim=-1)
+    steps = torch.arange(len(weights), device=base.device)
+    for axis in range(dim):
+        extent = grid.shape[axis]
+        index = base[..., axis, None] + steps
+        index = index.remainder(extent) if grid.periodic[axis] else index.clamp(0, extent - 1)
+        node = (node.unsqueeze(-1) * extent + index.unsqueeze(-2)).flatten(-2)
+        weight = (weight.unsqueeze(-1) * along[..., axis, None, :]).flatten(-2)
+    return Stencil(node, weight)
+
+
+def inside(cells: Tensor, grid: Grid) -> Tensor:
+    """Positions (B, N, D) brought into the domain: wrapped on periodic axes, held at the faces of wall axes."""
+    columns = [
+        column.remainder(extent) if wraps else column.clamp(0, extent)
+        for column, extent, wraps in zip(cells.unbind(-1), grid.shape, grid.periodic, strict=True)
+    ]
+    return torch.stack(columns, dim=-1)

@@ -1,0 +1,48 @@
+"""Linear (cloud-in-cell, bilinear, trilinear) transfers: one kernel both ways, 2 nodes per axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from nmpm.grid import Grid
+from nmpm.transfer.base import Stencil, Transfer, gather, inside, tensor_product
+
+
+def linear_stencil(cells: Tensor, grid: Grid) -> Stencil:
+    """The 2 ** D nodes around each particle, weighted by nearness: w = prod_d (1 - |x_d - c_d|)."""
+    offset = inside(cells, grid) - 0.5
+    base = offset.detach().floor()
+    upper = offset - base
+    return tensor_product(base.long(), [1 - upper, upper], grid)
+
+
+def linear_g2p(field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
+    """Gather a grid field (B, C, *S) at `cells` (B, N, D) with the linear kernel, (B, N, C).
+
+    In 2-D and 3-D without periodic axes this is torch's own sampler, several times faster than the stencil on a CPU.
+    """
+    if grid.dim == 1 or any(grid.periodic):
+        return gather(linear_stencil(cells, grid), field.flatten(2).transpose(1, 2))
+    extent = torch.tensor(grid.shape, dtype=cells.dtype, device=cells.device)
+    unit = (2 * cells / extent - 1).flip(-1)  # the sampler wants the last axis first
+    points = unit.reshape(unit.shape[0], *(1,) * (grid.dim - 1), *unit.shape[1:])
+    sampled = functional.grid_sample(field, points, mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled.flatten(2).transpose(1, 2)
+
+
+@dataclass(frozen=True)
+class Linear(Transfer):
+    """Linear interpolation both ways: p2g and g2p are adjoint, g2p is exact on linear fields in the interior."""
+
+    def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
+        return linear_stencil(cells, grid)
+
+    def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
+        return linear_stencil(cells, grid)
+
+    def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
+        return linear_g2p(field, cells, grid)
