@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ class EmulatorCLI(LightningCLI):
                 "checkpoint.enable_version_counter": False,
             }
         )
+        parser.set_defaults({"weights_only": True} if "weights_only" in parser else {})
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
@@ -66,16 +68,18 @@ class EmulatorCLI(LightningCLI):
         """Test the best checkpoint, once."""
         checkpoint = self.trainer.checkpoint_callback
         best = getattr(checkpoint, "best_model_path", "")
-        self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=best or None)
+        self.trainer.test(
+            self.model, datamodule=self.datamodule, ckpt_path=best or None, verbose=False, weights_only=True
+        )
 
 
 def run(words: list[str]) -> None:
     """Run a training command, e.g. ["fit", "--config", "goop.yaml"]."""
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    sys.argv = ["nmpm", *_with_shipped_configs(words)]  # Lightning warns of `args` that differ from the command line
     EmulatorCLI(
         EmulatorModule,
         TrajectoryDataModule,
-        args=_with_shipped_configs(words),
         seed_everything_default=0,
         parser_kwargs={"parser_mode": "omegaconf+"},
         save_config_kwargs={"overwrite": True},

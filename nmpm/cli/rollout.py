@@ -1,0 +1,106 @@
+"""`nmpm rollout NAME --frames 400 --out out.h5`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nmpm import __version__
+from nmpm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from nmpm.particles import Particles
+    from nmpm.scene import Scene
+    from nmpm.zoo import Pretrained
+
+BOUNDARY = 3
+
+
+def run(words: list[str]) -> None:
+    """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
+    parser = argparse.ArgumentParser(
+        prog="nmpm rollout",
+        description="Roll a pretrained model out, from thrown blocks of particles or from a recorded trajectory.",
+    )
+    parser.add_argument("name", help="a model of the zoo, see nmpm zoo list")
+    parser.add_argument("--frames", type=int, default=400, help="frames to predict (default: 400)")
+    parser.add_argument("--out", type=Path, default=Path("out.h5"), help="file to write (default: out.h5)")
+    parser.add_argument("--data", type=Path, help="start from a trajectory of this HDF5 file (native layout)")
+    parser.add_argument("--trajectory", type=int, default=0, help="which trajectory of --data (default: the first)")
+    parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
+    parser.add_argument("--particles", type=int, default=1000, help="about how many to throw (default: 1000)")
+    parser.add_argument("--blocks", type=int, default=1, help="into how many blocks (default: 1)")
+    chosen = parser.parse_args(words[1:])
+    if chosen.frames < 1:
+        raise ConfigError(f"--frames {chosen.frames}: ask for at least 1 frame.")
+    if not chosen.out.parent.is_dir():
+        raise ConfigError(f"--out {chosen.out}: the folder {chosen.out.parent} does not exist.")
+    from nmpm.zoo import Zoo
+
+    model = Zoo.load(chosen.name)
+    if chosen.data is None:
+        try:
+            state = model.example(chosen.seed, chosen.particles, chosen.blocks)
+        except ValueError as error:
+            raise ConfigError(f"{error} Use fewer --particles or more --blocks.") from error
+    else:
+        state = _recorded(model, chosen.data, chosen.trajectory)
+    _write(model, chosen.name, state, chosen.frames, chosen.out)
+    sys.stdout.write(f"wrote {chosen.frames + 2} frames of {state.position.shape[1]} particles to {chosen.out}\n")
+
+
+def _recorded(model: Pretrained, path: Path, index: int) -> Particles:
+    """The state at the second frame of a recorded trajectory."""
+    from nmpm.data.format import Split, read_metadata
+    from nmpm.data.recording import Recordings, collate
+
+    metadata = read_metadata(path.parent, _family(model))
+    recordings = Recordings(Split(path), metadata, model.scene)
+    if not 0 <= index < len(recordings):
+        raise ConfigError(f"--trajectory {index}: {path} holds trajectories 0 … {len(recordings) - 1}.")
+    return collate([recordings[index]], [0], 2, model.scene).initial
+
+
+def _family(model: Pretrained) -> str | None:
+    from nmpm.data.families import FAMILIES
+
+    known = set(FAMILIES["deepmind"].types.values())
+    return "deepmind" if set(model.scene.materials) <= known else None
+
+
+def _write(model: Pretrained, name: str, state: Particles, frames: int, path: Path) -> None:
+    """The two frames of the start, then the prediction, with what is needed to draw it."""
+    import torch
+    from rich.progress import track
+
+    from nmpm.data.format import Trajectory, write_split
+    from nmpm.rollout import stream
+
+    start = torch.stack([state.position - state.velocity, state.position], dim=1)
+    bundles = -(-frames // model.emulator.frames)
+    parts = [start, *track(stream(model.emulator, state, frames), "rollout", total=bundles, transient=True)]
+    position = torch.cat(parts, dim=1)[0].numpy()
+    obstacle = np.broadcast_to(state.obstacle[0].numpy(), (len(position), *state.obstacle.shape[1:]))
+    types = _type_ids(model.scene)
+    ids = np.array(list(types), dtype=np.int64)[state.material[0].numpy()]
+    ids = np.concatenate([ids, np.full(obstacle.shape[1], BOUNDARY)])
+    attributes = {
+        "generator": f"nmpm {__version__}, predicted by the zoo model {name}",
+        "scene": json.dumps(model.scene.to_dict()),
+        "particle_types": json.dumps({**types, BOUNDARY: "boundary"}),
+        "static_types": np.array([BOUNDARY]),
+    }
+    write_split(path, [Trajectory(np.concatenate([position, obstacle], axis=1), ids, attributes)])
+
+
+def _type_ids(scene: Scene) -> dict[int, str]:
+    """DeepMind's id for each of the scene's materials, in order; beyond 100 for materials that it does not have."""
+    from nmpm.data.families import FAMILIES
+
+    ids = {name: number for number, name in FAMILIES["deepmind"].types.items()}
+    return {ids.get(name, 100 + index): name for index, name in enumerate(scene.materials)}

@@ -1,0 +1,122 @@
+"""The embedded datasets: nothing to download, simulated on first use.
+
+`ensure("goop")` gives the folder of a dataset in the native format, and makes it if it is not there yet.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from nmpm.data.generate import Request, generate
+from nmpm.errors import DataError
+from nmpm.scene import Scene
+from nmpm.sim import load_preset, scene_of
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An embedded dataset.
+
+    Args:
+        name: By which it is asked for.
+        preset: Name of the simulator's preset.
+        counts: Trajectories in each of the splits train, valid and test.
+        seed: From which the seed of every trajectory is derived.
+    """
+
+    name: str
+    preset: str
+    counts: Mapping[str, int]
+    seed: int = 0
+
+
+_ENTRIES = MappingProxyType(
+    {entry.name: entry for entry in (Entry("goop", "goop", MappingProxyType({"train": 200, "valid": 10, "test": 30})),)}
+)
+
+
+def dataset_home() -> Path:
+    """The cache folder: the environment variable `NMPM_HOME`, else `~/.cache/nmpm`."""
+    return Path(os.environ.get("NMPM_HOME") or Path.home() / ".cache" / "nmpm").expanduser()
+
+
+def catalog() -> tuple[str, ...]:
+    """Names of the embedded datasets."""
+    return tuple(_ENTRIES)
+
+
+def describe(name: str) -> Entry:
+    """What an embedded dataset is made of.
+
+    Raises:
+        DataError: if there is none of that name.
+    """
+    if name not in _ENTRIES:
+        raise DataError(
+            f"No embedded dataset is called {name!r}; there are: {', '.join(_ENTRIES)}. For data of your own, give the "
+            "path of their folder."
+        )
+    return _ENTRIES[name]
+
+
+def scene(name: str) -> Scene:
+    """The facts that a dataset's trajectories share, without making it.
+
+    Raises:
+        DataError: if there is none of that name.
+    """
+    return scene_of(load_preset(describe(name).preset))
+
+
+def request_of(
+    name: str, counts: Mapping[str, int] | None = None, frames: int | None = None, seed: int | None = None
+) -> Request:
+    """What `ensure` simulates for the same arguments.
+
+    Raises:
+        DataError: if there is no dataset of that name.
+        ConfigError: if the counts or frames cannot be.
+    """
+    entry = describe(name)
+    preset = load_preset(entry.preset)
+    preset = dataclasses.replace(preset, frames=preset.frames if frames is None else frames)
+    return Request(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
+
+
+def folder_of(name: str, request: Request) -> Path:
+    """Where a request is kept: the name and a fingerprint of all that determines the data."""
+    fingerprint = hashlib.sha256(json.dumps(request.to_dict(), sort_keys=True).encode()).hexdigest()[:10]
+    return dataset_home() / "datasets" / f"{name}-{fingerprint}"
+
+
+def ensure(
+    name: str,
+    counts: Mapping[str, int] | None = None,
+    frames: int | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+) -> Path:
+    """The folder of an embedded dataset, simulated now if it is not there yet.
+
+    Args:
+        name: One of `catalog()`.
+        counts: Trajectories in each of the splits train, valid and test; the dataset's own when left out.
+        frames: Simulated frames of a trajectory; the preset's own when left out.
+        seed: From which the seed of every trajectory is derived; the dataset's own when left out.
+        workers: Trajectories simulated at a time; as many as there are processor cores when left out.
+
+    Raises:
+        DataError: if there is no dataset of that name, or its folder cannot be written.
+        ConfigError: if the counts or frames cannot be.
+    """
+    request = request_of(name, counts, frames, seed)
+    folder = folder_of(name, request)
+    generate(request.preset, folder, request.counts, request.seed, workers)
+    return folder

@@ -1,0 +1,232 @@
+"""Trajectories on disk, in the layout that LagrangeBench shares.
+
+A dataset is a folder with `metadata.json` and `train.h5`, `valid.h5`, `test.h5`. In each file there is a group per
+trajectory, named `00000`, `00001`, …, with the datasets `position` (T, N, D), float32, and `particle_type` (N,),
+integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from nmpm.data.atomic import replacing
+from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
+from nmpm.data.metadata import Metadata as Metadata
+from nmpm.data.metadata import read_metadata as read_metadata
+from nmpm.data.metadata import write_metadata as write_metadata
+from nmpm.errors import DataError
+
+SPLITS = ("train", "valid", "test")
+_CHUNK_BYTES = 2**20
+_LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One recorded run.
+
+    Args:
+        position: (T, N, D) float32, in domain length.
+        particle_type: (N,) int64 type ids.
+        attributes: What else is known of it, e.g. `gravity` (D,) in length/s², `seed`.
+
+    Raises:
+        DataError: if the shapes do not fit together or a position is not a finite number.
+    """
+
+    position: np.ndarray
+    particle_type: np.ndarray
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_arrays(self.position, self.particle_type, "trajectory")
+        object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float32))
+        object.__setattr__(self, "particle_type", np.asarray(self.particle_type, dtype=np.int64))
+        _check_finite(self.position, "trajectory", first_frame=0)
+
+
+def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
+    """Writes trajectories, in order, into one file; the same ones give the same bytes.
+
+    Raises:
+        DataError: if there are no trajectories.
+    """
+    path, count = Path(path), 0
+    # The earliest format keeps no time stamps in groups.
+    with replacing(path) as part, h5py.File(part, "w", libver=("earliest", "v108")) as file:
+        for count, trajectory in enumerate(trajectories, start=1):
+            _write_trajectory(file.create_group(f"{count - 1:05d}"), trajectory)
+        if not count:
+            raise DataError(f"{path}: there are no trajectories to write.")
+
+
+def _write_trajectory(group: Any, trajectory: Trajectory) -> None:
+    frames, particles, dim = trajectory.position.shape
+    chunk = min(frames, max(1, _CHUNK_BYTES // (4 * particles * dim)))
+    group.create_dataset(
+        "position",
+        data=trajectory.position,
+        chunks=(chunk, particles, dim),
+        shuffle=True,
+        compression="gzip",
+        compression_opts=1,
+    )
+    group.create_dataset("particle_type", data=trajectory.particle_type)
+    for name in sorted(trajectory.attributes):
+        group.attrs[name] = trajectory.attributes[name]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    name: str
+    frames: int
+    particles: int
+    dim: int
+
+
+class Split:
+    """The trajectories of one file, read when asked for. Holds no open file, so it can be pickled and shared.
+
+    Args:
+        path: The HDF5 file.
+
+    Raises:
+        DataError: if the file is missing, damaged or not of the layout above.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise DataError(f"{self.path}: no such file{_neighbours(self.path)}.")
+        if not self._entries:
+            raise DataError(f"{self.path}: the file holds no trajectory; {_LAYOUT}.")
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the trajectories, in order."""
+        return tuple(entry.name for entry in self._entries)
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions, the same for all trajectories."""
+        return self._entries[0].dim
+
+    def frames(self, index: int) -> int:
+        """Number of frames, T, of a trajectory."""
+        return self._entries[index].frames
+
+    def particles(self, index: int) -> int:
+        """Number of particles, N, of a trajectory, static ones included."""
+        return self._entries[index].particles
+
+    def where(self, index: int) -> str:
+        """File and trajectory, for messages."""
+        return f"{self.path}, trajectory {self._entries[index].name}"
+
+    def particle_type(self, index: int) -> np.ndarray:
+        """The (N,) int64 type ids of a trajectory."""
+        with _opened(self.path) as file:
+            return np.asarray(file[self._entries[index].name]["particle_type"][()], dtype=np.int64)
+
+    def attributes(self, index: int) -> dict[str, Any]:
+        """The attributes of a trajectory."""
+        with _opened(self.path) as file:
+            return dict(file[self._entries[index].name].attrs)
+
+    def read(self, index: int, start: int = 0, stop: int | None = None) -> Trajectory:
+        """The frames from `start` up to `stop` (to the end when None) of a trajectory.
+
+        Raises:
+            DataError: if they cannot be read or hold a position that is not a finite number.
+        """
+        with _opened(self.path) as file:
+            group = file[self._entries[index].name]
+            position = np.asarray(group["position"][start:stop], dtype=np.float32)
+            particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
+            attributes = dict(group.attrs)
+        _check_finite(position, self.where(index), first_frame=start)
+        return Trajectory(position, particle_type, attributes)
+
+    @cached_property
+    def _entries(self) -> tuple[_Entry, ...]:
+        with _opened(self.path) as file:
+            entries = tuple(_entry(group, name, self.path) for name, group in file.items())
+        for entry in entries:
+            if entry.dim != entries[0].dim:
+                raise DataError(
+                    f"{self.path}, trajectory {entry.name}: {entry.dim} dimensions, {entries[0].dim} in the others."
+                )
+        return entries
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The open file; whatever HDF5 stumbles over becomes an error that names the file."""
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(
+            f"{path}: cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again."
+        ) from error
+
+
+def _entry(group: Any, name: str, path: Path) -> _Entry:
+    where = f"{path}, trajectory {name}"
+    if not isinstance(group, h5py.Group):
+        raise DataError(f"{path}: {name!r} is not a group; {_LAYOUT}.")
+    missing = [key for key in ("position", "particle_type") if not isinstance(group.get(key), h5py.Dataset)]
+    if missing:
+        found = ", ".join(group) or "nothing"
+        raise DataError(f"{where}: the key {' and '.join(map(repr, missing))} is missing (found: {found}); {_LAYOUT}.")
+    _check_arrays(group["position"], group["particle_type"], where)
+    frames, particles, dim = group["position"].shape
+    return _Entry(name, frames, particles, dim)
+
+
+def _check_arrays(position: Any, particle_type: Any, where: str) -> None:
+    """Checks kinds and shapes of two arrays or HDF5 datasets."""
+    wanted = {"position": ("f", 3, "floats of shape (T, N, D)"), "particle_type": ("iu", 1, "integers of shape (N,)")}
+    for key, array in (("position", position), ("particle_type", particle_type)):
+        kinds, axes, description = wanted[key]
+        if array.dtype.kind not in kinds or array.ndim != axes or 0 in array.shape:
+            raise DataError(f"{where}: {key} should be {description}; it is {array.dtype} of shape {array.shape}.")
+    if position.shape[2] > 3:
+        raise DataError(f"{where}: position has {position.shape[2]} dimensions; 1, 2 or 3 are possible.")
+    if position.shape[1] != particle_type.shape[0]:
+        raise DataError(
+            f"{where}: position has {position.shape[1]} particles but particle_type has {particle_type.shape[0]}."
+        )
+
+
+def _check_finite(position: np.ndarray, where: str, first_frame: int) -> None:
+    if not np.isfinite(position).all():
+        frame, particle, _ = map(int, np.argwhere(~np.isfinite(position))[0])
+        raise DataError(
+            f"{where}: position of particle {particle} in frame {first_frame + frame} is"
+            f" {position[frame, particle].tolist()}; every position must be a finite number. Leave the run out, or"
+            " cut it before that frame."
+        )
+
+
+def _neighbours(path: Path) -> str:
+    found = sorted(file.name for file in path.parent.glob("*.h5"))
+    return f" (beside it: {', '.join(found)})" if found else ""
+
+
+def split_paths(folder: Path) -> Mapping[str, Path]:
+    """The split files that a dataset's folder has, by name, in the order train, valid, test."""
+    paths = {name: Path(folder) / f"{name}.h5" for name in SPLITS}
+    return {name: path for name, path in paths.items() if path.is_file()}

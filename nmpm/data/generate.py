@@ -1,0 +1,275 @@
+"""Simulated datasets: made in parallel, resumed after an interruption, the same bytes whoever makes them.
+
+A folder in the making holds `.parts`: what was asked for, and a file for each finished trajectory. Once a split has all
+of its parts they become its HDF5 file; `metadata.json` comes last and marks the dataset as complete. Every file appears
+whole or not at all, so that the same call goes on wherever the last one was stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+import nmpm
+from nmpm.data.atomic import replacing
+from nmpm.data.folder_lock import locked
+from nmpm.data.format import (
+    METADATA_FILE,
+    SPLITS,
+    Metadata,
+    Split,
+    Trajectory,
+    read_metadata,
+    write_metadata,
+    write_split,
+)
+from nmpm.errors import ConfigError, DataError
+from nmpm.sim import Preset, simulate
+from nmpm.sim.mls_mpm import REVISION
+
+_PARTS = ".parts"
+_REQUEST = "request.json"
+_KEY = "simulation"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A dataset to simulate.
+
+    Args:
+        preset: The family of scenes.
+        counts: Trajectories in each of the splits train, valid and test.
+        seed: From which the seed of every trajectory is derived.
+
+    Raises:
+        ConfigError: if a split is unknown, missing or empty.
+    """
+
+    preset: Preset
+    counts: Mapping[str, int]
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if set(self.counts) != set(SPLITS) or min(self.counts.values()) < 1 or self.seed < 0:
+            raise ConfigError(
+                f"counts = {dict(self.counts)}, seed = {self.seed}: every one of {', '.join(SPLITS)} needs at least 1 "
+                "trajectory, and the seed must not be negative."
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """What determines the data, as plain lists, strings and numbers."""
+        counts = {split: self.counts[split] for split in SPLITS}
+        return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": REVISION}
+
+    def trajectory_seed(self, split: str, index: int) -> int:
+        """Seed of one trajectory, whatever the number of others."""
+        sequence = np.random.SeedSequence((self.seed, SPLITS.index(split), index))
+        return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def generate(
+    preset: Preset, folder: Path, counts: Mapping[str, int], seed: int = 0, workers: int | None = None
+) -> None:
+    """Simulate a dataset into a folder, unless it is there already.
+
+    Any number of processes may ask for the same folder: the first one makes it, the others wait for it.
+
+    Args:
+        preset: The family of scenes.
+        folder: Where to; made if need be.
+        counts: Trajectories in each of the splits train, valid and test.
+        seed: From which the seed of every trajectory is derived.
+        workers: Trajectories simulated at a time; as many as there are processor cores when left out.
+
+    Raises:
+        ConfigError: if the preset or the counts cannot be.
+        DataError: if the folder holds other data than asked for, or cannot be written.
+    """
+    request, folder = Request(preset, counts, seed), Path(folder)
+    if _is_complete(request, folder):  # Without the lock, which needs a folder that can be written.
+        return
+    try:
+        with locked(folder):
+            _complete(request, folder, workers or os.cpu_count() or 1)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error}). What is finished stays; once there is room and permission, "
+            "the same call goes on from there."
+        ) from error
+
+
+def _complete(request: Request, folder: Path, workers: int) -> None:
+    if _is_complete(request, folder):
+        return
+    _open_parts(request, folder)
+    _sweep(folder)
+    _simulate_parts(request, folder, workers)
+    for split in SPLITS:
+        _assemble(request, folder, split)
+    train = Split(folder / "train.h5")
+    # What is left of the parts goes first: nothing may come after the file that says all is done.
+    metadata = _metadata(request, train)
+    write_metadata(folder, metadata)
+    shutil.rmtree(folder / _PARTS, ignore_errors=True)
+
+
+def _is_complete(request: Request, folder: Path) -> bool:
+    if not (folder / METADATA_FILE).is_file():
+        return False
+    _check_same(request, read_metadata(folder).extra.get(_KEY), folder)
+    return True
+
+
+def _open_parts(request: Request, folder: Path) -> None:
+    """Note what the parts are for, or make sure that those which are there are for the same."""
+    note = folder / _PARTS / _REQUEST
+    if note.is_file():
+        _check_same(request, json.loads(note.read_text(encoding="utf-8")), folder)
+        return
+    foreign = [f"{split}.h5" for split in SPLITS if (folder / f"{split}.h5").exists()]
+    if foreign:
+        raise DataError(f"{folder}: {', '.join(foreign)} is there already and not simulated; choose another folder.")
+    with replacing(note) as temporary:
+        temporary.write_text(json.dumps(request.to_dict(), indent=1), encoding="utf-8")
+
+
+def _check_same(request: Request, found: Any, folder: Path) -> None:
+    asked = json.loads(json.dumps(request.to_dict()))
+    found = found if isinstance(found, dict) else {}
+    differing = [key for key in asked if found.get(key) != asked[key]]
+    if differing:
+        what = "; ".join(_difference(key, found.get(key), asked[key]) for key in differing)
+        raise DataError(
+            f"{folder}: holds other data than asked for: {what}. Choose another folder, or delete this one."
+        )
+
+
+def _difference(key: str, found: Any, asked: Any) -> str:
+    if isinstance(asked, dict) and isinstance(found, dict):
+        inner = [name for name in asked if found.get(name) != asked[name]]
+        return ", ".join(_difference(f"{key}.{name}", found.get(name), asked[name]) for name in inner)
+    return f"{key} is {found}, asked {asked}"
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes left half-written; the lock says that no other is writing."""
+    for stale in [*folder.glob(".*.part"), *(folder / _PARTS).glob(".*.part")]:
+        stale.unlink(missing_ok=True)
+
+
+def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
+    wanted = [(s, i) for s in SPLITS if not (folder / f"{s}.h5").is_file() for i in range(request.counts[s])]
+    missing = [(s, i) for s, i in wanted if not _part(folder, s, i).is_file()]
+    if not missing:
+        return
+    total = sum(request.counts.values())
+    _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
+    # Threads suffice, as the kernels hold no lock; they need no second start of the interpreter, and die with it.
+    pool = ThreadPoolExecutor(min(workers, len(missing)))
+    try:
+        with _shown(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
+            for future in as_completed([pool.submit(_simulate_part, request, folder, s, i) for s, i in missing]):
+                future.result()
+                advance()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _simulate_part(request: Request, folder: Path, split: str, index: int) -> None:
+    made = simulate(request.preset, request.trajectory_seed(split, index))
+    with replacing(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
+        np.savez(file, position=made.position, particle_type=made.particle_type, **made.attributes)
+
+
+def _part(folder: Path, split: str, index: int) -> Path:
+    return folder / _PARTS / f"{split}-{index:05d}.npz"
+
+
+def _assemble(request: Request, folder: Path, split: str) -> None:
+    path = folder / f"{split}.h5"
+    parts = [_part(folder, split, index) for index in range(request.counts[split])]
+    if not path.is_file():
+        with _shown(f"Writing {path.name}", len(parts)) as advance:
+            write_split(path, _read_parts(parts, advance))
+    for part in parts:
+        part.unlink(missing_ok=True)
+
+
+def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Trajectory]:
+    for part in parts:
+        try:
+            with np.load(part, allow_pickle=False) as arrays:
+                attributes = {key: arrays[key].item() for key in sorted(set(arrays) - {"position", "particle_type"})}
+                yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
+        except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
+            raise DataError(f"{part}: damaged ({error}); delete it, and the same call makes it again.") from error
+        advance()
+
+
+@contextmanager
+def _shown(what: str, total: int, done: int = 0) -> Iterator[Callable[[], None]]:
+    """A progress bar on standard error; gives the function that moves it on by one."""
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("ETA"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(what, total=total, completed=done)
+        yield lambda: progress.advance(task)
+
+
+def _metadata(request: Request, train: Split) -> Metadata:
+    preset = request.preset
+    provenance = {
+        "generator": f"nmpm {nmpm.__version__}, MLS-MPM",
+        "note": "Simulated by nmpm from the preset below; not measured, and not anybody else's dataset.",
+    }
+    return Metadata(
+        bounds=preset.box,
+        dt=preset.frame_dt,
+        dim=2,
+        sequence_length=preset.frames,
+        particle_types={material.particle_type: material.name for material in preset.materials},
+        static_types=frozenset({3}),
+        domain=preset.domain,
+        gravity=preset.gravity,
+        particle_volume=preset.particle_volume,
+        extra={
+            **_statistics(train),
+            "default_connectivity_radius": round(1.8 * preset.spacing, 6),
+            "num_particles_max": preset.blocks.particles[1],
+            **provenance,
+            _KEY: request.to_dict(),
+        },
+    )
+
+
+def _statistics(train: Split) -> dict[str, list[float]]:
+    """Mean and standard deviation, per axis, of velocity (length/frame) and acceleration (length/frame²)."""
+    sums = {"vel": np.zeros((3, 1)), "acc": np.zeros((3, 1))}
+    for index in range(len(train)):
+        velocity = np.diff(train.read(index).position.astype(np.float64), axis=0)
+        for key, values in (("vel", velocity), ("acc", np.diff(velocity, axis=0))):
+            flat = values.reshape(-1, values.shape[-1])
+            sums[key] = sums[key] + np.stack([np.full(flat.shape[1], len(flat)), flat.sum(0), (flat**2).sum(0)])
+    statistics = {}
+    for key, (count, total, squares) in sums.items():
+        mean = total / count
+        statistics[f"{key}_mean"] = mean.tolist()
+        statistics[f"{key}_std"] = np.sqrt(squares / count - mean**2).tolist()
+    return statistics

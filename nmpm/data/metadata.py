@@ -1,0 +1,258 @@
+"""The `metadata.json` of a dataset: DeepMind's keys, and a few that say what DeepMind's leave open.
+
+Required are `bounds`, `dt`, `dim` and `sequence_length` (as in DeepMind's files this may be one less than the frames
+stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `domain`, `gravity` (length/s²),
+`particle_volume` (length ** dim) and `periodic_boundary_conditions`. All other keys are kept as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nmpm.data.atomic import replacing
+from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
+from nmpm.errors import DataError
+from nmpm.scene import Interval
+
+METADATA_FILE = "metadata.json"
+_LENGTH_KEYS = ("sequence_length", "sequence_length_train", "sequence_length_test")
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What holds for every trajectory of a dataset.
+
+    Args:
+        bounds: Where particles may be, (lower, upper) per axis, in domain length.
+        dt: Time between stored frames, in seconds (LagrangeBench's `dt` times its `write_every`).
+        dim: Number of space dimensions.
+        sequence_length: Frames per trajectory as the dataset declares them.
+        particle_types: Name of each particle type id.
+        static_types: Ids of the types that never move.
+        periodic: Whether each axis wraps; nowhere when left out.
+        domain: What a grid should cover, (lower, upper) per axis, or None.
+        gravity: Acceleration in length/s² per axis, or None where unknown.
+        particle_volume: Volume of a particle in length ** dim, or None where unknown.
+        extra: Every other key of the file, unchanged.
+    """
+
+    bounds: tuple[Interval, ...]
+    dt: float
+    dim: int
+    sequence_length: int
+    particle_types: dict[int, str]
+    static_types: frozenset[int] = frozenset()
+    periodic: tuple[bool, ...] = ()
+    domain: tuple[Interval, ...] | None = None
+    gravity: tuple[float, ...] | None = None
+    particle_volume: float | None = None
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.periodic:
+            object.__setattr__(self, "periodic", (False,) * self.dim)
+
+    @property
+    def moving_types(self) -> tuple[int, ...]:
+        """Ids of the types that move, in order of id."""
+        names = self.particle_types
+        return tuple(sorted(i for i in names if i not in self.static_types and names[i] != PADDING))
+
+    def check_types(self, particle_type: np.ndarray, where: str) -> None:
+        """Makes sure that every id in an array is known.
+
+        Raises:
+            DataError: naming the unknown ids, and `where` they were met.
+        """
+        unknown = sorted(set(np.unique(particle_type).tolist()) - set(self.particle_types))
+        if unknown:
+            known = ", ".join(f"{i} {name}" for i, name in sorted(self.particle_types.items()))
+            raise DataError(
+                f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {known}). Name it in"
+                f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or choose another family'
+                f" ({', '.join(sorted(FAMILIES))})."
+            )
+
+
+def read_metadata(folder: Path, family: str | None = None) -> Metadata:
+    """Reads and checks a dataset's `metadata.json`.
+
+    Args:
+        folder: The dataset's folder.
+        family: What type ids mean ("deepmind", "lagrangebench") where the file does not say so itself.
+
+    Raises:
+        DataError: if the file is missing, is not JSON, lacks a key or holds a wrong value.
+        ConfigError: if there is no such family.
+    """
+    keys = _Keys(Path(folder) / METADATA_FILE)
+    dim = keys.take("dim", _whole)
+    if dim not in (1, 2, 3):
+        raise keys.error("dim", dim, "1, 2 or 3")
+    types, static = _types(keys, family)
+    return Metadata(
+        bounds=keys.take("bounds", _intervals(dim)),
+        dt=keys.take("dt", _positive) * keys.peek("write_every", _positive, 1.0),
+        dim=dim,
+        sequence_length=_sequence_length(keys),
+        particle_types=types,
+        static_types=static,
+        periodic=keys.take("periodic_boundary_conditions", _flags(dim), (False,) * dim),
+        domain=keys.take("domain", _intervals(dim), None),
+        gravity=keys.take("gravity", _vector(dim), None),
+        particle_volume=keys.take("particle_volume", _positive, None),
+        extra=keys.left,
+    )
+
+
+def write_metadata(folder: Path, metadata: Metadata) -> None:
+    """Writes `metadata.json`, in one step; `read_metadata` gives the same back."""
+    solver_steps = metadata.extra.get("write_every", 1)
+    plain: dict[str, Any] = {
+        "bounds": metadata.bounds,
+        "dt": metadata.dt / solver_steps,
+        "dim": metadata.dim,
+        "sequence_length": metadata.sequence_length,
+        "particle_types": {str(i): name for i, name in sorted(metadata.particle_types.items())},
+        "static_types": sorted(metadata.static_types),
+        "periodic_boundary_conditions": metadata.periodic,
+        "domain": metadata.domain,
+        "gravity": metadata.gravity,
+        "particle_volume": metadata.particle_volume,
+    }
+    plain = {key: value for key, value in plain.items() if value is not None} | metadata.extra
+    with replacing(Path(folder) / METADATA_FILE) as part:
+        part.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+
+
+class _Keys:
+    """The keys of a JSON object, taken one by one; each error names the file and the key."""
+
+    _REQUIRED = object()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.left = self._load()
+
+    def _load(self) -> dict[str, Any]:
+        if not self.path.parent.is_dir():
+            raise DataError(f"{self.path.parent}: no such folder. Give the folder that holds {METADATA_FILE}.")
+        if not self.path.is_file():
+            raise DataError(f"{self.path}: no such file. A dataset needs one with bounds, dt, dim and sequence_length.")
+        try:
+            plain = json.loads(self.path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DataError(f"{self.path}: not valid JSON ({error}).") from error
+        if not isinstance(plain, dict):
+            raise DataError(f"{self.path}: expected a JSON object, found {type(plain).__name__}.")
+        return plain
+
+    def error(self, key: str, value: Any, wanted: str) -> DataError:
+        return DataError(f"{self.path}: {key} = {json.dumps(value)[:80]} should be {wanted}.")
+
+    def peek(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
+        if self.left.get(key) is None:
+            if default is self._REQUIRED:
+                raise DataError(f"{self.path}: the key {key!r} is missing.")
+            return default
+        try:
+            return parse(self.left[key])
+        except (TypeError, ValueError) as error:
+            raise self.error(key, self.left[key], str(error)) from error
+
+    def take(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
+        value = self.peek(key, parse, default)
+        self.left.pop(key, None)
+        return value
+
+
+def _types(keys: _Keys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
+    fallback = find_family(family) if family is not None else None
+    types = keys.take("particle_types", _names, dict(fallback.types) if fallback else None)
+    if types is None:
+        raise DataError(
+            f"{keys.path}: the key 'particle_types' is missing, so nobody knows what the type ids mean. Add it, e.g."
+            f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
+        )
+    named = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
+    return types, keys.take("static_types", _ids, fallback.static if fallback else named)
+
+
+def _sequence_length(keys: _Keys) -> int:
+    found = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
+    length: int = keys.take(found, _whole) if found == _LENGTH_KEYS[0] else keys.peek(found, _whole)
+    return length
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError("a finite number")
+    return float(value)
+
+
+def _positive(value: Any) -> float:
+    if _number(value) <= 0:
+        raise ValueError("a positive number")
+    return float(value)
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError("a whole number above 0")
+    return value
+
+
+def _ids(value: Any) -> frozenset[int]:
+    if not isinstance(value, list) or any(isinstance(i, bool) or not isinstance(i, int) for i in value):
+        raise ValueError("a list of type ids")
+    return frozenset(value)
+
+
+def _names(value: Any) -> dict[int, str]:
+    if not isinstance(value, Mapping) or not value or not all(isinstance(name, str) for name in value.values()):
+        raise ValueError('an object of ids and names, e.g. {"7": "goop"}')
+    try:
+        types = {int(i): name for i, name in value.items()}
+    except ValueError as error:
+        raise ValueError('an object whose keys are whole numbers, e.g. {"7": "goop"}') from error
+    return types
+
+
+def _vector(dim: int) -> Callable[[Any], tuple[float, ...]]:
+    def parse(value: Any) -> tuple[float, ...]:
+        if not isinstance(value, list) or len(value) != dim:
+            raise ValueError(f"a list of {dim} numbers, one per axis")
+        return tuple(_number(item) for item in value)
+
+    return parse
+
+
+def _intervals(dim: int) -> Callable[[Any], tuple[Interval, ...]]:
+    wanted = f"a list of {dim} pairs [lower, upper] with lower < upper, one per axis"
+
+    def parse(value: Any) -> tuple[Interval, ...]:
+        if not isinstance(value, list) or len(value) != dim:
+            raise ValueError(wanted)
+        pairs = [_vector(2)(pair) for pair in value]
+        if any(low >= high for low, high in pairs):
+            raise ValueError(wanted)
+        return tuple((low, high) for low, high in pairs)
+
+    return parse
+
+
+def _flags(dim: int) -> Callable[[Any], tuple[bool, ...]]:
+    def parse(value: Any) -> tuple[bool, ...]:
+        # LagrangeBench gives three flags to two-dimensional scenes as well.
+        if not isinstance(value, list) or len(value) < dim or not all(isinstance(flag, bool) for flag in value):
+            raise ValueError(f"a list of at least {dim} truth values, one per axis")
+        return tuple(value[:dim])
+
+    return parse

@@ -1,0 +1,172 @@
+"""Trajectories as tensors, and windows cut from them.
+
+A recording holds what a scene's model needs of a trajectory: the particles that move, their materials, the static
+particles once, and gravity in length per frame squared. Everything a file may hold wrongly is found here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.errors import DataError
+from nmpm.particles import Window
+from nmpm.scene import Scene
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One trajectory of a known scene.
+
+    Args:
+        frames: (T, N, D) float32 positions of the particles that move, in domain length.
+        material: (N,) int64 index into `Scene.materials`.
+        obstacle: (M, D) float32 positions of the particles that do not move.
+        gravity: (D,) float32 in length per frame squared, zero where unknown.
+    """
+
+    frames: Tensor
+    material: Tensor
+    obstacle: Tensor
+    gravity: Tensor
+
+
+class Recordings(Sequence[Recording]):
+    """The trajectories of a split as recordings, read and checked when asked for.
+
+    Args:
+        split: The file.
+        metadata: What its type ids mean.
+        scene: What they are recordings of.
+    """
+
+    def __init__(self, split: Split, metadata: Metadata, scene: Scene) -> None:
+        if split.dim != scene.dim:
+            raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
+        self.split, self.metadata, self.scene = split, metadata, scene
+
+    def __len__(self) -> int:
+        return len(self.split)
+
+    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]
+        """Reads one trajectory.
+
+        Raises:
+            DataError: if it cannot be read, leaves the scene's domain or is of a material that the scene lacks.
+        """
+        trajectory, where = self.split.read(index), self.split.where(index)
+        types = trajectory.particle_type
+        self.metadata.check_types(types, where)
+        moving = np.isin(types, self.metadata.moving_types)
+        static = np.isin(types, list(self.metadata.static_types))
+        self._check_inside(trajectory, moving | static, where)
+        if not moving.any():
+            raise DataError(f"{where}: none of its particles moves; check static_types in the metadata.")
+        return Recording(
+            frames=torch.from_numpy(np.ascontiguousarray(trajectory.position[:, moving])),
+            material=torch.from_numpy(self._materials(types[moving], where)),
+            obstacle=torch.from_numpy(trajectory.position[0, static]),
+            gravity=self._gravity(trajectory, where),
+        )
+
+    def require_frames(self, frames: int, purpose: str) -> None:
+        """Makes sure that every trajectory is long enough.
+
+        Raises:
+            DataError: naming the first that is shorter.
+        """
+        for index in range(len(self)):
+            if self.split.frames(index) < frames:
+                raise DataError(
+                    f"{self.split.where(index)}: it has {self.split.frames(index)} frames, {purpose} needs {frames}."
+                    " Shorten the horizon (frames per bundle x bundles unrolled) or leave the trajectory out."
+                )
+
+    def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
+        index = np.zeros(types.shape, dtype=np.int64)
+        for type_id in np.unique(types).tolist():
+            name = self.metadata.particle_types[type_id]
+            if name not in self.scene.materials:
+                raise DataError(
+                    f"{where}: its material {name!r} (type {type_id}) is unknown to the scene, which has"
+                    f" {', '.join(self.scene.materials)}. Leave the trajectory out, or train on data that has both."
+                )
+            index[types == type_id] = self.scene.material_index(name)
+        return index
+
+    def _check_inside(self, trajectory: Trajectory, present: np.ndarray, where: str) -> None:
+        lower, upper = np.asarray(self.scene.domain, dtype=np.float32).T
+        # A periodic axis has no outside.
+        walls = ~np.asarray(self.scene.periodic)
+        position = trajectory.position
+        outside = (((position < lower) | (position > upper)) & walls).any(axis=-1) & present
+        if outside.any():
+            frame, particle = map(int, np.argwhere(outside)[0])
+            raise DataError(
+                f"{where}: particle {particle} in frame {frame} is at {position[frame, particle].tolist()}, outside"
+                f" the domain {list(map(list, self.scene.domain))} ({int(outside.any(axis=0).sum())} particles leave"
+                " it). Give the metadata a `domain` that holds all positions, or leave the trajectory out."
+            )
+
+    def _gravity(self, trajectory: Trajectory, where: str) -> Tensor:
+        known = trajectory.attributes.get("gravity", self.scene.gravity)
+        if known is None:
+            return torch.zeros(self.scene.dim)
+        gravity = torch.as_tensor(np.asarray(known, dtype=np.float64))
+        if gravity.shape != (self.scene.dim,) or not gravity.isfinite().all():
+            raise DataError(f"{where}: the attribute gravity = {known} should be {self.scene.dim} finite numbers.")
+        return (gravity * self.scene.dt**2).float()
+
+
+def collate(recordings: Sequence[Recording], starts: Sequence[int], length: int, scene: Scene) -> Window:
+    """Cuts one window out of each recording and pads them to a batch.
+
+    Args:
+        recordings: B recordings of the scene.
+        starts: The first frame of each window.
+        length: Frames per window, T.
+        scene: Padding particles lie at the centre of its domain; on its periodic axes positions follow the particle
+            across the border, so that differences between frames are displacements.
+
+    Returns:
+        Window: of B scenes with T frames, padded to the largest.
+    """
+    centre = torch.tensor([(low + high) / 2 for low, high in scene.domain])
+    batch, dim = len(recordings), scene.dim
+    count = max(len(recording.material) for recording in recordings)
+    statics = max(len(recording.obstacle) for recording in recordings)
+    window = Window(
+        frames=centre.expand(batch, length, count, dim).clone(),
+        material=torch.zeros(batch, count, dtype=torch.int64),
+        mask=torch.zeros(batch, count, dtype=torch.bool),
+        obstacle=centre.expand(batch, statics, dim).clone(),
+        obstacle_mask=torch.zeros(batch, statics, dtype=torch.bool),
+        gravity=torch.stack([recording.gravity for recording in recordings]),
+    )
+    for row, (recording, start) in enumerate(zip(recordings, starts, strict=True)):
+        particles, obstacles = len(recording.material), len(recording.obstacle)
+        window.frames[row, :, :particles] = recording.frames[start : start + length]
+        window.material[row, :particles] = recording.material
+        window.mask[row, :particles] = True
+        window.obstacle[row, :obstacles] = recording.obstacle
+        window.obstacle_mask[row, :obstacles] = True
+    unwrap(window.frames, scene)
+    return window
+
+
+def unwrap(frames: Tensor, scene: Scene) -> None:
+    """Undoes, in place, the jumps of (B, T, N, D) positions across periodic borders, by minimum image.
+
+    The first frame stays where it is; a later one may lie outside the domain, by whole periods.
+    """
+    for axis, (low, high) in enumerate(scene.domain):
+        if scene.periodic[axis]:
+            period = high - low
+            along = frames[..., axis]
+            turns = torch.round(along.diff(dim=1) / period).cumsum(dim=1)
+            along[:, 1:] -= turns * period

@@ -1,0 +1,173 @@
+"""What a test leaves behind: a table on the screen, the figures as JSON and CSV, a picture and an animation."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from nmpm import __version__
+from nmpm.data.atomic import replacing
+from nmpm.metrics import RolloutError
+from nmpm.particles import Window
+from nmpm.training import EmulatorModule
+from nmpm.viz import Exhibit, animation, snapshots
+
+PREDICTORS = {"model": "model", "still": "nothing moves", "free_fall": "free fall, stopped at walls"}
+
+
+class Report(Callback):
+    """Keeps the time that training took, and writes the report when a test ends.
+
+    Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions), `errors.csv`
+    (error against frame), `rollout.png` and `rollout.gif` (the first test trajectory beside its prediction).
+    """
+
+    def __init__(self) -> None:
+        self.trained_seconds = 0.0
+        self._since: float | None = None
+        self._exhibit: tuple[Window, Tensor] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"trained_seconds": self._elapsed()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.trained_seconds = float(state_dict["trained_seconds"])
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        self._since = time.monotonic()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        self.trained_seconds, self._since = self._elapsed(), None
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,  # noqa: ARG002
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,
+        batch: Window,
+        batch_idx: int,
+        dataloader_idx: int = 0,  # noqa: ARG002
+    ) -> None:
+        if batch_idx == 0:
+            self._exhibit = (batch.to("cpu"), outputs.cpu())
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not isinstance(pl_module, EmulatorModule):
+            return
+        curves = {name: _gathered(pl_module.test_errors[name]) for name in PREDICTORS}
+        if not trainer.is_global_zero:
+            return
+        folder = Path(trainer.default_root_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        figures = self._figures(trainer, pl_module, curves)
+        with replacing(folder / "report.json") as part:
+            part.write_text(json.dumps(figures, indent=1) + "\n")
+        _write_curves(folder / "errors.csv", {name: rows for name, (_, rows) in curves.items()})
+        if self._exhibit is not None:
+            exhibit = exhibit_of(pl_module, *self._exhibit)
+            snapshots(exhibit, folder / "rollout.png")
+            animation(exhibit, folder / "rollout.gif")
+        _print_table(figures, folder)
+
+    def _elapsed(self) -> float:
+        return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
+
+    def _figures(
+        self, trainer: Trainer, module: EmulatorModule, curves: Mapping[str, tuple[list[dict[str, float]], list[Tensor]]]
+    ) -> dict[str, Any]:
+        datamodule = trainer.datamodule  # type: ignore[attr-defined]
+        logged = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("test/")}
+        return {
+            "dataset": datamodule.description,
+            "test": {key.removeprefix("test/"): value for key, value in sorted(logged.items())},
+            "per_trajectory": {name: rows for name, (rows, _) in curves.items()},
+            "training": {
+                "steps": trainer.global_step,
+                "seconds": round(self.trained_seconds, 1),
+                "precision": str(trainer.precision),
+                "devices": trainer.world_size,
+                "hardware": hardware(),
+                "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
+            },
+            "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
+        }
+
+
+def figure_names(test: Mapping[str, float]) -> list[str]:
+    """Names of the model's figures, horizons in order, the full rollout after them."""
+    names = [name for name in test if "/" not in name]
+    return sorted(names, key=lambda name: (not name.startswith("mse"), int((name.split("@") + ["1000000000"])[1])))
+
+
+def table_row(test: Mapping[str, float], kind: str) -> list[str]:
+    """A predictor's figures ×10⁻³, in the order of `figure_names`; empty where it has none."""
+    prefix = "" if kind == "model" else f"{kind}/"
+    return [f"{1e3 * test[prefix + name]:.4g}" if prefix + name in test else "" for name in figure_names(test)]
+
+
+def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exhibit:
+    """The first trajectory of a batch beside its prediction, as something to draw."""
+    scene, real = module.emulator.scene, window.mask[0]
+    start = window.frames[0, 1:2, real]
+    rows = {
+        "truth": window.frames[0, 1:, real].numpy(),
+        "prediction": torch.cat([start, predicted[0][:, real]]).numpy(),
+    }
+    obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
+    return Exhibit.of_scene(scene, rows, window.material[0, real].numpy(), obstacle)
+
+
+def hardware() -> str:
+    """What this process computes on, in words."""
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name()
+    return f"{_processor()}, {torch.get_num_threads()} threads"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _gathered(metric: RolloutError) -> tuple[list[dict[str, float]], list[Tensor]]:
+    """MSE per trajectory and curves, from all processes."""
+    with metric.sync_context():
+        return metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]
+
+
+def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
+    """Mean over trajectories of the squared error at each predicted frame, one column per predictor."""
+    shortest = {name: min((len(curve) for curve in rows), default=0) for name, rows in curves.items()}
+    means = {name: torch.stack([c[: shortest[name]] for c in rows]).mean(0) for name, rows in curves.items() if rows}
+    lines = [["frame", *means]]
+    lines += [[str(frame), *map(str, values)] for frame, values in enumerate(zip(*map(Tensor.tolist, means.values())), 1)]
+    with replacing(path) as part:
+        part.write_text("".join(",".join(line) + "\n" for line in lines))
+
+
+def _print_table(figures: Mapping[str, Any], folder: Path) -> None:
+    test = figures["test"]
+    names = figure_names(test)
+    table = Table(title=f"{figures['dataset']}: test error ×10⁻³ (MSE in length², EMD in length)")
+    table.add_column("predictor")
+    for name in names:
+        table.add_column(name, justify="right")
+    for kind, label in PREDICTORS.items():
+        table.add_row(label, *table_row(test, kind))
+    console = Console()
+    console.print(table)
+    console.print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")

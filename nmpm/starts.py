@@ -1,0 +1,49 @@
+"""States to start a rollout from when there is no recording at hand: blocks of particles, thrown into the scene's box."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+
+
+def thrown_blocks(scene: Scene, count: int = 1000, blocks: int = 1, speed: float = 1.0, seed: int = 0) -> Particles:
+    """Square blocks (cubes) of particles on a lattice at the scene's own density, side by side along the first axis.
+
+    Args:
+        scene: Gives box, particle volume, materials (dealt to the blocks in turn) and gravity.
+        count: About how many particles in all.
+        blocks: How many blocks.
+        speed: Largest initial speed along each axis, in length per second.
+        seed: Of places and velocities.
+
+    Returns:
+        One scene (B = 1) without obstacles.
+
+    Raises:
+        ValueError: if the blocks do not fit into the box.
+    """
+    rng = np.random.default_rng(seed)
+    spacing = scene.particle_volume ** (1 / scene.dim)
+    side = max(1, round((count / blocks) ** (1 / scene.dim)))
+    low, high = np.array(scene.bounds).T
+    room = (high - low) / np.array([blocks] + [1] * (scene.dim - 1)) - side * spacing
+    if room.min() < 0:
+        raise ValueError(f"{blocks} blocks of {side**scene.dim} particles, {side * spacing:.3g} wide, do not fit the box.")
+    lattice = spacing * (np.stack(np.meshgrid(*[np.arange(side)] * scene.dim, indexing="ij"), -1).reshape(-1, scene.dim) + 0.5)
+    shift = np.eye(scene.dim)[0] * (high - low)[0] / blocks
+    corners = low + rng.uniform(0, room, (blocks, scene.dim)) + np.arange(blocks)[:, None] * shift
+    position = torch.from_numpy((corners[:, None] + lattice).reshape(1, -1, scene.dim)).float()
+    thrown = np.repeat(rng.uniform(-speed, speed, (blocks, scene.dim)) * scene.dt, len(lattice), axis=0)
+    material = torch.arange(blocks).remainder(len(scene.materials)).repeat_interleave(len(lattice))[None]
+    return Particles(
+        position=position,
+        velocity=torch.from_numpy(thrown[None]).float(),
+        material=material,
+        mask=torch.ones_like(material, dtype=torch.bool),
+        obstacle=torch.zeros(1, 0, scene.dim),
+        obstacle_mask=torch.zeros(1, 0, dtype=torch.bool),
+        gravity=torch.tensor(scene.gravity or (0.0,) * scene.dim)[None] * scene.dt**2,
+    )

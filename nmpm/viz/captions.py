@@ -1,0 +1,19 @@
+"""The words on pictures."""
+
+from __future__ import annotations
+
+import math
+
+from nmpm.viz.exhibit import Exhibit
+
+
+def clock(exhibit: Exhibit, frame: int) -> str:
+    """The time of a frame in seconds, with the same number of decimals for every frame of an exhibit."""
+    longest = max(exhibit.frames - 1, 1) * exhibit.dt
+    decimals = max(0, 2 - math.floor(math.log10(longest)))
+    return f"{frame * exhibit.dt:.{decimals}f} s"
+
+
+def unseen(count: int) -> str:
+    """What is said of particles that left the picture; nothing where none did."""
+    return f"{count} out of view" if count else ""

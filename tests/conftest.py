@@ -1,0 +1,70 @@
+"""Data that several rooms test with: recorded trajectories where there are any, tiny made-up ones everywhere."""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
+
+Sizes = Sequence[tuple[int, int]]
+
+
+@pytest.fixture(scope="session")
+def recorded() -> Path:
+    """The folder of recorded trajectories."""
+    folder = os.environ.get("NMPM_TEST_DATA")
+    if not folder:
+        pytest.skip("recorded trajectories are not at hand: NMPM_TEST_DATA is not set")
+    if not Path(folder).is_dir():
+        pytest.skip(f"recorded trajectories are not at hand: NMPM_TEST_DATA={folder} is no folder")
+    return Path(folder)
+
+
+def made_up_trajectory(frames: int, particles: int, seed: int = 0, statics: int = 0, dim: int = 2) -> Trajectory:
+    """Goop (7) that drifts slowly through the middle of [0.1, 0.9] ** dim, and boundary particles (3) that rest."""
+    rng = np.random.default_rng((seed, frames, particles))
+    start = rng.uniform(0.3, 0.7, size=(1, particles + statics, dim))
+    drift = rng.normal(scale=1e-3, size=(frames, particles + statics, dim)).cumsum(axis=0)
+    drift[:, particles:] = 0
+    types = np.r_[np.full(particles, 7), np.full(statics, 3)]
+    return Trajectory((start + drift).astype(np.float32), types, {"seed": seed})
+
+
+def made_up_metadata(dim: int = 2, **changes: object) -> Metadata:
+    """DeepMind's box and time step, goop and boundary particles, gravity downwards."""
+    known: dict = {
+        "bounds": ((0.1, 0.9),) * dim,
+        "dt": 0.0025,
+        "dim": dim,
+        "sequence_length": 12,
+        "particle_types": {3: "boundary", 7: "goop"},
+        "static_types": frozenset({3}),
+        "gravity": (0.0,) * (dim - 1) + (-9.81,),
+    }
+    return Metadata(**(known | changes))
+
+
+@pytest.fixture
+def make_dataset(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a dataset of made-up trajectories, sizes given as (frames, particles), and gives its folder."""
+
+    def make(
+        train: Sizes = ((12, 5), (12, 7), (12, 6)),
+        valid: Sizes = ((12, 5), (12, 4)),
+        test: Sizes = ((12, 5), (15, 4), (12, 6)),
+        statics: int = 0,
+        dim: int = 2,
+        **changes: object,
+    ) -> Path:
+        folder = tmp_path / "dataset"
+        for name, sizes in (("train", train), ("valid", valid), ("test", test)):
+            runs = [made_up_trajectory(*size, seed=i, statics=statics, dim=dim) for i, size in enumerate(sizes)]
+            if runs:
+                write_split(folder / f"{name}.h5", runs)
+        write_metadata(folder, made_up_metadata(dim, **changes))
+        return folder
+
+    return make

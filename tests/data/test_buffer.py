@@ -1,0 +1,151 @@
+from collections import Counter
+from itertools import islice
+
+import h5py
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.data.buffer import TrajectoryBuffer, WindowPlan
+from nmpm.data.format import Split, read_metadata
+from nmpm.data.recording import Recordings
+from nmpm.data.scenes import infer_scene
+from nmpm.errors import ConfigError, DataError
+
+PLANS = st.builds(
+    WindowPlan,
+    frames=st.lists(st.integers(6, 30), min_size=1, max_size=12).map(tuple),
+    length=st.integers(2, 6),
+    batch_size=st.integers(1, 9),
+    buffer_size=st.integers(1, 5),
+    passes=st.sampled_from([0.3, 1, 4]),
+    seed=st.integers(0, 2**40),
+)
+
+
+def recordings_of(folder) -> Recordings:
+    return Recordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
+
+
+def buffer_of(folder, length: int = 5, **options) -> TrajectoryBuffer:
+    recordings = recordings_of(folder)
+    known = {"batch_size": 4, "buffer_size": 2, "passes": 1.0, "seed": 0}
+    frames = tuple(map(recordings.split.frames, range(len(recordings))))
+    return TrajectoryBuffer(recordings, WindowPlan(frames=frames, length=length, **(known | options)))
+
+
+class TestPlan:
+    @given(plan=PLANS, index=st.integers(0, 500), world=st.integers(1, 4))
+    @settings(max_examples=100, deadline=None)
+    def test_windows_lie_inside_trajectories_of_the_buffer(self, plan, index, world):
+        for rank in range(world):
+            members = plan.members(index // plan.batches_per_buffer(world))
+            drawn = plan.batch(index, rank, world)
+            assert len(drawn) == plan.batch_size
+            for trajectory, start in drawn:
+                assert trajectory in members
+                assert 0 <= start <= plan.frames[trajectory] - plan.length
+
+    @given(plan=PLANS, order=st.permutations(range(12)))
+    @settings(max_examples=30, deadline=None)
+    def test_a_batch_depends_on_nothing_but_its_number(self, plan, order):
+        alone = {index: plan.batch(index, 1, 2) for index in order}
+        again = WindowPlan(plan.frames, plan.length, plan.batch_size, plan.buffer_size, plan.passes, plan.seed)
+        assert [alone[index] for index in range(12)] == [again.batch(index, 1, 2) for index in range(12)]
+
+    @given(plan=PLANS)
+    @settings(max_examples=30, deadline=None)
+    def test_buffers_go_through_all_trajectories(self, plan):
+        total = len(plan.frames)
+        for buffer in range(5):
+            members = plan.members(buffer)
+            assert len(set(members)) == len(members) <= min(plan.buffer_size, total)
+        seen = set().union(*(plan.members(buffer) for buffer in range(-(-total // plan.buffer_size))))
+        assert seen == set(range(total))
+
+    def test_ranks_share_out_every_window_once(self):
+        plan = WindowPlan(frames=(13, 9), length=4, batch_size=2, buffer_size=2, passes=2, seed=0)
+        assert plan.batches_per_buffer(world=4) == 4
+        one_pass = Counter(w for index in range(2) for rank in range(4) for w in plan.batch(index, rank, 4))
+        assert set(one_pass.values()) == {1}
+        assert len(one_pass) == 16
+
+    def test_every_window_is_as_likely(self):
+        plan = WindowPlan(frames=(8,) * 6, length=3, batch_size=4, buffer_size=2, passes=1, seed=3)
+        drawn = Counter(w for index in range(300) for w in plan.batch(index, 0, 1))
+        assert len(drawn) == 36
+        assert max(drawn.values()) - min(drawn.values()) <= 2
+
+    def test_another_seed_another_order(self):
+        plans = [WindowPlan((30, 30), 4, 8, 2, 1, seed) for seed in (0, 1)]
+        assert plans[0].batch(0, 0, 1) != plans[1].batch(0, 0, 1)
+
+    @pytest.mark.parametrize("wrong", [{"batch_size": 0}, {"buffer_size": -1}, {"passes": 0}, {"seed": -1}])
+    def test_numbers_that_make_no_sense(self, wrong):
+        known = {"frames": (9,), "length": 3, "batch_size": 2, "buffer_size": 2, "passes": 1, "seed": 0}
+        with pytest.raises(ConfigError, match=f"{next(iter(wrong))} = "):
+            WindowPlan(**(known | wrong))
+
+
+class TestBuffer:
+    def test_windows_are_the_files_frames(self, make_dataset):
+        buffer = buffer_of(make_dataset(statics=1))
+        for index, window in enumerate(islice(buffer.batches(), 20)):
+            for row, (trajectory, start) in enumerate(buffer.plan.batch(index, 0, 1)):
+                count = int(window.mask[row].sum())
+                truth = torch.from_numpy(buffer.recordings.split.read(trajectory, start, start + 5).position)
+                assert torch.equal(window.frames[row, :, :count], truth[:, :count])
+                assert torch.equal(window.obstacle[row], truth[0, count:])
+
+    @pytest.mark.parametrize("start", [0, 1, 5, 6, 7, 40])
+    def test_goes_on_anywhere(self, make_dataset, start):
+        buffer = buffer_of(make_dataset(train=((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))))
+        straight = list(islice(buffer.batches(), start + 8))
+        resumed = list(islice(buffer.batches(start), 8))
+        for expected, window in zip(straight[start:], resumed, strict=True):
+            assert torch.equal(window.frames, expected.frames)
+            assert torch.equal(window.mask, expected.mask)
+
+    def test_ranks_see_different_windows(self, make_dataset):
+        buffer = buffer_of(make_dataset())
+        for first, second in zip(*[islice(buffer.batches(rank=r, world=2), 5) for r in (0, 1)], strict=True):
+            assert first.frames.shape[0] == second.frames.shape[0]
+            assert first.frames.shape != second.frames.shape or not torch.equal(first.frames, second.frames)
+
+    def test_reads_each_trajectory_of_a_held_buffer_once(self, make_dataset, monkeypatch):
+        buffer = buffer_of(make_dataset(), buffer_size=16)
+        read = Counter()
+        original = Split.read
+        monkeypatch.setattr(Split, "read", lambda self, i, *a: (read.update([i]), original(self, i, *a))[1])
+        list(islice(buffer.batches(), 50))
+        assert read == {0: 1, 1: 1, 2: 1}
+
+    def test_a_bad_trajectory_read_ahead_is_reported(self, make_dataset):
+        folder = make_dataset(train=((12, 5),) * 8)
+        buffer = buffer_of(folder, buffer_size=1)
+        later = buffer.plan.members(1)[0]
+        with h5py.File(folder / "train.h5", "a") as file:
+            file[f"{later:05d}/position"][3, 2, 0] = float("nan")
+        batches = buffer.batches()
+        for _ in range(buffer.plan.batches_per_buffer(1)):
+            next(batches)
+        with pytest.raises(DataError, match=f"trajectory {later:05d}: position of particle 2 in frame 3"):
+            next(batches)
+
+    def test_too_short_a_trajectory(self, make_dataset):
+        with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* 8 frames to predict needs 10"):
+            buffer_of(make_dataset(train=((12, 5), (9, 5))), length=10)
+
+
+def test_waterdrop(recorded):
+    folder = recorded / "deepmind-waterdrop"
+    scene = infer_scene(folder, family="deepmind", gravity=(0, -9.81))
+    split = Split(folder / "train.h5")
+    recordings = Recordings(split, read_metadata(folder, "deepmind"), scene)
+    plan = WindowPlan(tuple(map(split.frames, range(9))), length=18, batch_size=16, buffer_size=4, passes=4, seed=0)
+    window = next(TrajectoryBuffer(recordings, plan).batches(7))
+    for row, (trajectory, start) in enumerate(plan.batch(7, 0, 1)):
+        truth = torch.from_numpy(split.read(trajectory, start, start + 18).position)
+        assert torch.equal(window.frames[row, :, : truth.shape[1]], truth)
+    torch.testing.assert_close(window.gravity, torch.tensor([[0, -9.81 * 0.0025**2]]).expand(16, 2))

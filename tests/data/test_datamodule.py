@@ -1,0 +1,247 @@
+from collections import Counter
+from itertools import islice
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
+
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.errors import ConfigError, DataError
+from nmpm.particles import Window
+
+TRAIN = ((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))
+
+
+class Recorder(LightningModule):
+    """Learns something that depends on every batch, and remembers what it saw."""
+
+    def __init__(self, fail_at: int | None = None) -> None:
+        super().__init__()
+        self.offset = torch.nn.Parameter(torch.zeros(2))
+        self.fail_at = fail_at
+        self.seen: list[float] = []
+        self.evaluated: list[torch.Size] = []
+
+    def training_step(self, batch: Window, batch_idx: int) -> torch.Tensor:
+        if len(self.seen) == self.fail_at:
+            raise RuntimeError("interrupted")
+        self.seen.append(float(batch.frames.double().sum()))
+        moved = batch.frames + self.offset
+        return (moved[:, :-1] - batch.frames[:, 1:]).square().mean()
+
+    def validation_step(self, batch: Window, batch_idx: int) -> None:
+        self.evaluated.append(batch.frames.shape)
+
+    test_step = predict_step = validation_step
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.parameters(), lr=0.01)
+
+
+def trainer_of(folder, *callbacks, **options) -> Trainer:
+    known = {
+        "accelerator": "cpu",
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "default_root_dir": folder,
+        "limit_val_batches": 0,
+        "enable_checkpointing": bool(callbacks),
+        "max_epochs": -1,
+    }
+    return Trainer(callbacks=list(callbacks), **(known | options))
+
+
+def module_of(folder, **options) -> TrajectoryDataModule:
+    return TrajectoryDataModule(**({"path": str(folder), "horizon": 3, "batch_size": 2, "buffer_size": 2} | options))
+
+
+SETTINGS = {
+    "plain": {},
+    "accumulating": {"accumulate_grad_batches": 2},
+    "in short epochs": {"limit_train_batches": 5},
+    "accumulating in short epochs": {"limit_train_batches": 5, "accumulate_grad_batches": 2},
+    "validating": {"val_check_interval": 3, "check_val_every_n_epoch": None, "limit_val_batches": 1.0},
+    "validating in short epochs": {"val_check_interval": 2, "limit_train_batches": 6, "limit_val_batches": 1.0},
+}
+
+
+@pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`", "ignore:.fit.ckpt_path=")
+class TestResuming:
+    @pytest.mark.parametrize("stop", [3, 5, 6])
+    @pytest.mark.parametrize("options", SETTINGS.values(), ids=SETTINGS.keys())
+    @pytest.mark.parametrize("moment", [{"every_n_train_steps": 1}, {"every_n_train_steps": 1, "save_last": True}])
+    def test_resumed_training_sees_the_same_batches(self, make_dataset, tmp_path, options, stop, moment):
+        folder = make_dataset(train=TRAIN)
+        straight = Recorder()
+        trainer_of(tmp_path, max_steps=11, **options).fit(straight, datamodule=module_of(folder))
+
+        first = Recorder()
+        saving = ModelCheckpoint(tmp_path / "saved", filename="{step}", save_top_k=-1, **moment)
+        trainer_of(tmp_path, saving, max_steps=stop, **options).fit(first, datamodule=module_of(folder))
+        second = Recorder()
+        saved = tmp_path / "saved" / ("last.ckpt" if "save_last" in moment else f"step={stop}.ckpt")
+        trainer_of(tmp_path, max_steps=11, **options).fit(second, datamodule=module_of(folder), ckpt_path=saved)
+
+        assert first.seen + second.seen == straight.seen
+        assert len(straight.seen) >= 11
+        assert torch.equal(second.offset, straight.offset)
+
+    @pytest.mark.parametrize("options", SETTINGS.values(), ids=SETTINGS.keys())
+    def test_from_an_earlier_checkpoint_of_a_longer_run(self, make_dataset, tmp_path, options):
+        folder = make_dataset(train=TRAIN)
+        straight = Recorder()
+        saving = ModelCheckpoint(tmp_path / "saved", filename="{step}", save_top_k=-1, every_n_train_steps=4)
+        trainer_of(tmp_path, saving, max_steps=11, **options).fit(straight, datamodule=module_of(folder))
+        resumed = Recorder()
+        saved = tmp_path / "saved" / "step=4.ckpt"
+        trainer_of(tmp_path, max_steps=11, **options).fit(resumed, datamodule=module_of(folder), ckpt_path=saved)
+        assert resumed.seen == straight.seen[-len(resumed.seen) :]
+        assert len(straight.seen) - len(resumed.seen) >= 4
+        assert torch.equal(resumed.offset, straight.offset)
+
+    def test_from_a_checkpoint_saved_at_validation(self, make_dataset, tmp_path):
+        folder, options = make_dataset(train=TRAIN), SETTINGS["validating"]
+        straight = Recorder()
+        saving = ModelCheckpoint(tmp_path / "saved", filename="{step}", save_top_k=-1, save_on_train_epoch_end=False)
+        trainer_of(tmp_path, saving, max_steps=11, **options).fit(straight, datamodule=module_of(folder))
+        resumed = Recorder()
+        saved = tmp_path / "saved" / "step=6.ckpt"
+        trainer_of(tmp_path, max_steps=11, **options).fit(resumed, datamodule=module_of(folder), ckpt_path=saved)
+        assert resumed.seen == straight.seen[6:]
+        assert torch.equal(resumed.offset, straight.offset)
+
+    def test_an_interrupted_batch_is_seen_again(self, make_dataset, tmp_path):
+        folder = make_dataset(train=TRAIN)
+        straight, broken, resumed = Recorder(), Recorder(fail_at=4), Recorder()
+        trainer_of(tmp_path, max_steps=9).fit(straight, datamodule=module_of(folder))
+        with pytest.raises(RuntimeError, match="interrupted"):
+            trainer_of(tmp_path, OnExceptionCheckpoint(tmp_path, "broken"), max_steps=9).fit(
+                broken, datamodule=module_of(folder)
+            )
+        saved = tmp_path / "broken.ckpt"
+        trainer_of(tmp_path, max_steps=9).fit(resumed, datamodule=module_of(folder), ckpt_path=saved)
+        assert broken.seen + resumed.seen == straight.seen
+        assert torch.equal(resumed.offset, straight.offset)
+
+    def test_a_new_run_starts_at_the_beginning(self, make_dataset, tmp_path):
+        module = module_of(make_dataset(train=TRAIN))
+        first, second = Recorder(), Recorder()
+        trainer_of(tmp_path, max_steps=4).fit(first, datamodule=module)
+        trainer_of(tmp_path, max_steps=4).fit(second, datamodule=module)
+        assert first.seen == second.seen
+
+
+@pytest.mark.filterwarnings("ignore:predict returned None", "ignore:`isinstance.treespec")
+class TestTrainer:
+    @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+    def test_runs_every_stage(self, make_dataset, tmp_path, precision):
+        module, model = module_of(make_dataset(train=TRAIN)), Recorder()
+        trainer = trainer_of(tmp_path, max_steps=2, limit_val_batches=1.0, precision=precision)
+        trainer.fit(model, datamodule=module)
+        model.evaluated.clear()
+        for stage in (trainer.validate, trainer.test, trainer.predict):
+            stage(model, datamodule=module)
+        whole = [torch.Size((2, 12, 5, 2)), torch.Size((2, 12, 6, 2)), torch.Size((1, 15, 4, 2))]
+        assert model.evaluated == whole + whole[1:]
+
+
+def as_rank(module: TrajectoryDataModule, rank: int, world: int) -> TrajectoryDataModule:
+    progress = SimpleNamespace(total=SimpleNamespace(processed=0))
+    loop = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=progress))
+    module.trainer = SimpleNamespace(global_rank=rank, world_size=world, fit_loop=loop)  # type: ignore[assignment]
+    return module
+
+
+class TestEvaluation:
+    @pytest.mark.parametrize("world", [1, 2, 3])
+    @pytest.mark.parametrize("batch_size", [1, 2, 8])
+    def test_every_trajectory_once_over_all_ranks(self, make_dataset, world, batch_size):
+        sizes = ((12, 5), (15, 4), (12, 6), (12, 7), (15, 3), (13, 2), (12, 3))
+        folder = make_dataset(test=sizes)
+        seen: Counter[int] = Counter()
+        for rank in range(world):
+            module = as_rank(module_of(folder, eval_batch_size=batch_size), rank, world)
+            loader = module.test_dataloader()
+            assert len(loader) == len(loader.batches) >= 1
+            for batch, window in zip(loader.batches, loader, strict=True):
+                assert len(batch) == len(window.frames) <= batch_size
+                seen.update(batch)
+                for row, index in enumerate(batch):
+                    truth = torch.from_numpy(module.split("test").read(index).position)
+                    assert torch.equal(window.frames[row, :, window.mask[row]], truth)
+        assert seen == Counter(range(7))
+
+    def test_order_is_stable(self, make_dataset):
+        loader = module_of(make_dataset(), eval_batch_size=2).test_dataloader()
+        assert loader.batches == ((0, 2), (1,))
+
+    def test_limit(self, make_dataset):
+        module = module_of(make_dataset(), limit_eval=1)
+        assert module.val_dataloader().batches == ((0,),)
+        assert module.test_dataloader().batches == ((0, 2), (1,))
+
+    def test_more_ranks_than_trajectories(self, make_dataset):
+        with pytest.raises(ConfigError, match=r"valid.h5: 2 trajectories cannot be shared by 3"):
+            as_rank(module_of(make_dataset()), 2, 3).val_dataloader()
+
+    def test_nothing_to_predict(self, make_dataset):
+        with pytest.raises(DataError, match="trajectory 00000: it has 2 frames, an evaluation needs 3"):
+            module_of(make_dataset(valid=((2, 5),))).val_dataloader()
+
+    def test_waterdrop(self, recorded):
+        module = TrajectoryDataModule(
+            path=str(recorded / "deepmind-waterdrop"), family="deepmind", gravity=[0, -9.81], eval_batch_size=2
+        )
+        windows = list(module.test_dataloader())
+        assert [len(window.frames) for window in windows] == [2, 1]
+        assert windows[0].target.shape[1] == 999
+
+
+class TestModule:
+    def test_ranks_train_on_different_windows(self, make_dataset):
+        loaders = [as_rank(module_of(make_dataset(train=TRAIN)), rank, 2).train_dataloader() for rank in (0, 1)]
+        batches = [[window.frames.sum() for window in islice(loader, 6)] for loader in loaders]
+        assert not set(map(float, batches[0])) & set(map(float, batches[1]))
+
+    def test_works_without_a_trainer(self, make_dataset):
+        loader = module_of(make_dataset()).train_dataloader()
+        window = next(iter(loader))
+        assert window.frames.shape[:2] == (2, 5)
+        assert torch.equal(next(iter(loader)).frames, window.frames)
+
+    def test_scene_and_description(self, make_dataset):
+        module = module_of(make_dataset(), boundary=["periodic", "wall"], gravity=[0, -1])
+        assert module.scene.gravity == (0, -1)
+        assert module.scene.periodic == (True, False)
+        assert "horizon=3" in str(module)
+
+    @pytest.mark.parametrize(
+        ("options", "named"),
+        [
+            ({}, "either"),
+            ({"path": "a", "name": "goop"}, "either"),
+            ({"path": "a", "horizon": 0}, "horizon = 0"),
+            ({"path": "a", "limit_eval": 0}, "limit_eval = 0"),
+            ({"path": "a", "generate": {"frames": 3}}, "generate cannot be combined with `path`"),
+            ({"name": "goop", "family": "deepmind"}, "family cannot be combined with `name`"),
+        ],
+    )
+    def test_contradictory_options(self, options, named):
+        with pytest.raises(ConfigError, match=named):
+            TrajectoryDataModule(**options)
+
+    def test_missing_split(self, make_dataset):
+        module = module_of(make_dataset(valid=()))
+        with pytest.raises(DataError, match=r"no valid.h5 there \(found: train, test\)"):
+            module.val_dataloader()
+
+    def test_missing_folder(self, tmp_path):
+        with pytest.raises(DataError, match="nowhere: no such folder"):
+            _ = module_of(tmp_path / "nowhere").scene
+
+    def test_trajectory_shorter_than_the_horizon(self, make_dataset):
+        with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* needs 10.*horizon"):
+            module_of(make_dataset(train=TRAIN), horizon=8).train_dataloader()

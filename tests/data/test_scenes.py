@@ -1,0 +1,201 @@
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
+from nmpm.data.scenes import infer_scene
+from nmpm.errors import ConfigError, DataError
+
+
+def lattice(spacing: float, low: float = 0.3, count: int = 8, dim: int = 2, frames: int = 3) -> np.ndarray:
+    """(T, N, D) particles at rest on a square lattice."""
+    axis = low + spacing * np.arange(count)
+    points = np.stack(np.meshgrid(*[axis] * dim), axis=-1).reshape(1, -1, dim)
+    return np.repeat(points, frames, axis=0)
+
+
+BOX = Metadata(
+    bounds=((0.1, 0.9),) * 2,
+    dt=0.0025,
+    dim=2,
+    sequence_length=3,
+    particle_types={0: "rigid", 3: "boundary", 5: "water", 7: "goop"},
+    static_types=frozenset({3}),
+)
+
+
+@pytest.fixture(scope="module")
+def scene_of(tmp_path_factory):
+    def infer(*runs: Trajectory, metadata: Metadata = BOX, split: str = "train", **arguments):
+        folder = tmp_path_factory.mktemp("dataset")
+        write_metadata(folder, metadata)
+        write_split(folder / f"{split}.h5", runs)
+        return infer_scene(folder, **arguments)
+
+    return infer
+
+
+def run(position: np.ndarray, types: int | np.ndarray = 7, **attributes: object) -> Trajectory:
+    return Trajectory(position, np.broadcast_to(types, position.shape[1]), attributes)
+
+
+class TestExtents:
+    def test_box_with_a_wall_layer(self, scene_of):
+        scene = scene_of(run(lattice(0.01)))
+        assert scene.bounds == ((0.1, 0.9), (0.1, 0.9))
+        np.testing.assert_allclose(scene.domain, [(0.08, 0.92)] * 2)
+        assert scene.boundary == ("wall", "wall")
+
+    @given(shift=st.floats(-3, 3), scale=st.floats(0.1, 10))
+    @settings(max_examples=25, deadline=None)
+    def test_contains_what_was_seen(self, scene_of, shift, scale):
+        position = shift + scale * lattice(0.05)
+        scene = scene_of(run(position.astype(np.float32)))
+        for (low, high), (outer_low, outer_high) in zip(scene.bounds, scene.domain, strict=True):
+            assert outer_low < low <= min(0.1, np.float32(position.min()))
+            assert outer_high > high >= max(0.9, np.float32(position.max()))
+
+    def test_stated_domain(self, scene_of):
+        stated = replace(BOX, domain=((0.0, 1.0), (0.05, 0.95)))
+        assert scene_of(run(lattice(0.01)), metadata=stated).domain == ((0.0, 1.0), (0.05, 0.95))
+        position = lattice(0.01)
+        position[:, 0, 1] = 0.04
+        with pytest.raises(DataError, match=r"domain \[0.05, 0.95\] on axis 1 .* from 0.04 to .*Widen"):
+            scene_of(run(position), metadata=stated)
+
+    def test_no_layer_on_a_periodic_axis(self, scene_of):
+        scene = scene_of(run(lattice(0.01)), boundary=["periodic", "wall"])
+        assert scene.boundary == ("periodic", "wall")
+        assert scene.domain[0] == scene.bounds[0] == (0.1, 0.9)
+        assert scene.domain[1] != scene.bounds[1]
+
+    def test_arguments_override_the_metadata(self, scene_of):
+        scene = scene_of(run(lattice(0.01)), bounds=[(0, 2), (0, 1)], gravity=[0, -1])
+        assert scene.bounds == ((0, 2), (0, 1))
+        np.testing.assert_allclose(scene.domain, [(-0.05, 2.05), (-0.025, 1.025)])
+        assert scene.gravity == (0, -1)
+
+    @pytest.mark.parametrize(
+        "arguments", [{"gravity": [0.0]}, {"bounds": [(0, 1)]}, {"boundary": ["wall"]}, {"boundary": ["wall", "open"]}]
+    )
+    def test_arguments_that_do_not_fit(self, scene_of, arguments):
+        with pytest.raises(ConfigError, match=next(iter(arguments))):
+            scene_of(run(lattice(0.01)), **arguments)
+
+
+class TestParticles:
+    def test_materials_that_occur_in_order_of_id(self, scene_of):
+        position = lattice(0.01)
+        scene = scene_of(run(position, 7), run(position, 5))
+        assert scene.materials == ("water", "goop")
+        assert not scene.obstacles
+
+    def test_obstacles(self, scene_of):
+        position = lattice(0.01)
+        types = np.where(np.arange(position.shape[1]) < 9, 3, 7)
+        scene = scene_of(run(position, types))
+        assert scene.materials == ("goop",)
+        assert scene.obstacles
+
+    @pytest.mark.parametrize("dim", [1, 2, 3])
+    def test_volume_from_the_spacing(self, scene_of, dim):
+        box = replace(BOX, dim=dim, bounds=((0.1, 0.9),) * dim, periodic=())
+        scene = scene_of(run(lattice(0.02, dim=dim)), metadata=box)
+        assert scene.particle_volume == pytest.approx(0.02**dim, rel=1e-4)
+
+    def test_spacing_wraps_on_a_periodic_axis(self, scene_of):
+        # Two columns that are neighbours across the border only.
+        position = np.array([[[0.105, 0.2], [0.895, 0.2], [0.105, 0.6], [0.895, 0.6]]] * 3)
+        scene = scene_of(run(position), boundary=["periodic", "wall"])
+        assert scene.particle_volume == pytest.approx(0.01**2, rel=1e-4)
+
+    def test_stated_volume(self, scene_of):
+        assert scene_of(run(lattice(0.02)), metadata=replace(BOX, particle_volume=0.5)).particle_volume == 0.5
+
+    def test_volume_that_cannot_be_known(self, scene_of):
+        with pytest.raises(DataError, match="particle_volume"):
+            scene_of(run(lattice(0.02, count=1)))
+
+    def test_nothing_moves(self, scene_of):
+        with pytest.raises(DataError, match="none of its particles moves"):
+            scene_of(run(lattice(0.01), 3))
+
+    def test_unknown_type(self, scene_of):
+        with pytest.raises(DataError, match=r"trajectory 00001: unknown particle type 6 \(known: 0 rigid"):
+            scene_of(run(lattice(0.01)), run(lattice(0.01), 6))
+
+    def test_dimensions_contradict(self, scene_of):
+        with pytest.raises(DataError, match=r"positions have 3 dimensions, metadata.json says 2"):
+            scene_of(run(lattice(0.01, dim=3)))
+
+    def test_no_split(self, make_dataset):
+        folder = make_dataset(train=(), valid=(), test=())
+        with pytest.raises(DataError, match=r"no train.h5, valid.h5 or test.h5"):
+            infer_scene(folder)
+
+    def test_other_splits_serve_where_train_is_missing(self, scene_of):
+        assert scene_of(run(lattice(0.01)), split="test").materials == ("goop",)
+
+
+class TestGravity:
+    def test_unknown(self, scene_of):
+        scene = scene_of(run(lattice(0.01)))
+        assert scene.gravity is None
+        assert not scene.gravity_varies
+
+    def test_the_same_in_all_trajectories(self, scene_of):
+        scene = scene_of(*[run(lattice(0.01), gravity=[0.0, -2.0])] * 2)
+        assert scene.gravity == (0, -2)
+        assert not scene.gravity_varies
+
+    def test_varies(self, scene_of):
+        scene = scene_of(run(lattice(0.01), gravity=[0.0, -2.0]), run(lattice(0.01), gravity=[1.0, 0.0]))
+        assert scene.gravity is None
+        assert scene.gravity_varies
+
+    def test_one_differs_from_the_metadata(self, scene_of):
+        known = replace(BOX, gravity=(0.0, -9.81))
+        scene = scene_of(run(lattice(0.01)), run(lattice(0.01), gravity=[0.0, -2.0]), metadata=known)
+        assert scene.gravity == (0, -9.81)
+        assert scene.gravity_varies
+
+
+class TestRecorded:
+    def test_waterdrop(self, recorded):
+        scene = infer_scene(recorded / "deepmind-waterdrop", family="deepmind", gravity=(0, -9.81))
+        assert scene.dim == 2
+        assert scene.dt == 0.0025
+        assert scene.materials == ("water",)
+        assert not scene.obstacles
+        assert 0.0082**2 < scene.particle_volume < 0.0088**2
+        for name in ("train", "valid", "test"):
+            with h5py.File(recorded / "deepmind-waterdrop" / f"{name}.h5") as file:
+                for group in file.values():
+                    position = group["position"][()]
+                    for axis in range(2):
+                        low, high = position[..., axis].min(), position[..., axis].max()
+                        assert scene.domain[axis][0] < low
+                        assert high < scene.domain[axis][1]
+                        if name == "train":
+                            assert scene.bounds[axis][0] <= low
+                            assert high <= scene.bounds[axis][1]
+        np.testing.assert_allclose(scene.domain, [(0.08, 0.92)] * 2)
+
+    def test_heated_channel(self, recorded):
+        scene = infer_scene(
+            recorded / "jaxsph-heated-channel-2d", family="lagrangebench", boundary=("periodic", "wall")
+        )
+        assert scene.domain[0] == (0, 1)
+        assert scene.obstacles
+        assert scene.materials == ("fluid", "rigid")
+
+    def test_dambreak(self, recorded):
+        scene = infer_scene(recorded / "jaxsph-dambreak-2d")
+        assert scene.materials == ("fluid",)
+        assert scene.obstacles
+        assert scene.gravity == (0, -1)
+        assert scene.dt == pytest.approx(0.03)
