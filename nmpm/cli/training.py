@@ -33,9 +33,12 @@ class EmulatorCLI(LightningCLI):
                 "checkpoint.enable_version_counter": False,
             }
         )
-        parser.set_defaults({"weights_only": True} if "weights_only" in parser else {})
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
+
+    def before_instantiate_classes(self) -> None:
+        """Checkpoints are read as tensors and plain data: nothing in them is executed."""
+        self.config[self.subcommand]["weights_only"] = True
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""

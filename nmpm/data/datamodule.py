@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -93,10 +94,18 @@ class TrajectoryDataModule(LightningDataModule):
 
     @cached_property
     def folder(self) -> Path:
-        """Where the dataset's files are; an embedded one is simulated if it has not been yet."""
+        """Where the dataset's files are; an embedded one is simulated if it has not been yet.
+
+        Raises:
+            ConfigError: if `generate` holds an unknown option.
+        """
         if self.name is not None:
             from nmpm.data import catalog
 
+            try:
+                inspect.signature(catalog.ensure).bind(self.name, **self.generate)
+            except TypeError as error:
+                raise ConfigError(f"generate = {self.generate}: {error}.") from error
             return catalog.ensure(self.name, **self.generate)
         return Path(self.path or "")
 

@@ -121,10 +121,7 @@ def _complete(request: Request, folder: Path, workers: int) -> None:
     _simulate_parts(request, folder, workers)
     for split in SPLITS:
         _assemble(request, folder, split)
-    train = Split(folder / "train.h5")
-    # What is left of the parts goes first: nothing may come after the file that says all is done.
-    metadata = _metadata(request, train)
-    write_metadata(folder, metadata)
+    write_metadata(folder, _metadata(request, Split(folder / "train.h5")))
     shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
 

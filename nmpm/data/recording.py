@@ -136,27 +136,32 @@ def collate(recordings: Sequence[Recording], starts: Sequence[int], length: int,
     Returns:
         Window: of B scenes with T frames, padded to the largest.
     """
-    centre = torch.tensor([(low + high) / 2 for low, high in scene.domain])
-    batch, dim = len(recordings), scene.dim
-    count = max(len(recording.material) for recording in recordings)
-    statics = max(len(recording.obstacle) for recording in recordings)
-    window = Window(
-        frames=centre.expand(batch, length, count, dim).clone(),
-        material=torch.zeros(batch, count, dtype=torch.int64),
-        mask=torch.zeros(batch, count, dtype=torch.bool),
-        obstacle=centre.expand(batch, statics, dim).clone(),
-        obstacle_mask=torch.zeros(batch, statics, dtype=torch.bool),
+    cuts = [recording.frames[start : start + length] for recording, start in zip(recordings, starts, strict=True)]
+    centre = [(low + high) / 2 for low, high in scene.domain]
+    frames, mask = _padded(cuts, centre)
+    obstacle, obstacle_mask = _padded([recording.obstacle for recording in recordings], centre)
+    material, _ = _padded([recording.material[:, None] for recording in recordings], [0])
+    unwrap(frames, scene)
+    return Window(
+        frames=frames,
+        material=material[..., 0],
+        mask=mask,
+        obstacle=obstacle,
+        obstacle_mask=obstacle_mask,
         gravity=torch.stack([recording.gravity for recording in recordings]),
     )
-    for row, (recording, start) in enumerate(zip(recordings, starts, strict=True)):
-        particles, obstacles = len(recording.material), len(recording.obstacle)
-        window.frames[row, :, :particles] = recording.frames[start : start + length]
-        window.material[row, :particles] = recording.material
-        window.mask[row, :particles] = True
-        window.obstacle[row, :obstacles] = recording.obstacle
-        window.obstacle_mask[row, :obstacles] = True
-    unwrap(window.frames, scene)
-    return window
+
+
+def _padded(parts: Sequence[Tensor], filler: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Stacks (..., N_i, C) tensors to (B, ..., N, C), N the largest, with (B, N) telling what is not filler."""
+    counts = [part.shape[-2] for part in parts]
+    # NumPy copies in this thread alone; PyTorch would wait for its thread pool, which training needs.
+    padded = np.empty((len(parts), *parts[0].shape[:-2], max(counts), len(filler)), dtype=parts[0].numpy().dtype)
+    for row, (part, count) in enumerate(zip(parts, counts, strict=True)):
+        padded[row, ..., :count, :] = part.numpy()
+        padded[row, ..., count:, :] = filler
+    mask = np.arange(max(counts)) < np.asarray(counts)[:, None]
+    return torch.from_numpy(padded), torch.from_numpy(mask)
 
 
 def unwrap(frames: Tensor, scene: Scene) -> None:

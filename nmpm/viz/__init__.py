@@ -1,5 +1,7 @@
 """Pictures of particle trajectories: snapshots (PNG) and animations (GIF, MP4), drawn from NumPy arrays alone.
 
+Usage::
+
     exhibit = Exhibit({"simulation": truth, "prediction": rollout}, material, bounds=bounds, dt=dt)
     snapshots(exhibit, "rollout.png")
     animation(exhibit, "rollout.gif")

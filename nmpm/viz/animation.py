@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import imageio.v2 as imageio
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError
 from nmpm.viz.exhibit import Exhibit
-from nmpm.viz.gif_palette import GifPalette
+from nmpm.viz.gif_palette import TRANSPARENT, GifPalette
 from nmpm.viz.output import check_suffix, replacing
 from nmpm.viz.progress import tracked
 from nmpm.viz.reel import Reel
@@ -66,11 +66,23 @@ def animation(exhibit: Exhibit, path: Path | str, fps: float = 20.0, max_frames:
 
 def _write_gif(order: _Order, path: Path) -> None:
     spread = np.linspace(0, len(order.moments) - 1, SAMPLES).astype(int)
-    palette = GifPalette([order.reel.draw(order.moments[place]) for place in dict.fromkeys(spread.tolist())])
-    first, *rest = (palette.apply(frame) for frame in order.drawn())
-    frame_time = max(20, round(100 / order.fps) * 10)
+    samples = [order.reel.draw(order.moments[place]) for place in dict.fromkeys(spread.tolist())]
+    chosen = GifPalette(samples, order.reel.colours)
+    first, *rest = (chosen.apply(frame) for frame in order.drawn())
+    frame_time = round(100 / order.fps) * 10
     durations = [frame_time] * len(rest) + [max(frame_time, round(HOLD * 1000))]
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)
+    # With `optimize` and a transparent entry, a frame stores only the pixels that changed.
+    first.save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=rest,
+        duration=durations if rest else durations[0],
+        loop=0,
+        disposal=1,
+        optimize=True,
+        transparency=TRANSPARENT,
+    )
 
 
 def _write_mp4(order: _Order, path: Path) -> None:
@@ -78,9 +90,10 @@ def _write_mp4(order: _Order, path: Path) -> None:
         raise ConfigError(
             "MP4 needs a video encoder that is not installed: `pip install 'imageio[ffmpeg]'`, or write a .gif instead."
         )
-    with imageio.get_writer(
+    encoder: Any = imageio.get_writer(
         path, format="FFMPEG", mode="I", fps=order.fps, codec="libx264", quality=8, macro_block_size=2
-    ) as video:
+    )
+    with encoder as video:
         for frame in order.drawn():
             video.append_data(frame)
 

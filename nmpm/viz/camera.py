@@ -14,7 +14,7 @@ from nmpm.viz.exhibit import Exhibit, Floats
 
 AZIMUTH = math.radians(28)
 ELEVATION = math.radians(22)
-MARGIN = 0.015
+MARGIN = 0.008
 """Empty rim around the box, as a share of its longer side."""
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Rgb = tuple[int, int, int]
 
 PAGE: Rgb = (255, 255, 255)
-INTERIOR: Rgb = (250, 250, 248)
+INTERIOR: Rgb = (247, 247, 247)
 WALL: Rgb = (205, 209, 215)
 EDGE: Rgb = (168, 174, 183)
 INK: Rgb = (38, 42, 48)
@@ -81,7 +81,7 @@ def shaded(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
     tone = tones[(np.arange(len(colours), dtype=np.uint64) * 2654435761 >> 13) % len(tones)][:, None]
     base = colours.astype(np.float64)
     mixed = np.where(tone > 0, base + (255 - base) * tone, base * (1 + tone))
-    return np.round(mixed).astype(np.uint8)
+    return np.asarray(np.round(mixed), dtype=np.uint8)
 
 
 def css(ink: Rgb) -> str:

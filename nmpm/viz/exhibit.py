@@ -116,6 +116,13 @@ class Exhibit:
         reference, *others = self.rows
         return {label: self._distance(self.rows[reference], self.rows[label]) for label in others}
 
+    def wrapped(self, position: Floats) -> Floats:
+        """Positions (..., D) brought back into the box along the axes that wrap."""
+        if not any(self.periodic):
+            return position
+        low, high = np.array(self.bounds).T
+        return np.where(self.periodic, low + np.mod(position - low, high - low), position)
+
     def _distance(self, reference: Floats, other: Floats) -> NDArray[np.float64]:
         squares = np.zeros(self.frames)
         for axis, wraps in enumerate(self.periodic or (False,) * self.dim):
@@ -184,6 +191,6 @@ def _check_finite(position: Floats, label: str) -> None:
     if not finite.all():
         frame, particle = (int(index) for index in np.argwhere(~finite)[0])
         raise DataError(
-            f"Row {label!r}: particle {particle} is at {position[frame, particle].tolist()} in frame {frame}, the first "
-            f"of {int((~finite).sum())} positions that are not finite. Draw the frames before it, or mend the source."
+            f"Row {label!r}: particle {particle} is at {position[frame, particle].tolist()} in frame {frame}; "
+            f"{int((~finite).sum())} of the row's positions are not finite. Draw fewer frames, or mend the data."
         )

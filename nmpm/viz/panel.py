@@ -47,7 +47,7 @@ class Panel:
         self._stamp = _disc(FINENESS * self._diameter / 2)
         # Obstacles come first, so that in 2-D the material lies on top of them.
         obstacles = np.tile(np.array(OBSTACLE, dtype=np.uint8), (len(exhibit.obstacles), 1))
-        self._colours = np.concatenate([shaded(obstacles), shaded(self._material_colours())])
+        self._colours = np.concatenate([obstacles, shaded(self._material_colours())])
 
     def draw(self, position: Floats) -> NDArray[np.uint8]:
         """One frame.
@@ -58,7 +58,7 @@ class Panel:
         Returns:
             (height, width, 3), top row first.
         """
-        seen = self.camera.project(np.concatenate([self.exhibit.obstacles, position]))
+        seen = self.camera.project(np.concatenate([self.exhibit.obstacles, self.exhibit.wrapped(position)]))
         inside = self._inside(seen)
         seen, colours = seen[inside], self._colours[inside]
         if self.camera.deep:
@@ -66,12 +66,13 @@ class Panel:
             seen, colours = seen[order], _hazy(colours[order], seen[order, 2])
         canvas = self._backdrop.copy()
         self._splat(canvas, seen, colours)
-        image = Image.frombuffer("RGBA", canvas.shape[::-1], canvas.tobytes(), "raw", "RGBA", 0, 1)
+        # RGBX and not RGBA, whose reduction would first multiply by an opacity that is one everywhere.
+        image = Image.frombuffer("RGBX", canvas.shape[::-1], canvas.tobytes(), "raw", "RGBX", 0, 1)
         return np.asarray(image.reduce(FINENESS))[..., :3]
 
     def outside(self, position: Floats) -> int:
         """How many of the particles (N, D) lie outside the window."""
-        return int((~self._inside(self.camera.project(position))).sum())
+        return int((~self._inside(self.camera.project(self.exhibit.wrapped(position)))).sum())
 
     def pixel(self, point: Floats) -> tuple[int, int]:
         """Row and column of the pixel at which a point (D,) is drawn."""

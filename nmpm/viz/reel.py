@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from nmpm.viz.camera import camera_for
-from nmpm.viz.captions import clock, unseen
-from nmpm.viz.colours import FAINT_INK, INK, PAGE, palette
+from nmpm.viz.captions import clock, distance, unseen
+from nmpm.viz.colours import FAINT_INK, INK, OBSTACLE, PAGE, Rgb, palette
 from nmpm.viz.exhibit import Exhibit
 from nmpm.viz.panel import Panel
 
 RIM = 10
 HEADER = 26
 FOOTER = 26
-LINE = 20
+LINE = 22
 FONT = 13
 DOT = 9
 
@@ -39,7 +39,8 @@ class Reel:
         self.exhibit = exhibit
         camera = camera_for(exhibit)
         self._stacked = camera.width > 1.6 * camera.height
-        self._panel = Panel(exhibit, round(side * math.sqrt(camera.width / camera.height)) if self._stacked else side)
+        stretch = min(3.0, math.sqrt(camera.width / camera.height)) if self._stacked else 1.0
+        self._panel = Panel(exhibit, round(side * stretch))
         self._across, self._down = (1, len(exhibit.rows)) if self._stacked else (len(exhibit.rows), 1)
         self._errors = exhibit.errors()
 
@@ -53,27 +54,32 @@ class Reel:
         """Height in pixels, even as video codecs require."""
         return _even(self._titled + self._down * (HEADER + self._panel.height) + FOOTER + self._legend_line)
 
+    @property
+    def colours(self) -> list[Rgb]:
+        """The materials' and obstacles' colours."""
+        return [*palette(self.exhibit.materials).values(), OBSTACLE]
+
     def draw(self, frame: int) -> NDArray[np.uint8]:
         """One frame of the trajectories, (height, width, 3)."""
-        image = self._frame_free.copy()
+        image = self._unchanging.copy()
         draw = ImageDraw.Draw(image)
         for index, (label, position) in enumerate(self.exhibit.rows.items()):
             left, top = self._corner(index)
             image.paste(Image.fromarray(self._panel.draw(position[frame])), (left, top))
             words = [unseen(self._panel.outside(position[frame]))]
             if label in self._errors:
-                words.append(f"RMS error {self._errors[label][frame]:.4f}")
+                words.append(f"RMS error {distance(self.exhibit, self._errors[label][frame])}")
             note = ", ".join(word for word in words if word)
             draw.text((left + self._panel.width, top - 6), note, FAINT_INK, self._font, anchor="rs")
         draw.text((RIM, self._footer), self._time(frame), INK, self._font, anchor="ls")
         return np.asarray(image)
 
     @cached_property
-    def _frame_free(self) -> Image.Image:
+    def _unchanging(self) -> Image.Image:
         """What is the same in every frame."""
         image = Image.new("RGB", (self.width, self.height), PAGE)
         draw = ImageDraw.Draw(image)
-        draw.text((RIM, 20), self.exhibit.title, INK, self._bold, anchor="ls")
+        draw.text((RIM, 18), self.exhibit.title, INK, self._bold, anchor="ls")
         for index, label in enumerate(self.exhibit.rows):
             left, top = self._corner(index)
             draw.text((left, top - 6), label, INK, self._bold, anchor="ls")
@@ -97,7 +103,7 @@ class Reel:
         return f"frame {frame} of {self.exhibit.frames - 1}   {clock(self.exhibit, frame)}"
 
     def _length(self, text: str) -> int:
-        return math.ceil(self._font.getlength(text))
+        return int(np.ceil(self._font.getlength(text)))
 
     @property
     def _footer(self) -> int:
@@ -109,7 +115,7 @@ class Reel:
         return LINE if self.exhibit.title else 0
 
     @cached_property
-    def _legend(self) -> dict[str, tuple[int, int, int]]:
+    def _legend(self) -> dict[str, Rgb]:
         return palette(self.exhibit.materials) if len(self.exhibit.materials) > 1 else {}
 
     @cached_property

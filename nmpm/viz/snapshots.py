@@ -6,8 +6,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -16,8 +18,8 @@ from matplotlib.ticker import MaxNLocator
 
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import camera_for
-from nmpm.viz.colours import FAINT_INK, INK, Rgb, css, palette
 from nmpm.viz.captions import clock, unseen
+from nmpm.viz.colours import FAINT_INK, INK, Rgb, css, palette
 from nmpm.viz.exhibit import Exhibit
 from nmpm.viz.output import check_suffix, replacing
 from nmpm.viz.panel import Panel
@@ -25,6 +27,8 @@ from nmpm.viz.panel import Panel
 SUFFIXES = (".png",)
 DPI = 200
 FONT = 8.0
+LETTER = 18
+"""Length of a letter of a row's label in pixels, at most."""
 PANEL_SIDE = 330
 """Side of a square panel in pixels; other shapes cover the same area."""
 LINE_COLOURS = ("#c8442c", "#3a5fa8", "#5b7f2b", "#7a4fa0")
@@ -40,8 +44,9 @@ class _Layout:
     panel_height: int
     chart_height: int
     head: int
+    row_height: int
     left: int = 96
-    right: int = 24
+    right: int = 34
     titles: int = 58
     gap: int = 12
 
@@ -59,13 +64,13 @@ class _Layout:
 
     @property
     def chart_top(self) -> int:
-        return self.panels_top + self.rows * (self.panel_height + self.gap) + (58 if self.chart_height else 0)
+        return self.panels_top + self.rows * (self.row_height + self.gap) + (58 if self.chart_height else 0)
 
     def corner(self, row: int, column: int) -> tuple[int, int]:
         """Left and upper edge of a panel."""
         return (
             self.left + column * (self.panel_width + self.gap),
-            self.panels_top + row * (self.panel_height + self.gap),
+            self.panels_top + row * (self.row_height + self.gap) + (self.row_height - self.panel_height) // 2,
         )
 
 
@@ -104,6 +109,7 @@ def _figure(exhibit: Exhibit, moments: list[int]) -> Figure:
         rows=len(exhibit.rows),
         panel_width=panel.width,
         panel_height=panel.height,
+        row_height=max(panel.height, LETTER * max(map(len, exhibit.rows))),
         chart_height=190 if len(exhibit.rows) > 1 and exhibit.frames > 1 else 0,
         head=52 if headed else 6,
     )
@@ -120,7 +126,7 @@ def _figure(exhibit: Exhibit, moments: list[int]) -> Figure:
 
 def _panel_width(exhibit: Exhibit) -> int:
     camera = camera_for(exhibit)
-    return round(PANEL_SIDE * min(1.4, math.sqrt(camera.width / camera.height)))
+    return round(PANEL_SIDE * float(np.clip(math.sqrt(camera.width / camera.height), 0.6, 1.4)))
 
 
 def _draw_panels(figure: Figure, layout: _Layout, panel: Panel, moments: list[int]) -> None:
@@ -131,7 +137,9 @@ def _draw_panels(figure: Figure, layout: _Layout, panel: Panel, moments: list[in
             figure.figimage(panel.draw(position[frame]), left, layout.height - top - layout.panel_height)
             outside = panel.outside(position[frame])
             if outside:
-                _text(figure, layout, left + 12, top + 12, unseen(outside), ha="left", va="top", size=FONT - 2)
+                mark = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1.0}
+                words = unseen(outside)
+                _text(figure, layout, left + 14, top + 14, words, ha="left", va="top", size=FONT - 2, bbox=mark)
 
 
 def _write_labels(figure: Figure, layout: _Layout, exhibit: Exhibit, moments: list[int]) -> None:
@@ -167,20 +175,29 @@ def _write_head(figure: Figure, layout: _Layout, exhibit: Exhibit) -> None:
 def _draw_chart(figure: Figure, layout: _Layout, exhibit: Exhibit, moments: list[int]) -> None:
     width = layout.width - layout.left - layout.right
     bottom = layout.height - layout.chart_top - layout.chart_height
-    place = (layout.left, bottom, width, layout.chart_height)
-    scale = (layout.width, layout.height) * 2
-    axes: Axes = figure.add_axes([length / whole for length, whole in zip(place, scale, strict=True)])
+    axes: Axes = figure.add_axes(
+        (
+            layout.left / layout.width,
+            bottom / layout.height,
+            width / layout.width,
+            layout.chart_height / layout.height,
+        )
+    )
     reference, *_ = exhibit.rows
     errors = exhibit.errors()
     for (label, error), line in zip(errors.items(), LINE_COLOURS * len(errors), strict=False):
-        axes.plot(error, color=line, lw=1.3, label=f"{label} against {reference}", clip_on=False)
+        axes.plot(error, color=line, lw=1.3, label=f"{label} against {reference}")
     axes.set_xlim(0, exhibit.frames - 1)
-    axes.set_ylim(0, max(1e-12, *(1.08 * float(error.max()) for error in errors.values())))
+    largest = max(1e-12, *(float(error.max()) for error in errors.values()))
+    # Beyond the box's diagonal a prediction has left the box, and how far would only flatten the rest of the curve.
+    diagonal = math.dist(*zip(*exhibit.walls, strict=True))
+    axes.set_ylim(0, min(1.08 * largest, diagonal))
     axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_formatter("{x:g}")
     for frame in moments:
         axes.axvline(frame, color=css(FAINT_INK), lw=0.5, alpha=0.45, zorder=0)
     _label_chart(axes, errors)
-    title = "RMS position error (domain length)"
+    title = "RMS position error (domain length" + ("; cut at the box's diagonal)" if largest > diagonal else ")")
     _text(figure, layout, layout.left, layout.chart_top - 12, title, ha="left", va="bottom", weight="bold")
 
 
@@ -199,6 +216,6 @@ def _text(
     down: float,
     text: str,
     ink: Rgb = INK,
-    **style: object,
+    **style: Any,
 ) -> None:
     figure.text(right / layout.width, 1 - down / layout.height, text, color=css(ink), **style)

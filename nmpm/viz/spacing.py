@@ -8,7 +8,7 @@ import numpy as np
 
 from nmpm.viz.exhibit import Floats
 
-SAMPLES = 256
+SAMPLES = 64
 NEIGHBOURS = {2: 6, 3: 12}
 """Neighbours counted, by dimension: enough to even out random placement, few enough to stay near the particle."""
 UNIT_BALL = {2: math.pi, 3: 4 * math.pi / 3}

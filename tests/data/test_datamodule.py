@@ -14,6 +14,9 @@ from nmpm.particles import Window
 TRAIN = ((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:`isinstance.treespec", "ignore:.*was called without a model")
+
+
 class Recorder(LightningModule):
     """Learns something that depends on every batch, and remembers what it saw."""
 
@@ -134,7 +137,7 @@ class TestResuming:
         assert first.seen == second.seen
 
 
-@pytest.mark.filterwarnings("ignore:predict returned None", "ignore:`isinstance.treespec")
+@pytest.mark.filterwarnings("ignore:predict returned None")
 class TestTrainer:
     @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
     def test_runs_every_stage(self, make_dataset, tmp_path, precision):
@@ -198,6 +201,28 @@ class TestEvaluation:
         windows = list(module.test_dataloader())
         assert [len(window.frames) for window in windows] == [2, 1]
         assert windows[0].target.shape[1] == 999
+
+
+class TestEmbedded:
+    @pytest.fixture(autouse=True)
+    def empty_home(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+
+    def test_scene_before_simulation(self, tmp_path):
+        assert TrajectoryDataModule(name="goop").scene.materials == ("goop",)
+        assert not (tmp_path / "home").exists()
+
+    def test_simulates_on_first_use(self, tmp_path):
+        options = {"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 6}
+        module = TrajectoryDataModule(name="goop", horizon=3, batch_size=2, generate=options)
+        model = Recorder()
+        trainer_of(tmp_path, max_steps=2).fit(model, datamodule=module)
+        assert len(model.seen) == 2
+        assert len(module.split("train")) == 2
+
+    def test_unknown_option(self):
+        with pytest.raises(ConfigError, match="'count'"):
+            TrajectoryDataModule(name="goop", generate={"count": 3}).prepare_data()
 
 
 class TestModule:

@@ -1,0 +1,178 @@
+"""Contracts as tests: subclass them to check a processor or a transfer of your own.
+
+    class TestMine(ProcessorContract):
+        recipe = Mine(width=8)
+
+They need pytest, which the package itself does not.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from nmpm.grid import Grid
+from nmpm.processors import GridLayout, GridProcessor, Processor
+from nmpm.specs import from_spec, to_spec
+from nmpm.transfer import Transfer
+
+
+class ProcessorContract:
+    """What every processor promises.
+
+    Args:
+        recipe: The processor under test.
+        shapes: Grids that it takes, among them odd and elongated ones.
+    """
+
+    recipe: ClassVar[Processor]
+    shapes: ClassVar[tuple[tuple[int, ...], ...]] = ((16, 16), (13, 21), (16, 8, 11))
+
+    def network(self, shape: tuple[int, ...], inputs: int = 4, frames: int = 3) -> GridProcessor:
+        """A network for walls all around, with reproducible weights."""
+        torch.manual_seed(0)
+        return self.recipe.build(GridLayout(inputs, len(shape), frames, (False,) * len(shape)))
+
+    def test_output_shape(self) -> None:
+        for shape in self.shapes:
+            for inputs, frames in ((1, 1), (5, 3)):
+                out = self.network(shape, inputs, frames)(torch.randn(2, inputs, *shape))
+                assert out.shape == (2, frames, len(shape), *shape)
+                assert out.isfinite().all()
+
+    def test_scenes_of_a_batch_do_not_see_each_other(self) -> None:
+        for shape in self.shapes:
+            network, grid = self.network(shape).eval(), torch.randn(3, 4, *shape)
+            torch.testing.assert_close(network(grid)[1:2], network(grid[1:2]), rtol=1e-4, atol=1e-5)
+
+    def test_is_deterministic(self) -> None:
+        for shape in self.shapes:
+            network, grid = self.network(shape).eval(), torch.randn(2, 4, *shape)
+            assert torch.equal(network(grid), network(grid))
+
+    def test_gradient_reaches_every_parameter_and_the_input(self) -> None:
+        for shape in self.shapes:
+            network, grid = self.network(shape), torch.randn(2, 4, *shape, requires_grad=True)
+            network(grid).square().sum().backward()
+            silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+            assert not silent
+            assert grid.grad is not None
+            assert grid.grad.abs().sum() > 0
+
+    def test_takes_tiny_and_huge_inputs(self) -> None:
+        for scale in (0.0, 1e-20, 1e6):
+            for shape in self.shapes:
+                assert self.network(shape)(scale * torch.randn(1, 4, *shape)).isfinite().all()
+
+    def test_weights_survive_saving(self) -> None:
+        shape = self.shapes[0]
+        first, grid = self.network(shape).eval(), torch.randn(1, 4, *shape)
+        state = {name: value.clone() for name, value in first.state_dict().items()}
+        assert all(isinstance(value, Tensor) for value in state.values())
+        torch.manual_seed(1)
+        second = self.recipe.build(GridLayout(4, len(shape), 3, (False,) * len(shape))).eval()
+        second.load_state_dict(state)
+        assert torch.equal(first(grid), second(grid))
+
+    def test_recipe_survives_as_plain_data(self) -> None:
+        assert from_spec(to_spec(self.recipe), Processor) == self.recipe
+
+
+class TransferContract:
+    """What every transfer promises, in float64.
+
+    Args:
+        transfer: The transfer under test.
+        one_kernel: Whether p2g and g2p use the same kernel, so that they are adjoint.
+    """
+
+    transfer: ClassVar[Transfer]
+    one_kernel: ClassVar[bool] = True
+    grids: ClassVar[tuple[Grid, ...]] = (
+        Grid((9, 14), (0.0, 0.0), (0.1, 0.2), (False, False)),
+        Grid((8, 6), (-1.0, 3.0), (1.0, 1.0), (True, False)),
+        Grid((5, 7, 6), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (False, True, False)),
+    )
+
+    def cells(self, grid: Grid, margin: float = 0.0, count: int = 40) -> Tensor:
+        """(2, N, D) positions in the domain, at least `margin` cells from its faces."""
+        generator = torch.Generator().manual_seed(0)
+        unit = torch.rand(2, count, grid.dim, generator=generator, dtype=torch.float64)
+        return margin + unit * (torch.tensor(grid.shape) - 2 * margin)
+
+    def edges(self, grid: Grid) -> Tensor:
+        """(1, N, D) positions on faces, corners, cell borders and outside."""
+        n = torch.tensor(grid.shape, dtype=torch.float64)
+        zero = torch.zeros_like(n)
+        places = [zero, n, n / 2, n.floor() / 2, zero + 0.5, n - 0.5, zero - 1e-9, n + 1e-9, zero - 1e6, n + 1e6]
+        return torch.stack(places)[None]
+
+    def test_p2g_conserves_what_it_scatters(self) -> None:
+        for grid in self.grids:
+            for cells in (self.cells(grid), self.edges(grid)):
+                values = torch.randn(*cells.shape[:2], 3, dtype=torch.float64)
+                total = self.transfer.p2g(values, cells, grid).flatten(2).sum(-1)
+                torch.testing.assert_close(total, values.sum(1), rtol=1e-12, atol=1e-12)
+
+    def test_g2p_of_a_constant_is_that_constant_everywhere(self) -> None:
+        for grid in self.grids:
+            for cells in (self.cells(grid), self.edges(grid)):
+                field = torch.full((len(cells), 1, *grid.shape), 3.7, dtype=torch.float64)
+                gathered = self.transfer.g2p(field, cells, grid)
+                torch.testing.assert_close(gathered, torch.full_like(gathered, 3.7), rtol=1e-12, atol=1e-12)
+
+    def test_g2p_is_exact_on_linear_fields_in_the_interior(self) -> None:
+        for grid in self.grids:
+            cells = self.cells(grid, margin=1.5)
+            for axis in range(grid.dim):
+                centre = torch.arange(grid.shape[axis], dtype=torch.float64) + 0.5
+                shape = [1] * grid.dim
+                shape[axis] = -1
+                field = (2 * centre - 1).reshape(1, 1, *shape).expand(2, 1, *grid.shape)
+                gathered = self.transfer.g2p(field.contiguous(), cells, grid)[..., 0]
+                torch.testing.assert_close(gathered, 2 * cells[..., axis] - 1, rtol=1e-12, atol=1e-10)
+
+    def test_p2g_and_g2p_are_adjoint(self) -> None:
+        if not self.one_kernel:
+            return
+        for grid in self.grids:
+            cells = self.cells(grid)
+            values = torch.randn(2, cells.shape[1], 2, dtype=torch.float64)
+            field = torch.randn(2, 2, *grid.shape, dtype=torch.float64)
+            on_grid = (self.transfer.p2g(values, cells, grid) * field).sum()
+            on_particles = (values * self.transfer.g2p(field, cells, grid)).sum()
+            assert math.isclose(on_grid, on_particles, rel_tol=1e-10, abs_tol=1e-10)
+
+    def test_order_of_particles_does_not_matter(self) -> None:
+        for grid in self.grids:
+            cells = self.cells(grid)
+            values = torch.randn(2, cells.shape[1], 1, dtype=torch.float64)
+            order = torch.randperm(cells.shape[1])
+            one, other = self.transfer.p2g(values, cells, grid), self.transfer.p2g(values[:, order], cells[:, order], grid)
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+
+    def test_periodic_axes_wrap(self) -> None:
+        for grid in self.grids:
+            shift = torch.tensor([3.0 * n if wraps else 0.0 for n, wraps in zip(grid.shape, grid.periodic, strict=True)])
+            cells = self.cells(grid)
+            field = torch.randn(2, 2, *grid.shape, dtype=torch.float64)
+            one, other = self.transfer.g2p(field, cells, grid), self.transfer.g2p(field, cells + shift, grid)
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+
+    def test_gradients_are_right(self) -> None:
+        for grid in self.grids:
+            cells = self.cells(grid, margin=0.6, count=3)
+            field = torch.randn(2, 1, *grid.shape, dtype=torch.float64)
+            values = torch.randn(2, 3, 1, dtype=torch.float64)
+            for tensor in (cells, field, values):
+                tensor.requires_grad_()
+            assert torch.autograd.gradcheck(lambda c, f, g=grid: self.transfer.g2p(f, c, g), (cells, field))
+            assert torch.autograd.gradcheck(lambda v, c=cells.detach(), g=grid: self.transfer.p2g(v, c, g), (values,))
+            if self.one_kernel:
+                assert torch.autograd.gradcheck(lambda c, v=values, g=grid: self.transfer.p2g(v, c, g), (cells,))
+
+    def test_survives_as_plain_data(self) -> None:
+        assert from_spec(to_spec(self.transfer), Transfer) == self.transfer

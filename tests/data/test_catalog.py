@@ -1,0 +1,56 @@
+from pathlib import Path
+
+import pytest
+
+from nmpm.data import catalog
+from nmpm.data.format import Split, read_metadata
+from nmpm.errors import DataError
+
+COUNTS = {"train": 1, "valid": 1, "test": 1}
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+def test_home_is_the_environments_or_the_users_cache(home, monkeypatch):
+    assert catalog.dataset_home() == home
+    monkeypatch.delenv("NMPM_HOME")
+    assert catalog.dataset_home() == Path.home() / ".cache" / "nmpm"
+
+
+def test_goop_is_embedded():
+    assert "goop" in catalog.catalog()
+    assert dict(catalog.describe("goop").counts) == {"train": 200, "valid": 10, "test": 30}
+
+
+def test_the_scene_is_known_without_simulating(home):
+    scene = catalog.scene("goop")
+    assert scene.materials == ("goop",)
+    assert scene.bounds == ((0.1, 0.9), (0.1, 0.9))
+    assert not home.exists()
+
+
+def test_ensure_makes_a_dataset_once(home):
+    folder = catalog.ensure("goop", counts=COUNTS, frames=2)
+    assert folder.parent == home / "datasets"
+    assert folder.name.startswith("goop-")
+    assert read_metadata(folder).sequence_length == 2
+    assert Split(folder / "train.h5").frames(0) == 3
+    before = (folder / "train.h5").stat().st_mtime_ns
+    assert catalog.ensure("goop", counts=COUNTS, frames=2) == folder
+    assert (folder / "train.h5").stat().st_mtime_ns == before
+
+
+def test_the_folder_depends_on_all_that_determines_the_data(home):
+    variants = [{}, {"seed": 1}, {"frames": 2}, {"counts": COUNTS}]
+    folders = {catalog.folder_of("goop", catalog.request_of("goop", **variant)) for variant in variants}
+    assert len(folders) == len(variants)
+
+
+@pytest.mark.parametrize("ask", [catalog.ensure, catalog.scene, catalog.describe])
+def test_an_unknown_name_lists_the_known_ones(ask):
+    with pytest.raises(DataError, match=r"'treacle'.*goop"):
+        ask("treacle")

@@ -1,0 +1,205 @@
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmpm.data import generate as generator
+from nmpm.data.format import Split, read_metadata
+from nmpm.data.generate import generate
+from nmpm.errors import ConfigError, DataError
+from nmpm.sim import load_preset, simulate
+
+GOOP = load_preset("goop")
+TINY = dataclasses.replace(GOOP, frames=30, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
+COUNTS = {"train": 4, "valid": 1, "test": 2}
+
+KILLED = """
+import json, sys
+from pathlib import Path
+from nmpm.data.generate import generate
+from nmpm.sim.preset import preset_from_dict
+generate(preset_from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), json.loads(sys.argv[3]), workers=2)
+"""
+
+
+def fingerprints(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("goop")
+    generate(TINY, folder, COUNTS, seed=5, workers=1)
+    return folder
+
+
+def test_holds_the_simulated_trajectories_in_order(made):
+    for split, count in COUNTS.items():
+        assert len(Split(made / f"{split}.h5")) == count
+    read = Split(made / "valid.h5").read(0)
+    again = simulate(TINY, int(read.attributes["seed"]))
+    np.testing.assert_array_equal(read.position, again.position)
+    np.testing.assert_array_equal(read.particle_type, again.particle_type)
+
+
+def test_every_trajectory_has_its_own_seed(made):
+    seeds = [Split(made / f"{split}.h5").attributes(index)["seed"] for split, n in COUNTS.items() for index in range(n)]
+    assert len(set(seeds)) == sum(COUNTS.values())
+
+
+def test_metadata_states_the_facts_and_the_source(made):
+    metadata = read_metadata(made)
+    assert (metadata.bounds, metadata.dt, metadata.dim) == (GOOP.box, GOOP.frame_dt, 2)
+    assert metadata.sequence_length == 30
+    assert metadata.particle_types == {7: "goop"}
+    assert metadata.gravity == (0.0, -9.81)
+    assert metadata.domain == GOOP.domain
+    assert "nmpm" in metadata.extra["generator"]
+    assert "Simulated by nmpm" in metadata.extra["note"]
+    assert metadata.extra["simulation"]["seed"] == 5
+    assert metadata.extra["simulation"]["counts"] == COUNTS
+
+
+def test_metadata_has_the_statistics_of_the_training_split(made):
+    split = Split(made / "train.h5")
+    runs = [split.read(index).position.astype(np.float64) for index in range(len(split))]
+    extra = read_metadata(made).extra
+    for key, order in (("vel", 1), ("acc", 2)):
+        values = np.concatenate([np.diff(run, n=order, axis=0).reshape(-1, 2) for run in runs])
+        np.testing.assert_allclose(extra[f"{key}_mean"], values.mean(0), rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(extra[f"{key}_std"], values.std(0), rtol=1e-9)
+
+
+def test_two_workers_make_the_same_bytes(made, tmp_path):
+    generate(TINY, tmp_path, COUNTS, seed=5, workers=2)
+    assert fingerprints(tmp_path) == fingerprints(made)
+    assert not (tmp_path / ".parts").exists()
+
+
+def test_more_trajectories_begin_with_the_same_ones(made, tmp_path):
+    generate(TINY, tmp_path, {"train": 2, "valid": 1, "test": 3}, seed=5)
+    np.testing.assert_array_equal(
+        Split(tmp_path / "test.h5").read(1).position, Split(made / "test.h5").read(1).position
+    )
+
+
+def test_a_finished_dataset_is_left_alone(made):
+    before = {path: path.stat().st_mtime_ns for path in made.iterdir()}
+    generate(TINY, made, COUNTS, seed=5)
+    assert {path: path.stat().st_mtime_ns for path in made.iterdir()} == before
+
+
+def test_killed_and_called_again_it_makes_the_same_bytes(tmp_path):
+    counts = {"train": 60, "valid": 1, "test": 1}
+    killed = tmp_path / "killed"
+    arguments = [json.dumps(TINY.to_dict()), str(killed), json.dumps(counts)]
+    process = subprocess.Popen([sys.executable, "-c", KILLED, *arguments], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while len(list(killed.glob(".parts/*.npz"))) < 3 and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    (killed / ".train.h5.99999.part").write_bytes(b"half a file")
+    finished = {path.name: path.stat().st_mtime_ns for path in killed.glob(".parts/*.npz")}
+    assert 3 <= len(finished) < 60
+    assert not (killed / "metadata.json").exists()
+
+    generate(TINY, killed, counts)
+    generate(TINY, tmp_path / "whole", counts)
+    assert fingerprints(killed) == fingerprints(tmp_path / "whole")
+
+
+def interrupted(folder: Path, monkeypatch, seed: int = 0) -> None:
+    """Leaves a folder as an interruption after the fourth trajectory does."""
+    simulated: list[int] = []
+
+    def stops_at_the_fifth(preset, trajectory_seed):
+        if len(simulated) == 4:
+            raise KeyboardInterrupt
+        simulated.append(trajectory_seed)
+        return simulate(preset, trajectory_seed)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(generator, "simulate", stops_at_the_fifth)
+        with pytest.raises(KeyboardInterrupt):
+            generate(TINY, folder, COUNTS, seed, workers=1)
+
+
+def test_goes_on_with_the_parts_that_are_there(tmp_path, monkeypatch):
+    interrupted(tmp_path, monkeypatch)
+    assert len(list(tmp_path.glob(".parts/*.npz"))) == 4
+    simulated: list[int] = []
+    monkeypatch.setattr(generator, "simulate", lambda preset, seed: simulated.append(seed) or simulate(preset, seed))
+    generate(TINY, tmp_path, COUNTS, workers=1)
+    assert len(simulated) == 3
+
+
+def test_two_at_once_do_not_disturb_each_other(made, tmp_path):
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda _: generate(TINY, tmp_path, COUNTS, seed=5, workers=1), range(2)))
+    assert fingerprints(tmp_path) == fingerprints(made)
+
+
+def test_a_full_disk_is_an_error_that_can_be_mended(made, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(generator.np, "savez", full)
+        with pytest.raises(DataError, match="No space left") as caught:
+            generate(TINY, tmp_path, COUNTS, seed=5)
+    assert str(tmp_path) in str(caught.value)
+    assert not list(tmp_path.glob("*.h5"))
+    generate(TINY, tmp_path, COUNTS, seed=5)
+    assert fingerprints(tmp_path) == fingerprints(made)
+
+
+@pytest.mark.parametrize(
+    ("preset", "counts", "seed", "message"),
+    [
+        (TINY, COUNTS, 6, "seed is 5, asked 6"),
+        (TINY, {**COUNTS, "train": 5}, 5, "counts.train is 4, asked 5"),
+        (dataclasses.replace(TINY, frames=31), COUNTS, 5, "preset.frames is 30, asked 31"),
+    ],
+)
+def test_a_folder_of_other_data_is_refused(made, preset, counts, seed, message):
+    with pytest.raises(DataError, match=f"{message}.*[Cc]hoose another folder, or delete"):
+        generate(preset, made, counts, seed)
+
+
+def test_a_folder_in_the_making_of_other_data_is_refused(tmp_path, monkeypatch):
+    interrupted(tmp_path, monkeypatch, seed=1)
+    with pytest.raises(DataError, match="seed is 1, asked 2"):
+        generate(TINY, tmp_path, COUNTS, seed=2)
+
+
+def test_foreign_files_are_not_overwritten(tmp_path):
+    (tmp_path / "train.h5").write_bytes(b"precious")
+    with pytest.raises(DataError, match=r"train\.h5"):
+        generate(TINY, tmp_path, COUNTS)
+    assert (tmp_path / "train.h5").read_bytes() == b"precious"
+
+
+def test_a_damaged_part_is_named(tmp_path, monkeypatch):
+    interrupted(tmp_path, monkeypatch)
+    part = tmp_path / ".parts" / "train-00002.npz"
+    part.write_bytes(part.read_bytes()[:100])
+    with pytest.raises(DataError, match=r"train-00002.npz: damaged.*delete"):
+        generate(TINY, tmp_path, COUNTS)
+    assert not (tmp_path / "train.h5").exists()
+
+
+@pytest.mark.parametrize("counts", [{"train": 1}, {"train": 1, "valid": 1, "test": 0}, {**COUNTS, "more": 1}])
+def test_counts_that_cannot_be_are_refused(tmp_path, counts):
+    with pytest.raises(ConfigError, match="train, valid, test"):
+        generate(TINY, tmp_path, counts)

@@ -1,0 +1,218 @@
+import dataclasses
+
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.decoders import Absolute, Flip, Residual
+from nmpm.emulator import Emulator
+from nmpm.particles import Particles, Window
+from nmpm.processors import Pointwise, UNet
+from nmpm.rollout import rollout, stream, unroll
+from nmpm.transfer import Linear, Nearest, Quadratic
+
+SMALL = UNet(width=4, depth=1, perceptron=(4,))
+CASES = [(t, d) for t in (Nearest(), Linear(), Quadratic()) for d in (Absolute(), Residual(), Flip())]
+
+
+def small(scene, transfer=None, decoder=None, processor=SMALL, frames=3, cells=16):
+    torch.manual_seed(0)
+    return Emulator(scene, cells, frames, transfer, processor, decoder).eval()
+
+
+def silenced(emulator):
+    """The emulator with a network that always says zero."""
+    for parameter in emulator.processor.parameters():
+        torch.nn.init.zeros_(parameter)
+    return emulator
+
+
+@pytest.mark.parametrize(("transfer", "decoder"), CASES)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_every_combination_predicts_finite_bundles_within_the_walls(transfer, decoder, dim):
+    scene = box(dim, ("water", "sand"))
+    particles = cloud(scene, batch=2, speed=0.05)
+    emulator = small(scene, transfer, decoder, cells=8)
+    bundle = emulator(particles, emulator.solid(particles))
+    assert bundle.position.shape == (2, 3, 30, dim)
+    assert bundle.velocity.shape == (2, 30, dim)
+    assert bundle.position.min() >= 0.1 - 1e-6
+    assert bundle.position.max() <= 0.9 + 1e-6
+    torch.testing.assert_close(bundle.velocity, bundle.position[:, -1] - bundle.position[:, -2], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("transfer", [Linear(), Quadratic()])
+def test_free_fall_of_a_block_is_exact_where_gravity_is_known(transfer):
+    scene = box()
+    particles = cloud(scene)
+    particles = particles.moved(particles.position, torch.zeros_like(particles.velocity) + 1e-3)
+    path = rollout(silenced(small(scene, transfer, Residual(), frames=4)), particles, 20)
+    steps = torch.arange(1, 21).view(1, -1, 1, 1)
+    exact = particles.position[:, None] + 1e-3 * steps + particles.gravity[:, None, None] * steps * (steps + 1) / 2
+    torch.testing.assert_close(path, exact, atol=3e-6, rtol=0)
+
+
+def test_what_the_decoders_hold():
+    scene = box(gravity=None)
+    particles = cloud(scene, speed=0.003)
+    still = silenced(small(scene, decoder=Absolute()))
+    assert torch.allclose(rollout(still, particles, 3), particles.position[:, None].expand(-1, 3, -1, -1), atol=1e-6)
+    own = silenced(small(scene, decoder=Flip()))
+    expected = particles.position + 3 * particles.velocity
+    assert torch.allclose(rollout(own, particles, 3)[:, -1], expected, atol=1e-6)
+    smoothed = rollout(silenced(small(scene, decoder=Residual())), particles, 3)[:, -1] - particles.position
+    assert smoothed.var() < (3 * particles.velocity).var()
+
+
+@pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic()])
+def test_padding_changes_nothing_to_the_bit(transfer):
+    scene = box()
+    particles = cloud(scene, count=20)
+    padded = Particles(
+        position=torch.cat([particles.position, torch.full((1, 7, 2), 0.5)], 1),
+        velocity=torch.cat([particles.velocity, torch.full((1, 7, 2), 0.3)], 1),
+        material=torch.cat([particles.material, torch.zeros(1, 7, dtype=torch.long)], 1),
+        mask=torch.cat([particles.mask, torch.zeros(1, 7, dtype=torch.bool)], 1),
+        obstacle=torch.full((1, 3, 2), 0.5),
+        obstacle_mask=torch.zeros(1, 3, dtype=torch.bool),
+        gravity=particles.gravity,
+    )
+    emulator = small(scene, transfer)
+    assert torch.equal(rollout(emulator, padded, 9)[:, :, :20], rollout(emulator, particles, 9))
+
+
+def test_order_of_particles_only_reorders_the_prediction():
+    scene = box(materials=("water", "sand"))
+    particles = cloud(scene)
+    order = torch.randperm(30)
+    shuffled = dataclasses.replace(
+        particles,
+        position=particles.position[:, order],
+        velocity=particles.velocity[:, order],
+        material=particles.material[:, order],
+    )
+    emulator = small(scene)
+    torch.testing.assert_close(
+        rollout(emulator, shuffled, 6), rollout(emulator, particles, 6)[:, :, order], atol=1e-5, rtol=0
+    )
+
+
+@pytest.mark.parametrize(("factor", "offset"), [(1000.0, 0.0), (1.0, 50.0), (0.01, -3.0)])
+def test_neither_origin_nor_unit_of_length_matters(factor, offset):
+    scene = box(gravity=None)
+    moved = dataclasses.replace(
+        scene,
+        bounds=tuple((a * factor + offset, b * factor + offset) for a, b in scene.bounds),
+        domain=tuple((a * factor + offset, b * factor + offset) for a, b in scene.domain),
+        particle_volume=scene.particle_volume * factor**2,
+    )
+    particles = cloud(scene)
+    there = particles.moved(particles.position.double() * factor + offset, particles.velocity.double() * factor)
+    here = rollout(small(scene), particles, 6)
+    back = (rollout(small(moved), there, 6).double() - offset) / factor
+    torch.testing.assert_close(back.float(), here, atol=2e-5 * max(1, abs(offset)) , rtol=0)
+
+
+def test_each_material_follows_its_own_velocity_field():
+    scene = box(materials=("water", "sand"), gravity=None)
+    particles = cloud(scene)
+    emulator = silenced(small(scene, processor=Pointwise(), frames=1, decoder=Absolute()))
+    final = emulator.processor.perceptron[-1]
+    with torch.no_grad():
+        final.bias.copy_(torch.tensor([1.0, 0.0, 0.0, 2.0]))  # water to the right, sand upwards, in cells per frame
+    moved = emulator.grid.to_cell_displacement(rollout(emulator, particles, 1)[:, 0] - particles.position)
+    expected = torch.tensor([[1.0, 0.0], [0.0, 2.0]])[particles.material]
+    torch.testing.assert_close(moved, expected, atol=1e-4, rtol=0)
+
+
+def test_obstacles_reach_the_network_and_only_through_the_solid_channel():
+    scene = box(obstacles=True)
+    particles = cloud(scene, statics=12)
+    emulator = small(scene)
+    solid = emulator.solid(particles)
+    assert solid.shape == (1, 1, 16, 16)
+    assert 0 <= solid.min() <= solid.max() <= 1
+    without = dataclasses.replace(particles, obstacle_mask=torch.zeros_like(particles.obstacle_mask))
+    assert solid.sum() > emulator.solid(without).sum()
+    assert not torch.equal(rollout(emulator, particles, 3), rollout(emulator, without, 3))
+
+
+def test_walls_fill_the_share_of_the_domain_beyond_the_bounds():
+    scene = box()
+    emulator = small(scene, cells=64)
+    solid = emulator.solid(cloud(scene))
+    assert solid.mean().item() == pytest.approx(1 - (0.8 / 0.84) ** 2, rel=1e-5)
+
+
+def test_periodic_axes_wrap_and_walls_do_not():
+    scene = box(boundary=("periodic", "wall"), bounds=((0.0, 1.0), (0.1, 0.9)), domain=((0.0, 1.0), (0.08, 0.92)))
+    particles = cloud(scene)
+    elsewhere = particles.moved(particles.position + torch.tensor([2.0, 0.0]), particles.velocity)
+    emulator = small(scene)
+    torch.testing.assert_close(
+        rollout(emulator, elsewhere, 6) - torch.tensor([2.0, 0.0]), rollout(emulator, particles, 6), atol=1e-5, rtol=0
+    )
+
+
+def test_transfers_stay_in_float32_under_autocast():
+    scene = box()
+    particles = cloud(scene)
+    emulator = silenced(small(scene))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        low = rollout(emulator, particles, 6)
+    assert low.dtype == torch.float32
+    assert torch.equal(low, rollout(emulator, particles, 6))
+
+
+def test_gradients_through_several_bundles_are_finite_and_reach_the_first_state():
+    scene = box()
+    particles = cloud(scene)
+    position = particles.position.clone().requires_grad_()
+    emulator = small(scene)
+    last = list(unroll(emulator, particles.moved(position, particles.velocity), 3))[-1]
+    last.position.square().sum().backward()
+    assert position.grad.isfinite().all()
+    assert position.grad.abs().sum() > 0
+    assert all(p.grad.isfinite().all() for p in emulator.processor.parameters())
+
+
+def test_calibration_measures_what_the_network_has_to_give():
+    scene = box(gravity=None)
+    particles = cloud(scene, count=50, batch=4)
+    generator = torch.Generator().manual_seed(1)
+    steps = 0.002 + 0.001 * torch.randn(4, 6, 50, 2, generator=generator)
+    frames = particles.position[:, None] + steps.cumsum(1)
+    window = Window(frames, particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
+    emulator = small(scene, decoder=Absolute())
+    emulator.calibrate([window])
+    expected = emulator.grid.to_cell_displacement(steps[:, 2:]).square().mean((0, 1, 2)).sqrt()
+    torch.testing.assert_close(emulator.output_scale.squeeze().mean(0), expected, rtol=0.05, atol=0)
+    assert emulator.calibrated
+    normalised = (emulator._state(window.initial) - emulator.input_mean) / emulator.input_std
+    assert normalised.mean((0, 2, 3)).abs().max() < 1e-4
+    with pytest.raises(ValueError, match="at least 5 frames"):
+        emulator.calibrate([dataclasses.replace(window, frames=frames[:, :4])])
+
+
+def test_rollouts_are_cut_to_the_frames_asked_for():
+    scene = box()
+    particles, emulator = cloud(scene), small(scene, frames=3)
+    whole = rollout(emulator, particles, 9)
+    for frames in (0, 1, 3, 7):
+        assert torch.equal(rollout(emulator, particles, frames), whole[:, :frames])
+    assert [len(part[0]) for part in stream(emulator, particles, 7)] == [3, 3, 1]
+    with pytest.raises(ValueError, match="not -1"):
+        rollout(emulator, particles, -1)
+
+
+def test_streaming_leaves_the_gradient_mode_alone():
+    scene = box()
+    for _ in stream(small(scene), cloud(scene), 6):
+        assert torch.is_grad_enabled()
+
+
+def test_scenes_without_particles_are_fine():
+    scene = box()
+    emulator = small(scene)
+    assert rollout(emulator, cloud(scene, count=0), 3).shape == (1, 3, 0, 2)
+    assert rollout(emulator, cloud(scene, count=1), 3).isfinite().all()

@@ -1,0 +1,59 @@
+import dataclasses
+
+import pytest
+
+from nmpm.errors import ConfigError
+from nmpm.scene import Scene
+
+BOX = Scene(
+    bounds=((0.1, 0.9), (0.1, 0.9)),
+    domain=((0.08, 0.92), (0.08, 0.92)),
+    dt=0.0025,
+    materials=("goop",),
+    particle_volume=6e-5,
+    gravity=(0.0, -9.81),
+)
+
+
+def test_a_box_of_one_material_needs_four_channels():
+    assert BOX.input_channels == ("goop.velocity_x", "goop.velocity_y", "goop.volume", "solid")
+    assert BOX.output_channels == ("goop.velocity_x", "goop.velocity_y")
+
+
+def test_only_what_varies_becomes_a_channel():
+    open_box = dataclasses.replace(BOX, domain=BOX.bounds)
+    assert "solid" not in open_box.input_channels
+    assert "solid" in dataclasses.replace(open_box, obstacles=True).input_channels
+    assert "gravity_y" in dataclasses.replace(BOX, gravity_varies=True).input_channels
+    mixed = dataclasses.replace(BOX, materials=("water", "sand"))
+    assert len(mixed.input_channels) == 2 * 3 + 1
+    assert mixed.output_channels == mixed.input_channels[:4]
+
+
+def test_survives_as_plain_data():
+    scene = dataclasses.replace(BOX, boundary=("periodic", "wall"), obstacles=True)
+    assert Scene.from_dict(scene.to_dict()) == scene
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"domain": ((0.2, 0.92), (0.08, 0.92))}, "axis 0"),
+        ({"gravity": (0.0,)}, "gravity"),
+        ({"dt": 0.0}, "dt"),
+        ({"materials": ()}, "material"),
+        ({"materials": ("goop", "goop")}, "once"),
+        ({"boundary": ("wall", "mirror")}, "mirror"),
+        ({"particle_volume": float("nan")}, "particle_volume"),
+    ],
+)
+def test_contradictions_are_named(changes, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        dataclasses.replace(BOX, **changes)
+
+
+def test_unknown_keys_and_materials_are_named():
+    with pytest.raises(ConfigError, match="colour"):
+        Scene.from_dict(BOX.to_dict() | {"colour": "red"})
+    with pytest.raises(ConfigError, match=r"'lava'.*goop"):
+        BOX.material_index("lava")

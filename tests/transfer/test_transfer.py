@@ -1,0 +1,66 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.grid import Grid
+from nmpm.testing import TransferContract
+from nmpm.transfer import Linear, Nearest, Quadratic, gather
+
+
+class TestNearest(TransferContract):
+    transfer = Nearest()
+    one_kernel = False
+
+
+class TestLinear(TransferContract):
+    transfer = Linear()
+
+
+class TestQuadratic(TransferContract):
+    transfer = Quadratic()
+
+
+@pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic()])
+@settings(max_examples=30, deadline=None)
+@given(
+    shape=st.lists(st.integers(1, 9), min_size=1, max_size=3),
+    periodic=st.lists(st.booleans(), min_size=3, max_size=3),
+    count=st.integers(0, 6),
+    reach=st.sampled_from([0.3, 1.0, 3.0, 1e4]),
+    seed=st.integers(0, 2**16),
+)
+def test_any_grid_conserves_mass_and_keeps_constants(transfer, shape, periodic, count, reach, seed):
+    grid = Grid(tuple(shape), (0.0,) * len(shape), (1.0,) * len(shape), tuple(periodic[: len(shape)]))
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.randn(1, count, len(shape), generator=generator, dtype=torch.float64) * reach
+    mass = transfer.p2g(torch.ones(1, count, 1, dtype=torch.float64), cells, grid)
+    assert mass.sum().item() == pytest.approx(count, abs=1e-9)
+    assert (mass >= -1e-12).all()
+    gathered = transfer.g2p(torch.ones(1, 1, *shape, dtype=torch.float64), cells, grid)
+    torch.testing.assert_close(gathered, torch.ones_like(gathered), rtol=1e-9, atol=1e-9)
+
+
+def test_linear_sampler_equals_its_stencil():
+    grid = Grid((11, 17), (0.0, 0.0), (1.0, 1.0), (False, False))
+    cells = torch.rand(2, 50, 2, dtype=torch.float64) * 25 - 4
+    field = torch.randn(2, 3, 11, 17, dtype=torch.float64)
+    by_stencil = gather(Linear().gather_stencil(cells, grid), field.flatten(2).transpose(1, 2))
+    torch.testing.assert_close(Linear().g2p(field, cells, grid), by_stencil, rtol=1e-10, atol=1e-10)
+
+
+def test_axes_are_never_transposed():
+    grid = Grid((4, 7), (0.0, 0.0), (1.0, 1.0), (False, False))
+    cells = torch.tensor([[[3.5, 5.5]]], dtype=torch.float64)
+    for transfer in (Nearest(), Linear()):
+        mass = transfer.p2g(torch.ones(1, 1, 1, dtype=torch.float64), cells, grid)
+        assert mass[0, 0, 3, 5].item() == pytest.approx(1)
+
+
+def test_nearest_is_the_mean_of_a_voxel():
+    grid = Grid((4, 4), (0.0, 0.0), (1.0, 1.0), (False, False))
+    cells = torch.tensor([[[1.1, 2.9], [1.9, 2.1], [3.2, 0.5]]], dtype=torch.float64)
+    sums = Nearest().p2g(torch.tensor([[[1.0, 2.0], [1.0, 4.0], [1.0, 7.0]]], dtype=torch.float64), cells, grid)
+    assert sums[0, 1, 1, 2].item() / sums[0, 0, 1, 2].item() == 3.0
+    assert sums[0, 1, 3, 0].item() == 7.0
+    assert (sums[0, 0] > 0).sum().item() == 2
