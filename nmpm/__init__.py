@@ -6,22 +6,23 @@ The public names are imported when first used, so that `import nmpm` costs nothi
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from nmpm.version import __version__
+
 if TYPE_CHECKING:
     from nmpm.emulator import Emulator as Emulator
     from nmpm.particles import Particles as Particles
-    from nmpm.rollout import rollout as rollout
+    from nmpm.rollouts import rollout as rollout
     from nmpm.scene import Scene as Scene
     from nmpm.zoo import Zoo as Zoo
 
-__version__ = "0.1.0"
-__all__ = ["Emulator", "Particles", "Scene", "Zoo", "rollout"]
+__all__ = ["Emulator", "Particles", "Scene", "Zoo", "__version__", "rollout"]
 
 _HOMES = {
     "Emulator": "nmpm.emulator",
     "Particles": "nmpm.particles",
     "Scene": "nmpm.scene",
     "Zoo": "nmpm.zoo",
-    "rollout": "nmpm.rollout",
+    "rollout": "nmpm.rollouts",
 }
 
 

@@ -78,7 +78,8 @@ class Emulator(nn.Module):
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
         self.processor = self.recipe.build(GridLayout(inputs, outputs, frames, scene.periodic))
         if scene.dim == 2:
-            self.processor.to(memory_format=torch.channels_last)  # the layout in which p2g's output comes
+            # The layout in which p2g's output comes; twice as fast on a CPU.
+            self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
         column = (1,) * scene.dim
         self.register_buffer("input_mean", torch.zeros(inputs, *column))
         self.register_buffer("input_std", torch.ones(inputs, *column))
@@ -137,7 +138,8 @@ class Emulator(nn.Module):
             return gathered
         split = gathered.unflatten(-1, (len(self.scene.materials), self.scene.dim))
         chosen = material[..., None, None].expand(-1, -1, 1, self.scene.dim)
-        return split.gather(2, chosen).squeeze(2)
+        own: Tensor = split.gather(2, chosen).squeeze(2)
+        return own
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Stop particles at the walls; periodic axes go on (positions there are unwrapped, transfers wrap)."""

@@ -20,7 +20,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
         ValueError: if the shapes differ or there is no real particle.
     """
     if predicted.shape != target.shape:
-        raise ValueError(f"Predicted {tuple(predicted.shape)} and target {tuple(target.shape)} positions differ in shape.")
+        raise ValueError(f"Predicted {tuple(predicted.shape)} and target {tuple(target.shape)} positions do not match.")
     count = mask.sum()
     if not count:
         raise ValueError("A batch without particles has no position error.")

@@ -14,8 +14,8 @@ from typing import Any
 import yaml
 from safetensors.torch import save
 
+from nmpm.comparison import PREDICTORS, figure_names, table_row
 from nmpm.errors import ZooError
-from nmpm.report import PREDICTORS, figure_names, table_row
 from nmpm.training import EmulatorModule
 from nmpm.zoo import check_name, emulator_config
 
@@ -77,9 +77,7 @@ def _card(name: str, figures: Mapping[str, Any], digest: str) -> dict[str, Any]:
 def _readme(card: Mapping[str, Any], pictured: bool) -> str:
     training, test = card["training"], card["test"]
     names = figure_names(test)
-    rows = [
-        [label, *table_row(test, kind)] for kind, label in PREDICTORS.items()
-    ]
+    rows = [[label, *table_row(test, kind)] for kind, label in PREDICTORS.items()]
     lines = [
         f"# {card['name']}",
         "",

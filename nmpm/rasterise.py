@@ -1,5 +1,6 @@
 """From particles to the grid state that the processor sees: per material the mean velocity and the volume fraction,
-then whatever else the scene requires (`Scene.input_channels`)."""
+then whatever else the scene requires (`Scene.input_channels`).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ def grid_state(
     """The grid state in grid units, (B, C_in, *S).
 
     Args:
-        scene, grid, transfer: What to rasterise for, onto and with.
+        scene: Says which channels there are.
+        grid: What to rasterise onto.
+        transfer: How to.
         particles: Gives materials, mask and gravity.
         cells: (B, N, D) positions in cells.
         velocity: (B, N, D) in cells per frame.

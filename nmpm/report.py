@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import platform
 import time
@@ -16,14 +15,13 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from nmpm import __version__
-from nmpm.data.atomic import replacing
+from nmpm.atomic import replacing
+from nmpm.comparison import PREDICTORS, figure_names, table_row
 from nmpm.metrics import RolloutError
 from nmpm.particles import Window
 from nmpm.training import EmulatorModule
+from nmpm.version import __version__
 from nmpm.viz import Exhibit, animation, snapshots
-
-PREDICTORS = {"model": "model", "still": "nothing moves", "free_fall": "free fall, stopped at walls"}
 
 
 class Report(Callback):
@@ -65,15 +63,15 @@ class Report(Callback):
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not isinstance(pl_module, EmulatorModule):
             return
-        curves = {name: _gathered(pl_module.test_errors[name]) for name in PREDICTORS}
+        judged = {kind: _gathered(metric) for kind, metric in pl_module.test_errors.errors.items()}
         if not trainer.is_global_zero:
             return
         folder = Path(trainer.default_root_dir)
         folder.mkdir(parents=True, exist_ok=True)
-        figures = self._figures(trainer, pl_module, curves)
+        figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in judged.items()})
         with replacing(folder / "report.json") as part:
             part.write_text(json.dumps(figures, indent=1) + "\n")
-        _write_curves(folder / "errors.csv", {name: rows for name, (_, rows) in curves.items()})
+        _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in judged.items()})
         if self._exhibit is not None:
             exhibit = exhibit_of(pl_module, *self._exhibit)
             snapshots(exhibit, folder / "rollout.png")
@@ -84,14 +82,14 @@ class Report(Callback):
         return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
 
     def _figures(
-        self, trainer: Trainer, module: EmulatorModule, curves: Mapping[str, tuple[list[dict[str, float]], list[Tensor]]]
+        self, trainer: Trainer, module: EmulatorModule, per_trajectory: Mapping[str, list[dict[str, float]]]
     ) -> dict[str, Any]:
         datamodule = trainer.datamodule  # type: ignore[attr-defined]
         logged = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("test/")}
         return {
             "dataset": datamodule.description,
             "test": {key.removeprefix("test/"): value for key, value in sorted(logged.items())},
-            "per_trajectory": {name: rows for name, (rows, _) in curves.items()},
+            "per_trajectory": dict(per_trajectory),
             "training": {
                 "steps": trainer.global_step,
                 "seconds": round(self.trained_seconds, 1),
@@ -104,28 +102,20 @@ class Report(Callback):
         }
 
 
-def figure_names(test: Mapping[str, float]) -> list[str]:
-    """Names of the model's figures, horizons in order, the full rollout after them."""
-    names = [name for name in test if "/" not in name]
-    return sorted(names, key=lambda name: (not name.startswith("mse"), int((name.split("@") + ["1000000000"])[1])))
-
-
-def table_row(test: Mapping[str, float], kind: str) -> list[str]:
-    """A predictor's figures ×10⁻³, in the order of `figure_names`; empty where it has none."""
-    prefix = "" if kind == "model" else f"{kind}/"
-    return [f"{1e3 * test[prefix + name]:.4g}" if prefix + name in test else "" for name in figure_names(test)]
-
-
 def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exhibit:
-    """The first trajectory of a batch beside its prediction, as something to draw."""
+    """The first trajectory of a batch beside its prediction, as something to draw.
+
+    Both start with the two frames that the prediction started from; both end where the prediction is not finite.
+    """
     scene, real = module.emulator.scene, window.mask[0]
-    start = window.frames[0, 1:2, real]
-    rows = {
-        "truth": window.frames[0, 1:, real].numpy(),
-        "prediction": torch.cat([start, predicted[0][:, real]]).numpy(),
-    }
+    truth = window.frames[0][:, real]
+    prediction = torch.cat([truth[:2], predicted[0][:, real]])
+    broken = ~prediction.isfinite().flatten(1).all(1)
+    frames = int(broken.int().argmax()) if broken.any() else len(prediction)
+    rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
-    return Exhibit.of_scene(scene, rows, window.material[0, real].numpy(), obstacle)
+    title = f"The prediction is not finite from frame {frames} on" if broken.any() else ""
+    return Exhibit.of_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
 
 
 def hardware() -> str:
@@ -150,11 +140,10 @@ def _gathered(metric: RolloutError) -> tuple[list[dict[str, float]], list[Tensor
 
 
 def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
-    """Mean over trajectories of the squared error at each predicted frame, one column per predictor."""
-    shortest = {name: min((len(curve) for curve in rows), default=0) for name, rows in curves.items()}
-    means = {name: torch.stack([c[: shortest[name]] for c in rows]).mean(0) for name, rows in curves.items() if rows}
-    lines = [["frame", *means]]
-    lines += [[str(frame), *map(str, values)] for frame, values in enumerate(zip(*map(Tensor.tolist, means.values())), 1)]
+    """Mean over trajectories of the squared error at each frame that all of them reach, a column per predictor."""
+    frames = min(len(curve) for rows in curves.values() for curve in rows)
+    means = torch.stack([torch.stack([curve[:frames] for curve in rows]).mean(0) for rows in curves.values()], dim=1)
+    lines = [["frame", *curves], *([str(frame), *map(str, row)] for frame, row in enumerate(means.tolist(), 1))]
     with replacing(path) as part:
         part.write_text("".join(",".join(line) + "\n" for line in lines))
 

@@ -58,9 +58,7 @@ class Scene:
             raise ConfigError(f"A scene has 1, 2 or 3 axes; bounds {self.bounds} have {self.dim}.")
         for name in ("domain", "boundary") + (("gravity",) if self.gravity is not None else ()):
             if len(getattr(self, name)) != self.dim:
-                raise ConfigError(
-                    f"Scene.{name} = {getattr(self, name)} needs one entry for each of {self.dim} axes."
-                )
+                raise ConfigError(f"Scene.{name} = {getattr(self, name)} needs one entry for each of {self.dim} axes.")
         for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(self.bounds, self.domain, strict=True)):
             if not (outer_low <= low < high <= outer_high and math.isfinite(outer_high - outer_low)):
                 raise ConfigError(

@@ -1,4 +1,4 @@
-"""States to start a rollout from when there is no recording at hand: blocks of particles, thrown into the scene's box."""
+"""States to start a rollout from when there is no recording at hand: blocks of particles, thrown into the box."""
 
 from __future__ import annotations
 
@@ -31,8 +31,11 @@ def thrown_blocks(scene: Scene, count: int = 1000, blocks: int = 1, speed: float
     low, high = np.array(scene.bounds).T
     room = (high - low) / np.array([blocks] + [1] * (scene.dim - 1)) - side * spacing
     if room.min() < 0:
-        raise ValueError(f"{blocks} blocks of {side**scene.dim} particles, {side * spacing:.3g} wide, do not fit the box.")
-    lattice = spacing * (np.stack(np.meshgrid(*[np.arange(side)] * scene.dim, indexing="ij"), -1).reshape(-1, scene.dim) + 0.5)
+        raise ValueError(
+            f"{blocks} blocks of {side**scene.dim} particles, {side * spacing:.3g} wide, overfill the box."
+        )
+    nodes = np.indices((side,) * scene.dim).reshape(scene.dim, -1).T
+    lattice = spacing * (nodes + 0.5)
     shift = np.eye(scene.dim)[0] * (high - low)[0] / blocks
     corners = low + rng.uniform(0, room, (blocks, scene.dim)) + np.arange(blocks)[:, None] * shift
     position = torch.from_numpy((corners[:, None] + lattice).reshape(1, -1, scene.dim)).float()

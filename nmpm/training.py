@@ -10,17 +10,17 @@ import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim import Optimizer
 
-from nmpm.baselines import free_fall, still
+from nmpm.comparison import Comparison
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator import Emulator
 from nmpm.losses import position_error
-from nmpm.metrics import EarthMover, RolloutError
+from nmpm.metrics import EarthMover
 from nmpm.particles import Particles, Window
 from nmpm.processors import Processor, UNet
-from nmpm.rollout import rollout, unroll
+from nmpm.rollouts import rollout, unroll
 from nmpm.scene import Scene
 from nmpm.schedules import Schedule
 from nmpm.specs import from_spec, to_spec
@@ -101,9 +101,8 @@ class EmulatorModule(LightningModule):
             },
             logger=False,
         )
-        names = ("model", "still", "free_fall")
-        self.valid_errors = nn.ModuleDict({name: RolloutError(horizons) for name in names})
-        self.test_errors = nn.ModuleDict({name: RolloutError(horizons) for name in names})
+        self.valid_errors = Comparison(scene, horizons)
+        self.test_errors = Comparison(scene, horizons)
         self.earth_mover = EarthMover(emd) if emd else None
 
     def setup(self, stage: str) -> None:
@@ -123,11 +122,12 @@ class EmulatorModule(LightningModule):
         self.log("train/loss", loss, prog_bar=True)
         return loss
 
-    def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
-        self._judge(batch, self.valid_errors)
+    def validation_step(self, batch: Window, batch_idx: int) -> None:
+        self.valid_errors.update(batch, self.predict_step(batch, batch_idx))
 
-    def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
-        predicted = self._judge(batch, self.test_errors)
+    def test_step(self, batch: Window, batch_idx: int) -> Tensor:
+        predicted = self.predict_step(batch, batch_idx)
+        self.test_errors.update(batch, predicted)
         if self.earth_mover is not None:
             self.earth_mover.update(predicted, batch.target, batch.mask, batch.material)
         return predicted
@@ -137,18 +137,21 @@ class EmulatorModule(LightningModule):
         return rollout(self.emulator, batch.initial, batch.target.shape[1])
 
     def on_validation_epoch_start(self) -> None:
-        _reset(self.valid_errors)
+        self.valid_errors.reset()
 
     def on_test_epoch_start(self) -> None:
-        _reset(self.test_errors)
+        self.test_errors.reset()
+        if self.earth_mover is not None:
+            self.earth_mover.reset()
 
     def on_validation_epoch_end(self) -> None:
-        self._report("valid", self.valid_errors)
+        self.log_dict({f"valid/{name}": value for name, value in self.valid_errors.compute().items()})
 
     def on_test_epoch_end(self) -> None:
-        self._report("test", self.test_errors)
+        figures = self.test_errors.compute()
         if self.earth_mover is not None:
-            self.log_dict({f"test/{name}": value for name, value in self.earth_mover.compute().items()})
+            figures |= self.earth_mover.compute()
+        self.log_dict({f"test/{name}": value for name, value in figures.items()})
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         optimizer = self.make_optimizer(self.emulator.parameters())
@@ -170,22 +173,3 @@ class EmulatorModule(LightningModule):
             return particles
         noise = self.position_noise * torch.randn_like(particles.position)
         return particles.moved(particles.position + noise, particles.velocity)
-
-    def _judge(self, batch: Window, errors: nn.ModuleDict) -> Tensor:
-        frames = batch.target.shape[1]
-        predicted = rollout(self.emulator, batch.initial, frames)
-        errors["model"].update(predicted, batch.target, batch.mask)
-        errors["still"].update(still(batch.initial, frames), batch.target, batch.mask)
-        errors["free_fall"].update(free_fall(self.emulator.scene, batch.initial, frames), batch.target, batch.mask)
-        return predicted
-
-    def _report(self, split: str, errors: nn.ModuleDict) -> None:
-        prefixes = {"model": split, "still": f"{split}/still", "free_fall": f"{split}/free_fall"}
-        for kind, metric in errors.items():
-            for name, value in metric.compute().items():
-                self.log(f"{prefixes[kind]}/{name}", value, prog_bar=(kind, name) == ("model", "mse"))
-
-
-def _reset(errors: nn.ModuleDict) -> None:
-    for metric in errors.values():
-        metric.reset()

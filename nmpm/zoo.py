@@ -29,7 +29,7 @@ from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Particles
 from nmpm.processors import Processor
-from nmpm.rollout import rollout
+from nmpm.rollouts import rollout
 from nmpm.scene import Scene
 from nmpm.shipped import shipped
 from nmpm.specs import from_spec, to_spec

@@ -18,7 +18,9 @@ def box(dim: int = 2, materials: tuple[str, ...] = ("goop",), **changes) -> Scen
     return Scene(**(facts | changes))
 
 
-def cloud(scene: Scene, count: int = 30, batch: int = 1, speed: float = 0.002, seed: int = 0, statics: int = 0) -> Particles:
+def cloud(
+    scene: Scene, count: int = 30, batch: int = 1, speed: float = 0.002, seed: int = 0, statics: int = 0
+) -> Particles:
     """Random particles in the middle of the box, moving slowly."""
     generator = torch.Generator().manual_seed(seed)
     shape = (batch, count, scene.dim)

@@ -8,7 +8,7 @@ from nmpm.decoders import Absolute, Flip, Residual
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles, Window
 from nmpm.processors import Pointwise, UNet
-from nmpm.rollout import rollout, stream, unroll
+from nmpm.rollouts import rollout, stream, unroll
 from nmpm.transfer import Linear, Nearest, Quadratic
 
 SMALL = UNet(width=4, depth=1, perceptron=(4,))
@@ -110,7 +110,7 @@ def test_neither_origin_nor_unit_of_length_matters(factor, offset):
     there = particles.moved(particles.position.double() * factor + offset, particles.velocity.double() * factor)
     here = rollout(small(scene), particles, 6)
     back = (rollout(small(moved), there, 6).double() - offset) / factor
-    torch.testing.assert_close(back.float(), here, atol=2e-5 * max(1, abs(offset)) , rtol=0)
+    torch.testing.assert_close(back.float(), here, atol=2e-5 * max(1, abs(offset)), rtol=0)
 
 
 def test_each_material_follows_its_own_velocity_field():
@@ -182,7 +182,8 @@ def test_calibration_measures_what_the_network_has_to_give():
     generator = torch.Generator().manual_seed(1)
     steps = 0.002 + 0.001 * torch.randn(4, 6, 50, 2, generator=generator)
     frames = particles.position[:, None] + steps.cumsum(1)
-    window = Window(frames, particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
+    rest = (particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
+    window = Window(frames, *rest)
     emulator = small(scene, decoder=Absolute())
     emulator.calibrate([window])
     expected = emulator.grid.to_cell_displacement(steps[:, 2:]).square().mean((0, 1, 2)).sqrt()

@@ -3,9 +3,9 @@ import torch
 from scenes import box, cloud
 
 from nmpm.baselines import free_fall, still
+from nmpm.grid import Grid
 from nmpm.losses import position_error
 from nmpm.metrics import EarthMover, RolloutError, earth_mover
-from nmpm.grid import Grid
 
 
 def test_mse_at_h_is_the_mean_up_to_h_over_particles_and_dimensions():

@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-from nmpm import __version__
 from nmpm.errors import NmpmError
+from nmpm.version import __version__
 
 COMMANDS = {
     "fit": ("nmpm.cli.training", "Train an emulator, then test the best checkpoint once."),

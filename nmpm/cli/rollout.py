@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nmpm import __version__
 from nmpm.errors import ConfigError
+from nmpm.version import __version__
 
 if TYPE_CHECKING:
     from nmpm.particles import Particles
@@ -79,7 +79,7 @@ def _write(model: Pretrained, name: str, state: Particles, frames: int, path: Pa
     from rich.progress import track
 
     from nmpm.data.format import Trajectory, write_split
-    from nmpm.rollout import stream
+    from nmpm.rollouts import stream
 
     start = torch.stack([state.position - state.velocity, state.position], dim=1)
     bundles = -(-frames // model.emulator.frames)

@@ -19,34 +19,38 @@ from nmpm.report import Report
 from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule
 
+BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
+# A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best
+# does not change.
+LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
+
 
 class EmulatorCLI(LightningCLI):
     """Links what the model needs from the data and the other way round, and ends a fit with a test."""
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
-        parser.set_defaults(
-            {
-                "checkpoint.filename": "best",
-                "checkpoint.monitor": "valid/mse",
-                "checkpoint.save_last": True,
-                "checkpoint.enable_version_counter": False,
-            }
-        )
+        parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
+        parser.add_lightning_class_args(ModelCheckpoint, "resume")
+        parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
     def before_instantiate_classes(self) -> None:
-        """Checkpoints are read as tensors and plain data: nothing in them is executed."""
-        self.config[self.subcommand]["weights_only"] = True
+        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""
+        config = self.config[self.subcommand]
+        config["weights_only"] = True
+        config["trainer"]["default_root_dir"] = config["trainer"]["default_root_dir"] or "runs/default"
+        for saver in ("checkpoint", "resume"):
+            folder = Path(config["trainer"]["default_root_dir"]) / "checkpoints"
+            config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
         config = self.config_init[self.subcommand]["trainer"]
-        root = config.get("default_root_dir") or "runs/default"
-        kwargs["default_root_dir"] = root
         if config.get("logger") in (None, True):
-            kwargs["logger"] = [CSVLogger(root, name="", version=""), TensorBoardLogger(root, name="", version="")]
+            table = CSVLogger(config["default_root_dir"], name="logs")
+            kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
             kwargs.setdefault("callbacks", []).append(LearningRateMonitor("step"))
         kwargs.setdefault("callbacks", []).append(Report())
         return super().instantiate_trainer(**kwargs)

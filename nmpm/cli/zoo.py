@@ -12,7 +12,7 @@ from nmpm.shipped import shipped
 def run(words: list[str]) -> None:
     """Run a zoo command, e.g. ["zoo", "list"]."""
     parser = argparse.ArgumentParser(prog="nmpm zoo", description="The pretrained models.")
-    parser.add_argument("--root", type=Path, default=shipped("zoo"), help="folder of the zoo (default: the shipped one)")
+    parser.add_argument("--root", type=Path, default=shipped("zoo"), help="the zoo's folder (default: the shipped one)")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="names, data and full-rollout errors of the models")
     card = commands.add_parser("card", help="everything known of one model")

@@ -17,7 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm.data.atomic import replacing
+from nmpm.atomic import replacing
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
 from nmpm.data.metadata import read_metadata as read_metadata

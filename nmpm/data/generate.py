@@ -23,8 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-import nmpm
-from nmpm.data.atomic import replacing
+from nmpm.atomic import replacing
 from nmpm.data.folder_lock import locked
 from nmpm.data.format import (
     METADATA_FILE,
@@ -39,6 +38,7 @@ from nmpm.data.format import (
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset, simulate
 from nmpm.sim.mls_mpm import REVISION
+from nmpm.version import __version__
 
 _PARTS = ".parts"
 _REQUEST = "request.json"
@@ -165,7 +165,7 @@ def _difference(key: str, found: Any, asked: Any) -> str:
 
 def _sweep(folder: Path) -> None:
     """Remove what killed processes left half-written; the lock says that no other is writing."""
-    for stale in [*folder.glob(".*.part"), *(folder / _PARTS).glob(".*.part")]:
+    for stale in [*folder.glob(".*.part*"), *(folder / _PARTS).glob(".*.part*")]:
         stale.unlink(missing_ok=True)
 
 
@@ -233,7 +233,7 @@ def _shown(what: str, total: int, done: int = 0) -> Iterator[Callable[[], None]]
 def _metadata(request: Request, train: Split) -> Metadata:
     preset = request.preset
     provenance = {
-        "generator": f"nmpm {nmpm.__version__}, MLS-MPM",
+        "generator": f"nmpm {__version__}, MLS-MPM",
         "note": "Simulated by nmpm from the preset below; not measured, and not anybody else's dataset.",
     }
     return Metadata(

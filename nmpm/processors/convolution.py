@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 from torch import Tensor, nn
 from torch.nn import functional
 
-CONVOLUTIONS: dict[int, type[nn.Conv1d | nn.Conv2d | nn.Conv3d]] = {1: nn.Conv1d, 2: nn.Conv2d, 3: nn.Conv3d}
-TRANSPOSED: dict[int, type[nn.ConvTranspose1d | nn.ConvTranspose2d | nn.ConvTranspose3d]] = {
-    1: nn.ConvTranspose1d,
-    2: nn.ConvTranspose2d,
-    3: nn.ConvTranspose3d,
-}
+CONVOLUTIONS: dict[int, Callable[..., nn.Module]] = {1: nn.Conv1d, 2: nn.Conv2d, 3: nn.Conv3d}
+TRANSPOSED: dict[int, Callable[..., nn.Module]] = {1: nn.ConvTranspose1d, 2: nn.ConvTranspose2d, 3: nn.ConvTranspose3d}
 
 
 class Convolution(nn.Module):
@@ -41,7 +38,7 @@ class Upsampling(nn.Module):
     def __init__(self, channels: int, periodic: Sequence[bool]) -> None:
         super().__init__()
         self.padding = _circular_padding(periodic, 1)
-        cropped = tuple(3 if wraps else 1 for wraps in periodic)  # what circular padding added, doubled, and the overlap
+        cropped = tuple(3 if wraps else 1 for wraps in periodic)  # twice the padding, and the kernel's overlap
         self.convolution = TRANSPOSED[len(periodic)](channels, channels, 4, 2, cropped)
 
     def forward(self, grid: Tensor) -> Tensor:
@@ -55,7 +52,7 @@ class Upsampling(nn.Module):
 def pointwise(channels: Sequence[int], dim: int) -> nn.Sequential:
     """A perceptron applied to each cell: 1x1 convolutions of the given widths, LeakyReLU between."""
     layers: list[nn.Module] = []
-    for width, following in zip(channels[:-1], channels[1:], strict=True):
+    for width, following in pairwise(channels):
         layers += [CONVOLUTIONS[dim](width, following, 1), nn.LeakyReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 

@@ -58,11 +58,11 @@ class FNONetwork(GridProcessor):
             n_layers=recipe.layers,
             domain_padding=padding if any(padding) else None,
         )
-        self.register_state_dict_post_hook(_without_metadata)
+        self.register_state_dict_post_hook(_without_metadata)  # type: ignore[no-untyped-call]  # (torch's own)
 
     def forward(self, grid: Tensor) -> Tensor:
-        out: Tensor = self.operator(grid)
-        return out.unflatten(1, (self.frames, -1))
+        out: Tensor = self.operator(grid).unflatten(1, (self.frames, -1))
+        return out
 
 
 def _without_metadata(_module: nn.Module, state: dict[str, Any], _prefix: str, _local: object) -> None:

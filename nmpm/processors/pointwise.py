@@ -34,5 +34,5 @@ class PointwiseNetwork(GridProcessor):
         self.perceptron = pointwise(widths, layout.dim)
 
     def forward(self, grid: Tensor) -> Tensor:
-        out: Tensor = self.perceptron(grid)
-        return out.unflatten(1, (self.frames, -1))
+        out: Tensor = self.perceptron(grid).unflatten(1, (self.frames, -1))
+        return out

@@ -65,13 +65,9 @@ class UNetNetwork(GridProcessor):
         self.multiple = 2**recipe.depth
         hidden = recipe.perceptron
         self.encoder = pointwise([layout.in_channels, *hidden, width], layout.dim)
-        self.down = nn.ModuleList(
-            Convolution(width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1)
-        )
+        self.down = nn.ModuleList(Convolution(width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1))
         self.coarsen = nn.ModuleList(Convolution(width, width, 4, periodic, stride=2) for _ in range(recipe.depth))
-        self.up = nn.ModuleList(
-            Convolution(2 * width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1)
-        )
+        self.up = nn.ModuleList(Convolution(2 * width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1))
         self.refine = nn.ModuleList(Upsampling(width, periodic) for _ in range(recipe.depth))
         self.decoders = nn.ModuleList(
             pointwise([width, *hidden, layout.frames], layout.dim) for _ in range(layout.out_channels)
@@ -91,11 +87,18 @@ class UNetNetwork(GridProcessor):
             if level > 0:
                 hidden = _activate(self.refine[level - 1](hidden))
         fields = torch.stack([decoder(hidden) for decoder in self.decoders], dim=2)
-        return fields[(..., *(slice(n) for n in shape))]
+        return _cropped(fields, shape)
 
 
 def _activate(hidden: Tensor) -> Tensor:
     return functional.leaky_relu(hidden, inplace=True)
+
+
+def _cropped(fields: Tensor, shape: torch.Size) -> Tensor:
+    """The first cells of each space axis, (B, m, C, *shape)."""
+    for axis, cells in enumerate(shape, start=3):
+        fields = fields.narrow(axis, 0, cells)
+    return fields
 
 
 def _pad_to_multiple(grid: Tensor, multiple: int) -> Tensor:

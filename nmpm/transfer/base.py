@@ -48,7 +48,7 @@ class Transfer(ABC):
     def p2g(self, values: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Sum particle values (B, N, C) at `cells` (B, N, D) onto the nodes, (B, C, *S)."""
         summed = scatter(self.scatter_stencil(cells, grid), values, grid.size)
-        return summed.transpose(1, 2).unflatten(2, grid.shape)
+        return summed.transpose(1, 2).reshape(len(summed), -1, *grid.shape)
 
     def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Interpolate a grid field (B, C, *S) at `cells` (B, N, D), (B, N, C)."""

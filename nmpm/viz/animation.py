@@ -12,10 +12,11 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm.atomic import replacing
 from nmpm.errors import ConfigError
 from nmpm.viz.exhibit import Exhibit
 from nmpm.viz.gif_palette import TRANSPARENT, GifPalette
-from nmpm.viz.output import check_suffix, replacing
+from nmpm.viz.output import check_suffix
 from nmpm.viz.progress import tracked
 from nmpm.viz.reel import Reel
 

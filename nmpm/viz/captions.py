@@ -16,7 +16,8 @@ def clock(exhibit: Exhibit, frame: int) -> str:
 
 def distance(exhibit: Exhibit, length: float) -> str:
     """A distance in domain length, to about a thousandth of the box, with as many decimals for every frame;
-    in powers of ten where it is far beyond the box."""
+    in powers of ten where it is far beyond the box.
+    """
     longest = max(high - low for low, high in exhibit.bounds)
     decimals = max(0, 3 - math.floor(math.log10(longest)))
     return f"{length:.{decimals}f}" if length < 100 * longest else f"{length:.1e}"

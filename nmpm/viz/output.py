@@ -1,10 +1,8 @@
-"""Where pictures go: known formats, whole files."""
+"""Which formats pictures can be written in."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 from nmpm.errors import ConfigError
@@ -20,15 +18,3 @@ def check_suffix(path: Path, supported: Iterable[str], purpose: str) -> str:
     if suffix not in supported:
         raise ConfigError(f"Cannot write {purpose} to {path}: its name must end in {' or '.join(supported)}.")
     return suffix
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Gives a temporary path of the same suffix beside `path`, and renames it to `path` once all went well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from nmpm.atomic import replacing
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import camera_for
 from nmpm.viz.captions import clock, unseen
 from nmpm.viz.colours import FAINT_INK, INK, Rgb, css, palette
 from nmpm.viz.exhibit import Exhibit
-from nmpm.viz.output import check_suffix, replacing
+from nmpm.viz.output import check_suffix
 from nmpm.viz.panel import Panel
 
 SUFFIXES = (".png",)

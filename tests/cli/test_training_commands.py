@@ -1,0 +1,155 @@
+"""The shipped configurations are the integration tests: each trains, tests and reports under a tiny budget."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from nmpm.cli import main
+from nmpm.errors import ConfigError
+from nmpm.shipped import config_names, find_config
+from nmpm.training import EmulatorModule
+from nmpm.zoo import Zoo
+
+TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']
+TINY = [
+    *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
+    *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
+]
+
+
+@pytest.fixture(scope="session")
+def home(tmp_path_factory):
+    """One cache for all tests, so that the tiny goop is simulated once."""
+    return tmp_path_factory.mktemp("home")
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(home, tmp_path, monkeypatch):
+    monkeypatch.setenv("NMPM_HOME", str(home))
+    monkeypatch.chdir(tmp_path)
+
+
+def source(config: str, make_dataset) -> list[str]:
+    if yaml.safe_load(find_config(config).read_text())["data"].get("name"):
+        return TINY_GOOP
+    return ["--data.path", str(make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),)))]
+
+
+@pytest.mark.parametrize("config", config_names())
+def test_every_shipped_configuration_runs_to_its_report(config, make_dataset, capsys):
+    assert (
+        main(["fit", "--config", config, *TINY, *source(config, make_dataset), "--trainer.default_root_dir", "run"])
+        == 0
+    )
+    run = Path("run")
+    report = json.loads((run / "report.json").read_text())
+    assert report["training"]["steps"] == 2
+    for kind in ("", "still/", "free_fall/"):
+        assert report["test"][f"{kind}mse"] >= 0
+        assert report["test"][f"{kind}mse@32"] >= 0
+    assert len((run / "errors.csv").read_text().splitlines()) == 1 + len(range(2, 41 if "goop" in config else 40))
+    assert Image.open(run / "rollout.png").width > 300
+    assert Image.open(run / "rollout.gif").n_frames > 1
+    assert list(run.glob("logs/version_0/metrics.csv"))
+    assert list(run.glob("logs/version_0/events.out.tfevents.*"))
+    assert "free fall" in capsys.readouterr().out
+
+
+def test_every_part_can_be_swapped_by_class_name(make_dataset):
+    swaps = [
+        *("--model.processor", "nmpm.processors.FNO", "--model.processor.modes", "4", "--model.processor.width", "4"),
+        *("--model.transfer", "nmpm.transfer.Quadratic", "--model.decoder", "nmpm.decoders.Flip"),
+        *("--model.optimizer", "torch.optim.AdamW", "--model.optimizer.lr", "0.003"),
+        *("--trainer.logger", "lightning.pytorch.loggers.CSVLogger", "--trainer.logger.save_dir", "logs"),
+    ]
+    data = source("waterdrop.yaml", make_dataset)
+    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *swaps, "--trainer.default_root_dir", "run"]) == 0
+    saved = EmulatorModule.load_from_checkpoint(next(Path().rglob("best.ckpt")), weights_only=True)
+    assert type(saved.emulator.recipe).__name__ == "FNO"
+    assert saved.emulator.recipe.modes == 4
+    assert type(saved.emulator.transfer).__name__ == "Quadratic"
+    assert type(saved.emulator.decoder).__name__ == "Flip"
+    assert list(Path("logs").rglob("metrics.csv"))
+    assert not list(Path().rglob("events.out.tfevents.*"))
+
+
+def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dataset, tmp_path, capsys):
+    data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
+    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]) == 0
+    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data]) == 1
+    assert "--ckpt_path last" in capsys.readouterr().err
+    more = ["--trainer.max_steps", "4", "--ckpt_path", "last", "--resume.every_n_train_steps", "1"]
+    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *more]) == 0
+    assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 4
+    checked = ["--config", "waterdrop.yaml", *TINY, *data, "--ckpt_path", "run/checkpoints/best.ckpt"]
+    for command in ("validate", "test", "predict"):
+        assert main([command, *checked]) == 0
+    assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 0
+    assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 1
+    assert "exists" in capsys.readouterr().err
+    model = Zoo.load("drop/tiny", root=tmp_path / "zoo")
+    trained = EmulatorModule.load_from_checkpoint("run/checkpoints/best.ckpt", weights_only=True).emulator.eval()
+    state = model.example(count=50)
+    from nmpm import rollout
+
+    assert torch.equal(model.rollout(state, 20), rollout(trained, state, 20))
+    assert {p.name for p in (tmp_path / "zoo/drop/tiny").iterdir()} == {
+        *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png")
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["fit", "--config", "nowhere.yaml"], r"nowhere.yaml.*goop.yaml"),
+        (["fit", "--config", "goop.yaml", "--data.name", "lava"], r"lava.*goop"),
+        (["fit", "--config", "waterdrop.yaml", "--data.path", "nowhere"], r"nowhere"),
+        (["fit", "--config", "goop.yaml", *TINY_GOOP, "--model.cells", "4"], r"too small for a U-Net of depth 3"),
+        (["fit", "--config", "goop.yaml", *TINY, *TINY_GOOP, "--model.unroll", "20"], r"frames.*needs 162"),
+    ],
+)
+def test_mistakes_get_one_line_that_says_how_to_mend_them(words, complaint, capsys):
+    assert main(words) == 1
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(complaint, message)
+    assert len(message) < 600
+
+
+def test_an_unknown_key_is_named(capsys):
+    Path("mine.yaml").write_text("model: {widht: 3}\n")
+    with pytest.raises(SystemExit):
+        main(["fit", "--config", "mine.yaml"])
+    assert "widht" in capsys.readouterr().err
+
+
+def test_a_file_here_comes_before_the_shipped_one():
+    assert find_config("goop.yaml").parent.name == "configs"
+    Path("goop.yaml").write_text("seed_everything: 1\n")
+    assert find_config("goop.yaml") == Path("goop.yaml")
+    with pytest.raises(ConfigError, match=r"goop\.yaml"):
+        find_config("../goop.yaml")
+
+
+def test_help_answers_at_once_and_knows_every_command():
+    out = subprocess.run(
+        [sys.executable, "-m", "nmpm", "--help"], capture_output=True, text=True, check=True, env=os.environ
+    )
+    imported = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "nmpm", "--help"], capture_output=True, text=True, check=True
+    ).stderr
+    for command in ("fit", "validate", "test", "predict", "zoo", "rollout", "render"):
+        assert f"  {command} " in out.stdout
+    assert not any(f"| {heavy}\n" in imported for heavy in ("torch", "lightning", "numpy", "jsonargparse"))
+
+
+@pytest.mark.parametrize("words", [[], ["fly"]])
+def test_wrong_calls_exit_with_2(words):
+    assert main(words) == 2

@@ -1,0 +1,178 @@
+import functools
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
+
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.decoders import Absolute
+from nmpm.errors import NmpmError
+from nmpm.processors import UNet
+from nmpm.schedules import Schedule
+from nmpm.training import EmulatorModule
+from nmpm.transfer import Nearest
+
+TINY = UNet(width=4, depth=1, perceptron=(4,))
+
+
+def module_of(data: TrajectoryDataModule, **changes) -> EmulatorModule:
+    torch.manual_seed(0)
+    options = {"cells": 8, "frames": 2, "unroll": 2, "processor": TINY, "horizons": (1, 4), "position_noise": 1e-4}
+    return EmulatorModule(data.scene, **(options | {"grid_noise": 0.01} | changes))
+
+
+def data_of(folder: Path) -> TrajectoryDataModule:
+    return TrajectoryDataModule(path=str(folder), horizon=4, batch_size=2)
+
+
+def trainer_of(root: Path, steps: int, **options) -> lightning.Trainer:
+    defaults = {
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "val_check_interval": 2,
+        "check_val_every_n_epoch": None,
+        "num_sanity_val_steps": 0,
+        "gradient_clip_val": 1.0,
+    }
+    averaging = EMAWeightAveraging(decay=0.5, use_buffers=False)
+    last = ModelCheckpoint(root, filename="last", every_n_train_steps=2, enable_version_counter=False)
+    return lightning.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        default_root_dir=root,
+        callbacks=[averaging, last],
+        **(defaults | options),
+    )
+
+
+class Losses(lightning.Callback):
+    """Keeps the loss of every step."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.seen.append(outputs["loss"].item())
+
+
+def test_training_lowers_the_loss_and_reports_rollouts_beside_the_trivial_predictors(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    fast = functools.partial(torch.optim.Adam, lr=1e-2)
+    model = module_of(data, schedule=Schedule(warmup=2), position_noise=0.0, grid_noise=0.0, optimizer=fast)
+    trainer, losses = trainer_of(tmp_path, 80, val_check_interval=80), Losses()
+    trainer.callbacks.append(losses)
+    trainer.fit(model, data)
+    assert sum(losses.seen[-5:]) < 0.7 * sum(losses.seen[:5])
+    figures = trainer.callback_metrics
+    for kind in ("", "still/", "free_fall/"):
+        for name in ("mse", "mse@1", "mse@4"):
+            assert figures[f"valid/{kind}{name}"].isfinite()
+
+
+def test_a_resumed_training_ends_with_the_same_weights(make_dataset, tmp_path):
+    folder = make_dataset()
+    data = data_of(folder)
+    whole = module_of(data)
+    trainer_of(tmp_path / "whole", 8).fit(whole, data)
+    trainer_of(tmp_path / "parts", 4).fit(module_of(data), data_of(folder))
+    resumed, again = module_of(data), data_of(folder)
+    trainer_of(tmp_path / "parts", 8).fit(resumed, again, ckpt_path=tmp_path / "parts" / "last.ckpt", weights_only=True)
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_a_checkpoint_stands_alone(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    model = module_of(data, transfer=Nearest(), decoder=Absolute())
+    trainer_of(tmp_path, 2).fit(model, data)
+    loaded = EmulatorModule.load_from_checkpoint(tmp_path / "last.ckpt", weights_only=True, map_location="cpu")
+    assert loaded.emulator.scene == data.scene
+    assert (loaded.emulator.recipe, loaded.emulator.transfer, loaded.emulator.decoder) == (TINY, Nearest(), Absolute())
+    assert loaded.emulator.calibrated
+    for name, value in model.emulator.state_dict().items():
+        assert torch.equal(value, loaded.emulator.state_dict()[name]), name
+
+
+def test_a_pretrained_emulator_keeps_its_statistics(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    model = module_of(data)
+    model.emulator.input_std.fill_(3.0)
+    model.emulator.calibrated.fill_(True)
+    trainer_of(tmp_path, 1, val_check_interval=1).fit(model, data)
+    assert (model.emulator.input_std == 3.0).all()
+
+
+def test_bf16_trains(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    model = module_of(data)
+    trainer = trainer_of(tmp_path, 2, precision="bf16-mixed")
+    trainer.fit(model, data)
+    assert trainer.callback_metrics["train/loss"].isfinite()
+    assert all(p.dtype == torch.float32 for p in model.parameters())
+
+
+@pytest.mark.parametrize(
+    ("step", "factor"), [(0, 0.01), (50, 0.505), (100, 1.0), (999, 1.0), (50_500, 0.5), (1e5, 0.0)]
+)
+def test_schedule_is_the_papers(step, factor):
+    assert Schedule(warmup=100, flat=900, start=0.01).factor(step, 1e5) == pytest.approx(
+        factor, abs=2e-6 if step else 0
+    )
+
+
+def test_a_schedule_by_the_clock_ends_at_zero(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    model = module_of(data, schedule=Schedule(warmup=0))
+    trainer = trainer_of(tmp_path, 10**6, max_time="00:00:00:03", val_check_interval=10**6, limit_val_batches=0)
+    trainer.fit(model, data)
+    assert trainer.global_step < 10**6
+    assert trainer.optimizers[0].param_groups[0]["lr"] < 1e-5
+
+
+def test_a_trajectory_shorter_than_a_window_is_named(make_dataset, tmp_path):
+    data = data_of(make_dataset(train=((12, 5), (5, 5))))
+    with pytest.raises(NmpmError, match=r"train\.h5.*00001.*5 frames.*needs 6"):
+        trainer_of(tmp_path, 1, val_check_interval=1).fit(module_of(data), data)
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_training import data_of, module_of, trainer_of
+data = data_of(Path({folder!r}))
+root = Path({root!r})
+last = root / "last.ckpt"
+trainer_of(root, 60).fit(module_of(data), data, ckpt_path=last if last.exists() else None, weights_only=True)
+"""
+
+
+@pytest.mark.slow
+def test_kill_9_in_mid_training_loses_nothing_but_time(make_dataset, tmp_path):
+    folder = make_dataset()
+
+    def script(root: Path) -> list[str]:
+        text = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(folder), root=str(root))
+        return [sys.executable, "-c", text]
+
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    killed = subprocess.Popen(script(tmp_path / "killed"), env=environment, stderr=subprocess.DEVNULL)
+    while not (tmp_path / "killed" / "last.ckpt").exists():
+        assert killed.poll() is None, "it ended before its first checkpoint"
+        time.sleep(0.01)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    for root in (tmp_path / "killed", tmp_path / "whole"):
+        subprocess.run(script(root), env=environment, check=True, stderr=subprocess.DEVNULL)
+    states = [torch.load(tmp_path / name / "last.ckpt", weights_only=True) for name in ("killed", "whole")]
+    assert states[0]["global_step"] == states[1]["global_step"] == 60
+    for name, value in states[1]["state_dict"].items():
+        assert torch.equal(value, states[0]["state_dict"][name]), name
