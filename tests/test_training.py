@@ -151,7 +151,7 @@ from test_training import data_of, module_of, trainer_of
 data = data_of(Path({folder!r}))
 root = Path({root!r})
 last = root / "last.ckpt"
-trainer_of(root, 60).fit(module_of(data), data, ckpt_path=last if last.exists() else None, weights_only=True)
+trainer_of(root, 30).fit(module_of(data), data, ckpt_path=last if last.exists() else None, weights_only=True)
 """
 
 
@@ -173,6 +173,6 @@ def test_kill_9_in_mid_training_loses_nothing_but_time(make_dataset, tmp_path):
     for root in (tmp_path / "killed", tmp_path / "whole"):
         subprocess.run(script(root), env=environment, check=True, stderr=subprocess.DEVNULL)
     states = [torch.load(tmp_path / name / "last.ckpt", weights_only=True) for name in ("killed", "whole")]
-    assert states[0]["global_step"] == states[1]["global_step"] == 60
+    assert states[0]["global_step"] == states[1]["global_step"] == 30
     for name, value in states[1]["state_dict"].items():
         assert torch.equal(value, states[0]["state_dict"][name]), name

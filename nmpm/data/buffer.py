@@ -4,12 +4,14 @@ The trajectories of a dataset, shuffled again and again, form one endless row; b
 `buffer_size`. The windows of a buffer, shuffled again and again, form another endless row; batch after batch is cut
 from it, dealt to the ranks in turn, until `passes` times as many windows as an average buffer holds have been drawn.
 So every window is as likely as any other, no rank sees what another sees within a pass, and batch i of a rank is a
-pure function of the seed: training that stopped goes on with the batch it would have seen.
+pure function of the seed and the data: training that stopped goes on with the batch it would have seen.
+
+Where much of the recordings is rest, a share of the windows can be drawn in proportion to how much moves in them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +24,7 @@ from nmpm.data.recording import Recording, Recordings, collate
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 
-_TRAJECTORIES, _WINDOWS = 0, 1  # separate the streams of random numbers
+_TRAJECTORIES, _WINDOWS, _MOTION = 0, 1, 2  # separate the streams of random numbers
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,10 @@ class WindowPlan:
         buffer_size: Trajectories held at a time; all are held when there are no more than that.
         passes: How often a buffer's windows are seen, on average, before the next buffer.
         seed: Another seed gives another order.
+        emphasis: Share of the windows that is drawn in proportion to the motion in them, in [0, 1].
 
     Raises:
-        ConfigError: if a number is not positive.
+        ConfigError: if a number is out of its range.
     """
 
     frames: tuple[int, ...]
@@ -47,6 +50,7 @@ class WindowPlan:
     buffer_size: int
     passes: float
     seed: int
+    emphasis: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "buffer_size", "passes"):
@@ -54,6 +58,8 @@ class WindowPlan:
                 raise ConfigError(f"{name} = {getattr(self, name)} must be positive.")
         if self.seed < 0:
             raise ConfigError(f"seed = {self.seed} must not be negative.")
+        if not 0 <= self.emphasis <= 1:
+            raise ConfigError(f"emphasis = {self.emphasis} is a share, from 0 to 1.")
 
     def windows(self, trajectory: int) -> int:
         """How many windows a trajectory has."""
@@ -99,6 +105,33 @@ def _shuffle(total: int, *stream: int) -> np.ndarray:
     return order
 
 
+class Motion:
+    """Draws windows in proportion to the distance that their particles travel, on average.
+
+    Args:
+        held: Recordings by trajectory.
+        length: Frames of a window.
+    """
+
+    def __init__(self, held: Mapping[int, Recording], length: int) -> None:
+        travelled = {index: _travelled(recording, length) for index, recording in held.items()}
+        self.windows = [(index, start) for index, distance in travelled.items() for start in range(len(distance))]
+        self.cumulative = np.cumsum(np.concatenate(list(travelled.values())))
+
+    def draw(self, rng: np.random.Generator) -> tuple[int, int]:
+        """A window as (trajectory, first frame); any if nothing moves anywhere."""
+        place = rng.random() * self.cumulative[-1]
+        return self.windows[min(int(np.searchsorted(self.cumulative, place, side="right")), len(self.windows) - 1)]
+
+
+def _travelled(recording: Recording, length: int) -> np.ndarray:
+    """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
+    frames = recording.frames.numpy()
+    speed = np.linalg.norm(np.diff(frames, axis=0), axis=-1).mean(axis=-1, dtype=np.float64)
+    total = np.concatenate([[0.0], np.cumsum(speed)])
+    return np.asarray(total[length - 1 :] - total[: len(total) - length + 1])
+
+
 class TrajectoryBuffer:
     """Batches of training windows, without end, from trajectories held in memory.
 
@@ -126,14 +159,22 @@ class TrajectoryBuffer:
         with _reader() as reader:
             held = self._load(start // per_buffer, {})
             for buffer in count(start // per_buffer):
+                motion = Motion(held, self.plan.length) if self.plan.emphasis else None
                 upcoming: Future[dict[int, Recording]] = reader.submit(self._load, buffer + 1, held)
                 for index in range(max(start, buffer * per_buffer), (buffer + 1) * per_buffer):
-                    yield self._window(self.plan.batch(index, rank, world), held)
+                    drawn = self.plan.batch(index, rank, world)
+                    yield self._window(self._emphasised(drawn, motion, index, rank) if motion else drawn, held)
                 held = upcoming.result()
 
     def _load(self, buffer: int, held: dict[int, Recording]) -> dict[int, Recording]:
         members = self.plan.members(buffer)
         return {index: held[index] if index in held else self.recordings[index] for index in members}
+
+    def _emphasised(self, drawn: list[tuple[int, int]], motion: Motion, index: int, rank: int) -> list[tuple[int, int]]:
+        """The windows drawn, some of them replaced by others that were drawn in proportion to motion."""
+        rng = np.random.default_rng((self.plan.seed, _MOTION, index, rank))
+        replaced = rng.random(len(drawn)) < self.plan.emphasis
+        return [motion.draw(rng) if swap else window for swap, window in zip(replaced, drawn, strict=True)]
 
     def _window(self, drawn: list[tuple[int, int]], held: dict[int, Recording]) -> Window:
         trajectories, starts = zip(*drawn, strict=True)

@@ -34,6 +34,8 @@ class TrajectoryDataModule(LightningDataModule):
         batch_size: Training windows per batch and rank.
         buffer_size: Training trajectories held in memory at a time; twice as many while the next are read.
         passes: How often the windows of a buffer are seen, on average, before the next buffer.
+        emphasis: Share of the training windows that is drawn in proportion to the motion in them, in [0, 1]; the rest
+            is drawn evenly. Worth it where recordings end in long rest.
         seed: Order of the training windows.
         family: What the type ids in `path` mean where its metadata does not say: "deepmind" or "lagrangebench".
         gravity: Acceleration in length/s² per axis, instead of that in the metadata of `path`.
@@ -54,6 +56,7 @@ class TrajectoryDataModule(LightningDataModule):
         batch_size: int = 16,
         buffer_size: int = 16,
         passes: float = 4,
+        emphasis: float = 0.0,
         seed: int = 0,
         family: str | None = None,
         gravity: list[float] | None = None,
@@ -69,7 +72,7 @@ class TrajectoryDataModule(LightningDataModule):
                 raise ConfigError(f"{key} = {value} must be at least 1.")
         self.path, self.name, self.generate = path, name, dict(generate or {})
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
-        self.buffer_size, self.passes = buffer_size, passes
+        self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
         self.family, self.gravity, self.boundary = family, gravity, boundary
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
 
@@ -148,6 +151,7 @@ class TrajectoryDataModule(LightningDataModule):
             buffer_size=self.buffer_size,
             passes=self.passes,
             seed=self.seed,
+            emphasis=self.emphasis,
         )
         return TrainingLoader(TrajectoryBuffer(recordings, plan), self)
 

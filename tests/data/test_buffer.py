@@ -2,14 +2,16 @@ from collections import Counter
 from itertools import islice
 
 import h5py
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.buffer import TrajectoryBuffer, WindowPlan
+from nmpm.data.buffer import Motion, TrajectoryBuffer, WindowPlan
+from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.recording import Recordings
+from nmpm.data.recording import Recording, Recordings
 from nmpm.data.scenes import infer_scene
 from nmpm.errors import ConfigError, DataError
 
@@ -149,3 +151,35 @@ def test_waterdrop(recorded):
         truth = torch.from_numpy(split.read(trajectory, start, start + 18).position)
         assert torch.equal(window.frames[row, :, : truth.shape[1]], truth)
     torch.testing.assert_close(window.gravity, torch.tensor([[0, -9.81 * 0.0025**2]]).expand(16, 2))
+
+
+def test_emphasis_draws_windows_in_proportion_to_their_motion():
+    frames = torch.zeros(40, 3, 2)
+    frames[:10] = torch.arange(10).view(-1, 1, 1) * 0.01  # moves for 10 frames, then rests
+    frames[10:] = frames[9]
+    recording = Recording(frames, torch.zeros(3, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
+    motion = Motion({7: recording}, length=4)
+    rng = np.random.default_rng(0)
+    drawn = [motion.draw(rng) for _ in range(4000)]
+    assert {trajectory for trajectory, _ in drawn} == {7}
+    starts = np.bincount([start for _, start in drawn], minlength=37) / 4000
+    expected = np.array([min(3, max(0, 9 - start)) for start in range(37)]) / 24
+    np.testing.assert_allclose(starts, expected, atol=0.03)
+
+
+def test_emphasis_keeps_batches_a_function_of_their_number(make_dataset):
+    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, batch_size=4, emphasis=0.5)
+    buffer = data.train_dataloader().buffer
+    run = list(islice(buffer.batches(), 6))
+    resumed = list(islice(buffer.batches(start=3), 3))
+    for one, other in zip(run[3:], resumed, strict=True):
+        assert torch.equal(one.frames, other.frames)
+    plain = TrajectoryDataModule(path=data.path, horizon=4, batch_size=4).train_dataloader().buffer
+    assert any(not torch.equal(a.frames, b.frames) for a, b in zip(run, plain.batches(), strict=False))
+
+
+@pytest.mark.parametrize("emphasis", [-0.1, 1.5])
+def test_emphasis_is_a_share(make_dataset, emphasis):
+    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, emphasis=emphasis)
+    with pytest.raises(ConfigError, match="emphasis"):
+        data.train_dataloader()

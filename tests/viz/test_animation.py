@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from nmpm.atomic import replacing
 from nmpm.errors import ConfigError
 from nmpm.viz import animation
 from nmpm.viz.colours import INTERIOR, PAGE, WALL, colour
 from nmpm.viz.gif_palette import GROUND, SIZE, GifPalette, _cell
-from nmpm.viz.output import replacing
 from nmpm.viz.progress import tracked
 from nmpm.viz.reel import Reel
 
