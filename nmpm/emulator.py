@@ -119,9 +119,9 @@ class Emulator(nn.Module):
         smoothed = self._gather(state[:, : fields.shape[2]], cells, material)
         carried = self.decoder.carried(velocity, smoothed)
         path = []
-        for frame in range(1, self.frames + 1):
+        for frame, field in enumerate(fields.unbind(1), start=1):  # indexing would cost a zero-fill each, backwards
             known = carried + self.decoder.gained(gravity, frame).unsqueeze(1)
-            step = known + self._gather(fields[:, frame - 1], cells, material)
+            step = known + self._gather(field, cells, material)
             arrived = self._confine(cells + step)
             velocity = arrived - cells
             cells = arrived

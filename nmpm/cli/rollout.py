@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from nmpm.errors import ConfigError
-from nmpm.version import __version__
 
 if TYPE_CHECKING:
     from nmpm.particles import Particles
-    from nmpm.scene import Scene
     from nmpm.zoo import Pretrained
-
-BOUNDARY = 3
 
 
 def run(words: list[str]) -> None:
@@ -78,29 +71,10 @@ def _write(model: Pretrained, name: str, state: Particles, frames: int, path: Pa
     import torch
     from rich.progress import track
 
-    from nmpm.data.format import Trajectory, write_split
+    from nmpm.data.format import write_split
+    from nmpm.export import predicted_trajectory
     from nmpm.rollouts import stream
 
-    start = torch.stack([state.position - state.velocity, state.position], dim=1)
     bundles = -(-frames // model.emulator.frames)
-    parts = [start, *track(stream(model.emulator, state, frames), "rollout", total=bundles, transient=True)]
-    position = torch.cat(parts, dim=1)[0].numpy()
-    obstacle = np.broadcast_to(state.obstacle[0].numpy(), (len(position), *state.obstacle.shape[1:]))
-    types = _type_ids(model.scene)
-    ids = np.array(list(types), dtype=np.int64)[state.material[0].numpy()]
-    ids = np.concatenate([ids, np.full(obstacle.shape[1], BOUNDARY)])
-    attributes = {
-        "generator": f"nmpm {__version__}, predicted by the zoo model {name}",
-        "scene": json.dumps(model.scene.to_dict()),
-        "particle_types": json.dumps({**types, BOUNDARY: "boundary"}),
-        "static_types": np.array([BOUNDARY]),
-    }
-    write_split(path, [Trajectory(np.concatenate([position, obstacle], axis=1), ids, attributes)])
-
-
-def _type_ids(scene: Scene) -> dict[int, str]:
-    """DeepMind's id for each of the scene's materials, in order; beyond 100 for materials that it does not have."""
-    from nmpm.data.families import FAMILIES
-
-    ids = {name: number for number, name in FAMILIES["deepmind"].types.items()}
-    return {ids.get(name, 100 + index): name for index, name in enumerate(scene.materials)}
+    parts = list(track(stream(model.emulator, state, frames), "rollout", total=bundles, transient=True))
+    write_split(path, [predicted_trajectory(model.scene, state, torch.cat(parts, dim=1), f"the zoo model {name}")])

@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
+from nmpm.export import PredictionWriter
 from nmpm.report import Report
 from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule
@@ -52,7 +53,7 @@ class EmulatorCLI(LightningCLI):
             table = CSVLogger(config["default_root_dir"], name="logs")
             kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
             kwargs.setdefault("callbacks", []).append(LearningRateMonitor("step"))
-        kwargs.setdefault("callbacks", []).append(Report())
+        kwargs.setdefault("callbacks", []).extend([Report(), PredictionWriter()])
         return super().instantiate_trainer(**kwargs)
 
     def _parse_ckpt_path(self) -> None:

@@ -97,7 +97,7 @@ def _activate(hidden: Tensor) -> Tensor:
 def _cropped(fields: Tensor, shape: torch.Size) -> Tensor:
     """The first cells of each space axis, (B, m, C, *shape)."""
     for axis, cells in enumerate(shape, start=3):
-        fields = fields.narrow(axis, 0, cells)
+        fields = fields.narrow(axis, 0, cells) if fields.shape[axis] > cells else fields
     return fields
 
 
