@@ -25,8 +25,8 @@ class RolloutError(Metric):
     """
 
     full_state_update = False
-    squared: list[Tensor]
-    lengths: list[Tensor]
+    squared: list[Tensor] | Tensor  # one tensor once gathered from several processes
+    lengths: list[Tensor] | Tensor
 
     def __init__(self, horizons: Sequence[int] = (1, 8, 32, 100)) -> None:
         super().__init__()
@@ -44,14 +44,16 @@ class RolloutError(Metric):
         """
         squared = (predicted.double() - target.double()).square().mean(-1) * mask.unsqueeze(1)
         per_frame = squared.sum(-1) / mask.sum(-1, keepdim=True)
-        self.squared.append(per_frame.flatten().float())
-        self.lengths.append(torch.full((len(per_frame),), per_frame.shape[1], device=per_frame.device))
+        self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
+        self.lengths.append(  # type: ignore[union-attr]
+            torch.full((len(per_frame),), per_frame.shape[1], device=per_frame.device)
+        )
 
     def curves(self) -> list[Tensor]:
         """One (T,) curve of squared error against frame for each trajectory."""
-        if not self.lengths:
+        if not len(self.lengths):
             return []
-        lengths = dim_zero_cat(self.lengths).tolist()
+        lengths: list[int] = dim_zero_cat(self.lengths).tolist()
         return list(dim_zero_cat(self.squared).split(lengths))
 
     def per_trajectory(self) -> list[dict[str, float]]:

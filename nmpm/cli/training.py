@@ -84,7 +84,8 @@ class EmulatorCLI(LightningCLI):
 def run(words: list[str]) -> None:
     """Run a training command, e.g. ["fit", "--config", "goop.yaml"]."""
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    sys.argv = ["nmpm", *_with_shipped_configs(words)]  # Lightning warns of `args` that differ from the command line
+    # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
+    sys.argv = [sys.argv[0], *_with_shipped_configs(words)]
     EmulatorCLI(
         EmulatorModule,
         TrajectoryDataModule,
