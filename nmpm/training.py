@@ -13,6 +13,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.optim import Optimizer
 
+from nmpm.augmentation import check_mirrors, mirrored
 from nmpm.comparison import Comparison
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator import Emulator
@@ -51,6 +52,7 @@ class EmulatorModule(LightningModule):
         schedule: The learning rate's course over the training.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         grid_noise: Standard deviation of the noise on the normalised grid state in training.
+        mirror: Axes along which half of the training windows are mirrored; those without gravity.
         horizons: Frames at which rollout errors are reported, beside the full rollout.
         emd: Every how many frames to compute the exact earth mover's distance in tests; 0 for never (it is slow).
         seed: Of the noise.
@@ -69,6 +71,7 @@ class EmulatorModule(LightningModule):
         schedule: Schedule = Schedule(),  # noqa: B008
         position_noise: float = 0.0,
         grid_noise: float = 0.0,
+        mirror: Sequence[int] = (),
         horizons: Sequence[int] = (1, 8, 32, 100),
         emd: int = 0,
         seed: int = 0,
@@ -81,7 +84,8 @@ class EmulatorModule(LightningModule):
         self.unroll = unroll
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
-        self.position_noise = position_noise
+        check_mirrors(scene, mirror)
+        self.position_noise, self.mirror = position_noise, tuple(mirror)
         self.seed = seed
         self.save_hyperparameters(
             {
@@ -95,6 +99,7 @@ class EmulatorModule(LightningModule):
                 "schedule": to_spec(self.schedule)["init_args"],
                 "position_noise": position_noise,
                 "grid_noise": grid_noise,
+                "mirror": list(mirror),
                 "horizons": list(horizons),
                 "emd": emd,
                 "seed": seed,
@@ -116,6 +121,8 @@ class EmulatorModule(LightningModule):
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        for axis in self.mirror:
+            batch = mirrored(batch, self.emulator.scene, axis, torch.rand(len(batch.frames), device=self.device) < 0.5)
         bundles = unroll(self.emulator, self._perturbed(batch.initial), self.unroll)
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
         loss = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)

@@ -45,10 +45,8 @@ def source(config: str, make_dataset) -> list[str]:
 
 @pytest.mark.parametrize("config", config_names())
 def test_every_shipped_configuration_runs_to_its_report(config, make_dataset, capsys):
-    assert (
-        main(["fit", "--config", config, *TINY, *source(config, make_dataset), "--trainer.default_root_dir", "run"])
-        == 0
-    )
+    data = [*source(config, make_dataset), "--trainer.default_root_dir", "run"]
+    assert main(["fit", "--config", config, *TINY, *data]) == 0
     run = Path("run")
     report = json.loads((run / "report.json").read_text())
     assert report["training"]["steps"] == 2
@@ -109,6 +107,14 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert {p.name for p in (tmp_path / "zoo/drop/tiny").iterdir()} == {
         *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png")
     }
+
+
+def test_configurations_are_laid_over_one_another_and_refer_to_other_values(make_dataset):
+    Path("mine.yaml").write_text("trainer: {default_root_dir: 'run_${model.frames}_${data.batch_size}'}\n")
+    words = ["--config", "waterdrop.yaml", "--config", "mine.yaml", *TINY, *source("waterdrop.yaml", make_dataset)]
+    assert main(["fit", *words, "--model.frames", "3", "--model.emd", "10"]) == 0
+    report = json.loads(Path("run_3_2/report.json").read_text())
+    assert report["test"]["emd"] > 0
 
 
 @pytest.mark.parametrize(

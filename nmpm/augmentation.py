@@ -1,0 +1,54 @@
+"""Exact symmetries of scenes, used to show the network more than was recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nmpm.errors import ConfigError
+from nmpm.particles import Window
+from nmpm.scene import Scene
+
+
+def check_mirrors(scene: Scene, axes: Sequence[int]) -> None:
+    """Make sure that a mirror image along each axis is a scene of the same family.
+
+    Raises:
+        ConfigError: if an axis does not exist, or a gravity that the model is not told of acts along it.
+    """
+    for axis in axes:
+        if not 0 <= axis < scene.dim:
+            raise ConfigError(f"mirror: there is no axis {axis} in a scene of {scene.dim}.")
+        if scene.gravity is not None and scene.gravity[axis] and not scene.gravity_varies:
+            raise ConfigError(
+                f"mirror: along axis {axis} the scene has gravity {scene.gravity[axis]}, so that its mirror image is "
+                "another scene; leave the axis out."
+            )
+
+
+def mirrored(window: Window, scene: Scene, axis: int, chosen: Tensor) -> Window:
+    """Windows of which some are replaced by their mirror image along an axis, about the domain's middle.
+
+    Args:
+        window: B windows.
+        scene: Gives the domain.
+        axis: Which axis to turn round.
+        chosen: (B,) bool, which windows to turn.
+    """
+    middle = sum(scene.domain[axis]) / 2
+    return dataclasses.replace(
+        window,
+        frames=_turned(window.frames, axis, middle, chosen),
+        obstacle=_turned(window.obstacle, axis, middle, chosen),
+        gravity=_turned(window.gravity, axis, 0.0, chosen),
+    )
+
+
+def _turned(values: Tensor, axis: int, middle: float, chosen: Tensor) -> Tensor:
+    """Vectors (B, …, D) with one component of the chosen ones reflected about `middle`."""
+    reflected = values.clone()
+    reflected[..., axis] = 2 * middle - values[..., axis]
+    return torch.where(chosen.reshape(-1, *(1,) * (values.dim() - 1)), reflected, values)
