@@ -109,6 +109,7 @@ class EmulatorModule(LightningModule):
         self.valid_errors = Comparison(scene, horizons)
         self.test_errors = Comparison(scene, horizons)
         self.earth_mover = EarthMover(emd) if emd else None
+        self.validated_step = -1
 
     def setup(self, stage: str) -> None:
         if stage == "fit" and not self.emulator.calibrated:
@@ -153,6 +154,7 @@ class EmulatorModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         self.log_dict({f"valid/{name}": value for name, value in self.valid_errors.compute().items()})
+        self.validated_step = self.global_step
 
     def on_test_epoch_end(self) -> None:
         figures = self.test_errors.compute()

@@ -73,12 +73,25 @@ class EmulatorCLI(LightningCLI):
             )
 
     def after_fit(self) -> None:
-        """Test the best checkpoint, once."""
+        """Judge the last weights too, if no validation has, and test the best ones, once."""
         checkpoint = self.trainer.checkpoint_callback
-        best = getattr(checkpoint, "best_model_path", "")
+        if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor:
+            if self.model.validated_step < self.trainer.global_step:
+                self._judge_last_weights(checkpoint)
+            best = checkpoint.best_model_path
+        else:
+            best = ""
         self.trainer.test(
             self.model, datamodule=self.datamodule, ckpt_path=best or None, verbose=False, weights_only=True
         )
+
+    def _judge_last_weights(self, checkpoint: ModelCheckpoint) -> None:
+        self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
+        score = self.trainer.callback_metrics[str(checkpoint.monitor)]
+        if checkpoint.check_monitor_top_k(self.trainer, score):
+            path = Path(str(checkpoint.dirpath)) / f"{checkpoint.filename}{checkpoint.FILE_EXTENSION}"
+            self.trainer.save_checkpoint(path)
+            checkpoint.best_model_path, checkpoint.best_model_score = str(path), score
 
 
 def run(words: list[str]) -> None:

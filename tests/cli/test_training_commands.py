@@ -62,6 +62,18 @@ def test_every_shipped_configuration_runs_to_its_report(config, make_dataset, ca
     assert "free fall" in capsys.readouterr().out
 
 
+def test_the_last_weights_are_judged_too(make_dataset):
+    data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
+    words = ["fit", "--config", "waterdrop.yaml", *TINY, *data, "--trainer.val_check_interval", "1000"]
+    assert main([*words, "--resume.every_n_train_steps", "2"]) == 0
+    saved = torch.load("run/checkpoints/best.ckpt", weights_only=True)
+    assert saved["global_step"] == 2
+    last = torch.load("run/checkpoints/last.ckpt", weights_only=True)
+    for name, value in last["state_dict"].items():
+        assert torch.equal(saved["state_dict"][name], value)
+    assert EmulatorModule.load_from_checkpoint("run/checkpoints/best.ckpt", weights_only=True).emulator.calibrated
+
+
 def test_every_part_can_be_swapped_by_class_name(make_dataset):
     swaps = [
         *("--model.processor", "nmpm.processors.FNO", "--model.processor.modes", "4", "--model.processor.width", "4"),
