@@ -26,7 +26,7 @@ class Bundle:
     """The m frames that one call predicts.
 
     Args:
-        position: (B, m, N, D) in domain length.
+        position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
         velocity: (B, N, D) at the last frame, in length per frame.
     """
 
@@ -126,9 +126,10 @@ class Emulator(nn.Module):
             velocity = arrived - cells
             cells = arrived
             path.append(cells)
+        precision = particles.position.dtype
         return Bundle(
-            position=self.grid.to_length(torch.stack(path, dim=1)),
-            velocity=self.grid.to_displacement(velocity),
+            position=self.grid.to_length(torch.stack(path, dim=1).to(precision)),
+            velocity=self.grid.to_displacement(velocity.to(precision)),
         )
 
     def _gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import torch
@@ -110,6 +111,26 @@ class EmulatorModule(LightningModule):
         self.test_errors = Comparison(scene, horizons)
         self.earth_mover = EarthMover(emd) if emd else None
         self.validated_step = -1
+
+    @classmethod
+    def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
+        """A module that trains an emulator on: the same form, a copy of its weights and statistics.
+
+        Args:
+            emulator: For example `Zoo.load("goop").emulator`.
+            options: What else the constructor takes, such as `unroll` and `optimizer`.
+        """
+        module = cls(
+            emulator.scene,
+            cells=list(emulator.grid.shape),
+            frames=emulator.frames,
+            transfer=emulator.transfer,
+            processor=emulator.recipe,
+            decoder=emulator.decoder,
+            **options,
+        )
+        module.emulator.load_state_dict(emulator.state_dict())
+        return module
 
     def setup(self, stage: str) -> None:
         if stage == "fit" and not self.emulator.calibrated:

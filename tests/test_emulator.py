@@ -113,6 +113,19 @@ def test_neither_origin_nor_unit_of_length_matters(factor, offset):
     torch.testing.assert_close(back.float(), here, atol=2e-5 * max(1, abs(offset)), rtol=0)
 
 
+def test_float64_positions_far_from_the_origin_stay_precise():
+    scene = box(gravity=None)
+    far = dataclasses.replace(
+        scene,
+        bounds=tuple((a + 1e8, b + 1e8) for a, b in scene.bounds),
+        domain=tuple((a + 1e8, b + 1e8) for a, b in scene.domain),
+    )
+    particles = cloud(scene)
+    there = particles.moved(particles.position.double() + 1e8, particles.velocity.double())
+    back = rollout(small(far), there, 6) - 1e8
+    torch.testing.assert_close(back.float(), rollout(small(scene), particles, 6), atol=1e-5, rtol=0)
+
+
 def test_each_material_follows_its_own_velocity_field():
     scene = box(materials=("water", "sand"), gravity=None)
     particles = cloud(scene)

@@ -15,6 +15,7 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
 from nmpm.errors import NmpmError
 from nmpm.processors import UNet
+from nmpm.rollouts import rollout
 from nmpm.schedules import Schedule
 from nmpm.training import EmulatorModule
 from nmpm.transfer import Nearest
@@ -108,6 +109,20 @@ def test_a_pretrained_emulator_keeps_its_statistics(make_dataset, tmp_path):
     model.emulator.calibrated.fill_(True)
     trainer_of(tmp_path, 1, val_check_interval=1).fit(model, data)
     assert (model.emulator.input_std == 3.0).all()
+
+
+def test_fine_tuning_starts_from_the_same_predictions(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    pretrained = module_of(data, transfer=Nearest()).emulator
+    pretrained.output_scale.fill_(0.5)
+    pretrained.calibrated.fill_(True)
+    tuned = EmulatorModule.of(pretrained, unroll=2, horizons=(1,))
+    window = next(iter(data.test_dataloader()))
+    before = rollout(pretrained.eval(), window.initial, 6)
+    assert torch.equal(rollout(tuned.emulator.eval(), window.initial, 6), before)
+    trainer_of(tmp_path, 2).fit(tuned, data)
+    assert not torch.equal(rollout(tuned.emulator.eval(), window.initial, 6), before)
+    assert torch.equal(rollout(pretrained, window.initial, 6), before)
 
 
 def test_bf16_trains(make_dataset, tmp_path):
