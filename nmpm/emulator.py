@@ -16,7 +16,7 @@ from nmpm.decoders import Decoder, Residual
 from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.processors import GridLayout, Processor, UNet
-from nmpm.rasterise import grid_state, solid_fraction
+from nmpm.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.scene import Scene
 from nmpm.transfer import Linear, Transfer
 
@@ -54,6 +54,7 @@ class Emulator(nn.Module):
     input_std: Tensor
     output_scale: Tensor
     bounds: Tensor
+    walls: Tensor
     calibrated: Tensor
 
     def __init__(
@@ -88,10 +89,11 @@ class Emulator(nn.Module):
         limits = torch.tensor(scene.bounds, dtype=torch.float64)
         lower, spacing = torch.tensor(self.grid.lower).double(), torch.tensor(self.grid.spacing).double()
         self.register_buffer("bounds", ((limits.T - lower) / spacing).float(), persistent=False)
+        self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
 
     def solid(self, particles: Particles) -> Tensor:
         """What of each cell is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1. Once per scene, not per step."""
-        return solid_fraction(self.scene, self.grid, self.transfer, particles)
+        return solid_fraction(self.scene, self.grid, self.transfer, particles, self.walls)
 
     def forward(self, particles: Particles, solid: Tensor) -> Bundle:
         """Predict the next m frames.

@@ -40,12 +40,19 @@ def grid_state(
     return torch.cat(parts, dim=1)
 
 
-def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Particles) -> Tensor:
-    """The share of each cell taken by walls and obstacles, (B, 1, *S) in [0, 1]; (B, 0, *S) where a scene has none."""
+def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, walls: Tensor) -> Tensor:
+    """The share of each cell taken by walls and obstacles, (B, 1, *S) in [0, 1]; (B, 0, *S) where a scene has none.
+
+    Args:
+        scene: Says whether there are any.
+        grid: What to rasterise onto.
+        transfer: How to.
+        particles: Gives the obstacles.
+        walls: (*S), from `wall_fraction`.
+    """
     batch = particles.position.shape[0]
     if not scene.walled:
         return particles.position.new_zeros(batch, 0, *grid.shape)
-    walls = wall_fraction(scene, grid).to(particles.position.device)
     if not scene.obstacles:
         return walls.expand(batch, 1, *grid.shape)
     ones = particles.obstacle_mask.unsqueeze(-1).float()
