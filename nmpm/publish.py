@@ -20,13 +20,14 @@ from nmpm.training import EmulatorModule
 from nmpm.zoo import check_name, emulator_config
 
 
-def add(run: Path, name: str, root: Path) -> Path:
+def add(run: Path, name: str, root: Path, about: str = "") -> Path:
     """Turn a run's best checkpoint and report into the zoo entry `root/name`.
 
     Args:
         run: The run's folder, as `nmpm fit` left it.
         name: What the model is to be called.
         root: The zoo's folder.
+        about: What the data are and where they come from, in words, for the card.
 
     Returns:
         The entry's folder, which appears whole or not at all.
@@ -44,7 +45,7 @@ def add(run: Path, name: str, root: Path) -> Path:
     module = EmulatorModule.load_from_checkpoint(checkpoint, map_location="cpu", weights_only=True)
     weights = save({key: value.contiguous() for key, value in module.emulator.state_dict().items()})
     figures = json.loads(report.read_text())
-    card = _card(name, figures, hashlib.sha256(weights).hexdigest())
+    card = _card(name, about, figures, hashlib.sha256(weights).hexdigest())
     target.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(prefix=".adding-", dir=target.parent))
     try:
@@ -61,10 +62,11 @@ def add(run: Path, name: str, root: Path) -> Path:
     return target
 
 
-def _card(name: str, figures: Mapping[str, Any], digest: str) -> dict[str, Any]:
+def _card(name: str, about: str, figures: Mapping[str, Any], digest: str) -> dict[str, Any]:
     return {
         "name": name,
         "dataset": figures["dataset"],
+        "about": about,
         "license": "MIT",
         "sha256": digest,
         "test": figures["test"],
@@ -81,9 +83,10 @@ def _readme(card: Mapping[str, Any], pictured: bool) -> str:
     lines = [
         f"# {card['name']}",
         "",
-        f"An emulator of: {card['dataset']}.",
+        f"An emulator of: {card['dataset']}. {card['about']}".rstrip(),
         "",
-        "Test error ×10⁻³, from full rollouts (MSE in domain length squared over frames 1 … h; `mse` over all frames):",
+        "Test error ×10⁻³, from full rollouts: MSE over frames 1 … h in domain length squared (`mse`: over all frames), "
+        "exact earth mover's distance (`emd`) in domain length.",
         "",
         f"| predictor | {' | '.join(names)} |",
         f"|---|{'---:|' * len(names)}",

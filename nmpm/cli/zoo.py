@@ -20,6 +20,7 @@ def run(words: list[str]) -> None:
     add = commands.add_parser("add", help="make a zoo entry of a finished run")
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="what the model is to be called, e.g. goop or goop/small")
+    add.add_argument("--about", default="", help="what the data are and where they come from, for the card")
     chosen = parser.parse_args(words[1:])
     {"list": _list, "card": _card, "add": _add}[chosen.command](chosen)
 
@@ -44,4 +45,4 @@ def _card(chosen: argparse.Namespace) -> None:
 def _add(chosen: argparse.Namespace) -> None:
     from nmpm.publish import add
 
-    sys.stdout.write(f"added {add(chosen.run, chosen.name, chosen.root)}\n")
+    sys.stdout.write(f"added {add(chosen.run, chosen.name, chosen.root, chosen.about)}\n")
