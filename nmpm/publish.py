@@ -85,7 +85,7 @@ def _readme(card: Mapping[str, Any], pictured: bool) -> str:
         "",
         f"An emulator of: {card['dataset']}. {card['about']}".rstrip(),
         "",
-        "Test error ×10⁻³, from full rollouts: MSE over frames 1 … h in domain length squared (`mse`: over all frames), "
+        "Test error ×10⁻³, from full rollouts: MSE over frames 1 … h in domain length² (`mse`: over all frames), "
         "exact earth mover's distance (`emd`) in domain length.",
         "",
         f"| predictor | {' | '.join(names)} |",
