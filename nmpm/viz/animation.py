@@ -89,7 +89,7 @@ def _write_gif(order: _Order, path: Path) -> None:
 def _write_mp4(order: _Order, path: Path) -> None:
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ConfigError(
-            "MP4 needs a video encoder that is not installed: `pip install 'imageio[ffmpeg]'`, or write a .gif instead."
+            "MP4 needs a video encoder that is not installed: `pip install 'nmpm[video]'`, or write a .gif instead."
         )
     encoder: Any = imageio.get_writer(
         path, format="FFMPEG", mode="I", fps=order.fps, codec="libx264", quality=8, macro_block_size=2
