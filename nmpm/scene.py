@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 from nmpm.errors import ConfigError
+from nmpm.plain import listed, tupled
 
 Boundary = Literal["wall", "periodic"]
 Interval = tuple[float, float]
@@ -115,7 +116,7 @@ class Scene:
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers."""
         plain = dataclasses.asdict(self)
-        return {key: _listed(value) for key, value in plain.items()}
+        return {key: listed(value) for key, value in plain.items()}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
@@ -129,14 +130,6 @@ class Scene:
         if unknown:
             raise ConfigError(f"Scene has no key {', '.join(unknown)}; it has {', '.join(sorted(known))}.")
         try:
-            return cls(**{key: _tupled(value) for key, value in plain.items()})
+            return cls(**{key: tupled(value) for key, value in plain.items()})
         except TypeError as error:
             raise ConfigError(f"Scene cannot be read: {error}.") from error
-
-
-def _listed(value: Any) -> Any:
-    return [_listed(item) for item in value] if isinstance(value, tuple | list) else value
-
-
-def _tupled(value: Any) -> Any:
-    return tuple(_tupled(item) for item in value) if isinstance(value, tuple | list) else value

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 from nmpm.errors import ConfigError
+from nmpm.plain import listed, tupled
 
 T = TypeVar("T")
 
@@ -23,7 +24,7 @@ def to_spec(recipe: object) -> dict[str, Any]:
     """
     if not dataclasses.is_dataclass(recipe):
         raise ConfigError(f"{type(recipe).__name__} must be a dataclass, so that a checkpoint can store its arguments.")
-    arguments = {field.name: _plain(getattr(recipe, field.name)) for field in dataclasses.fields(recipe)}
+    arguments = {field.name: listed(getattr(recipe, field.name)) for field in dataclasses.fields(recipe)}
     return {"class_path": _path(type(recipe)), "init_args": arguments}
 
 
@@ -48,7 +49,7 @@ def from_spec(spec: object, base: type[T]) -> T:
             f"{base.__name__} {name!r} is not known. Known are {', '.join(sorted(known))}. If it is yours, import its "
             "module first: nothing that a file names is imported by itself."
         )
-    arguments = {key: _tupled(value) for key, value in dict(spec.get("init_args") or {}).items()}
+    arguments = {key: tupled(value) for key, value in dict(spec.get("init_args") or {}).items()}
     try:
         return known[name](**arguments)
     except TypeError as error:
@@ -63,11 +64,3 @@ def _subclasses(base: type[T]) -> Iterator[type[T]]:
 
 def _path(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
-
-
-def _tupled(value: Any) -> Any:
-    return tuple(_tupled(item) for item in value) if isinstance(value, tuple | list) else value
