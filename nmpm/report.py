@@ -33,17 +33,32 @@ class Report(Callback):
 
     def __init__(self) -> None:
         self.trained_seconds = 0.0
+        self.trained_steps = 0
         self._since: float | None = None
+        self._trained = False
         self._exhibit: tuple[Window, Tensor] | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return {"trained_seconds": self._elapsed()}
+        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if self._trained:
+            return  # the test after a fit loads the best checkpoint, which is often older than the training's end
         self.trained_seconds = float(state_dict["trained_seconds"])
+        self.trained_steps = int(state_dict.get("trained_steps", 0))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        self._since = time.monotonic()
+        self._since, self._trained = time.monotonic(), True
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,  # noqa: ARG002
+        batch: Any,  # noqa: ARG002
+        batch_idx: int,  # noqa: ARG002
+    ) -> None:
+        self.trained_steps = trainer.global_step
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self.trained_seconds, self._since = self._elapsed(), None
@@ -91,7 +106,7 @@ class Report(Callback):
             "test": {key.removeprefix("test/"): value for key, value in sorted(logged.items())},
             "per_trajectory": dict(per_trajectory),
             "training": {
-                "steps": trainer.global_step,
+                "steps": self.trained_steps,
                 "seconds": round(self.trained_seconds, 1),
                 "precision": str(trainer.precision),
                 "devices": trainer.world_size,

@@ -101,8 +101,12 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *more]) == 0
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 4
     checked = ["--config", "waterdrop.yaml", *TINY, *data, "--ckpt_path", "run/checkpoints/best.ckpt"]
+    trained = json.loads(Path("run/report.json").read_text())["training"]
+    best = torch.load("run/checkpoints/best.ckpt", weights_only=True)["callbacks"]["Report"]
+    assert trained["seconds"] >= round(best["trained_seconds"], 1)
     for command in ("validate", "test", "predict"):
         assert main([command, *checked]) == 0
+    assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == best["trained_steps"] > 0
     predictions = Split(Path("run/predictions.h5"))
     assert len(predictions) == 1
     assert predictions.read(0).position.shape == (40, 9, 2)
