@@ -88,7 +88,7 @@ def test_mp4(falling, tmp_path):
 
 def test_mp4_without_its_encoder_says_what_to_install(falling, tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'imageio\[ffmpeg\]'.*\.gif"):
+    with pytest.raises(ConfigError, match=r"pip install 'nmpm\[video\]'.*\.gif"):
         animation(falling, tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
 
