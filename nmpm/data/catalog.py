@@ -17,7 +17,7 @@ from types import MappingProxyType
 from nmpm.data.generate import Request, generate
 from nmpm.errors import DataError
 from nmpm.scene import Scene
-from nmpm.sim import load_preset, scene_of
+from nmpm.sim import load_preset
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def scene(name: str) -> Scene:
     Raises:
         DataError: if there is none of that name.
     """
-    return scene_of(load_preset(describe(name).preset))
+    return load_preset(describe(name).preset).scene
 
 
 def request_of(

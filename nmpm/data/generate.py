@@ -36,8 +36,8 @@ from nmpm.data.format import (
     write_split,
 )
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim import Preset, simulate
-from nmpm.sim.mls_mpm import REVISION
+from nmpm.sim import Preset
+from nmpm.sim.preset import BOUNDARY
 from nmpm.version import __version__
 
 _PARTS = ".parts"
@@ -74,7 +74,7 @@ class Request:
     def to_dict(self) -> dict[str, Any]:
         """What determines the data, as plain lists, strings and numbers."""
         counts = {split: self.counts[split] for split in SPLITS}
-        return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": REVISION}
+        return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": self.preset.revision}
 
     def trajectory_seed(self, split: str, index: int) -> int:
         """Seed of one trajectory, whatever the number of others."""
@@ -188,7 +188,7 @@ def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
 
 
 def _simulate_part(request: Request, folder: Path, split: str, index: int) -> None:
-    made = simulate(request.preset, request.trajectory_seed(split, index))
+    made = request.preset.simulate(request.trajectory_seed(split, index))
     with replacing(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
         np.savez(file, position=made.position, particle_type=made.particle_type, **made.attributes)
 
@@ -211,7 +211,7 @@ def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Traj
     for part in parts:
         try:
             with np.load(part, allow_pickle=False) as arrays:
-                attributes = {key: arrays[key].item() for key in sorted(set(arrays) - {"position", "particle_type"})}
+                attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
                 yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
         except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
             raise DataError(f"{part}: damaged ({error}); delete it, and the same call makes it again.") from error
@@ -231,25 +231,25 @@ def _shown(what: str, total: int, done: int = 0) -> Iterator[Callable[[], None]]
 
 
 def _metadata(request: Request, train: Split) -> Metadata:
-    preset = request.preset
+    preset, scene = request.preset, request.preset.scene
     provenance = {
-        "generator": f"nmpm {__version__}, MLS-MPM",
+        "generator": f"nmpm {__version__}, {preset.generator}",
         "note": "Simulated by nmpm from the preset below; not measured, and not anybody else's dataset.",
     }
     return Metadata(
-        bounds=preset.box,
-        dt=preset.frame_dt,
-        dim=2,
+        bounds=scene.bounds,
+        dt=scene.dt,
+        dim=scene.dim,
         sequence_length=preset.frames,
-        particle_types={material.particle_type: material.name for material in preset.materials},
-        static_types=frozenset({3}),
-        domain=preset.domain,
-        gravity=preset.gravity,
-        particle_volume=preset.particle_volume,
+        particle_types=preset.type_names,
+        static_types=frozenset({BOUNDARY}),
+        domain=scene.domain,
+        gravity=scene.gravity,
+        particle_volume=scene.particle_volume,
         extra={
             **_statistics(train),
-            "default_connectivity_radius": round(1.8 * preset.spacing, 6),
-            "num_particles_max": preset.blocks.particles[1],
+            "default_connectivity_radius": round(1.8 * scene.particle_volume ** (1 / scene.dim), 6),
+            "num_particles_max": preset.most_particles,
             **provenance,
             _KEY: request.to_dict(),
         },

@@ -9,7 +9,7 @@ import numpy as np
 
 from nmpm.errors import ConfigError
 from nmpm.sim.materials.base import Array
-from nmpm.sim.preset import Preset
+from nmpm.sim.mpm_preset import MpmPreset
 
 _ATTEMPTS = 10_000
 
@@ -37,7 +37,7 @@ class _Block:
     material: int
 
 
-def draw_start(preset: Preset, rng: np.random.Generator) -> Start:
+def draw_start(preset: MpmPreset, rng: np.random.Generator) -> Start:
     """An initial state after the preset's `blocks`.
 
     Raises:
@@ -63,7 +63,7 @@ def draw_start(preset: Preset, rng: np.random.Generator) -> Start:
     return _filled(preset, sorted(blocks, key=lambda block: block.material), rng)
 
 
-def _lattices(preset: Preset, number: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+def _lattices(preset: MpmPreset, number: int, rng: np.random.Generator) -> list[tuple[int, int]]:
     """Columns and rows of each block, drawn until all together have a number of particles that is asked for."""
     blocks = preset.blocks
     low, high = blocks.particles
@@ -78,7 +78,7 @@ def _lattices(preset: Preset, number: int, rng: np.random.Generator) -> list[tup
     raise ConfigError(f"No blocks have {blocks.particles} particles together: widen blocks.particles.")
 
 
-def _places(preset: Preset, lattices: list[tuple[int, int]], rng: np.random.Generator) -> list[Array] | None:
+def _places(preset: MpmPreset, lattices: list[tuple[int, int]], rng: np.random.Generator) -> list[Array] | None:
     """Lower corners of the blocks, or None if this draw lets two come too close."""
     gap = preset.blocks.gap
     box_low, box_high = np.array(preset.box).T
@@ -95,7 +95,7 @@ def _places(preset: Preset, lattices: list[tuple[int, int]], rng: np.random.Gene
     return [low for low, _ in placed]
 
 
-def _filled(preset: Preset, blocks: list[_Block], rng: np.random.Generator) -> Start:
+def _filled(preset: MpmPreset, blocks: list[_Block], rng: np.random.Generator) -> Start:
     positions, velocities = [], []
     counts = [0] * len(preset.materials)
     for block in blocks:

@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nmpm.data import generate as generator
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.generate import generate
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim import load_preset, simulate
+from nmpm.sim import MpmPreset, load_preset
 
 GOOP = load_preset("goop")
 TINY = dataclasses.replace(GOOP, frames=30, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
@@ -27,7 +26,7 @@ KILLED = """
 import json, sys
 from pathlib import Path
 from nmpm.data.generate import generate
-from nmpm.sim.preset import preset_from_dict
+from nmpm.sim import preset_from_dict
 generate(preset_from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), json.loads(sys.argv[3]), workers=2)
 """
 
@@ -47,7 +46,7 @@ def test_holds_the_simulated_trajectories_in_order(made):
     for split, count in COUNTS.items():
         assert len(Split(made / f"{split}.h5")) == count
     read = Split(made / "valid.h5").read(0)
-    again = simulate(TINY, int(read.attributes["seed"]))
+    again = TINY.simulate(int(read.attributes["seed"]))
     np.testing.assert_array_equal(read.position, again.position)
     np.testing.assert_array_equal(read.particle_type, again.particle_type)
 
@@ -122,6 +121,7 @@ def test_killed_and_called_again_it_makes_the_same_bytes(tmp_path):
 def interrupted(folder: Path, monkeypatch, seed: int = 0) -> None:
     """Leaves a folder as an interruption after the fourth trajectory does."""
     simulated: list[int] = []
+    simulate = MpmPreset.simulate
 
     def stops_at_the_fifth(preset, trajectory_seed):
         if len(simulated) == 4:
@@ -130,7 +130,7 @@ def interrupted(folder: Path, monkeypatch, seed: int = 0) -> None:
         return simulate(preset, trajectory_seed)
 
     with monkeypatch.context() as patch:
-        patch.setattr(generator, "simulate", stops_at_the_fifth)
+        patch.setattr(MpmPreset, "simulate", stops_at_the_fifth)
         with pytest.raises(KeyboardInterrupt):
             generate(TINY, folder, COUNTS, seed, workers=1)
 
@@ -139,7 +139,8 @@ def test_goes_on_with_the_parts_that_are_there(tmp_path, monkeypatch):
     interrupted(tmp_path, monkeypatch)
     assert len(list(tmp_path.glob(".parts/*.npz"))) == 4
     simulated: list[int] = []
-    monkeypatch.setattr(generator, "simulate", lambda preset, seed: simulated.append(seed) or simulate(preset, seed))
+    simulate = MpmPreset.simulate
+    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed: simulated.append(seed) or simulate(preset, seed))
     generate(TINY, tmp_path, COUNTS, workers=1)
     assert len(simulated) == 3
 
@@ -155,7 +156,7 @@ def test_a_full_disk_is_an_error_that_can_be_mended(made, tmp_path, monkeypatch)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(generator.np, "savez", full)
+        patch.setattr(np, "savez", full)
         with pytest.raises(DataError, match="No space left") as caught:
             generate(TINY, tmp_path, COUNTS, seed=5)
     assert str(tmp_path) in str(caught.value)

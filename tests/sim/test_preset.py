@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError
-from nmpm.sim import load_preset, scene_of
-from nmpm.sim.preset import CFL_LIMIT, preset_from_dict
+from nmpm.sim import load_preset, preset_from_dict
+from nmpm.sim.mpm_preset import CFL_LIMIT
 
 GOOP = load_preset("goop")
 
@@ -36,7 +36,7 @@ def test_round_trip_through_plain_values():
 
 
 def test_scene_states_the_facts():
-    scene = scene_of(GOOP)
+    scene = GOOP.scene
     assert scene.bounds == GOOP.box
     assert scene.domain == ((0.08, 0.92), (0.08, 0.92))
     assert scene.materials == ("goop",)

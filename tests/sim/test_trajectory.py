@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim import load_preset, simulate, simulate_from
+from nmpm.sim import load_preset, simulate_from
 
 GOOP = load_preset("goop")
 
@@ -26,7 +26,7 @@ def speeds(position):
 
 @pytest.fixture(scope="module")
 def trajectory():
-    return simulate(GOOP, seed=3)
+    return GOOP.simulate(seed=3)
 
 
 def test_has_the_frames_and_types_of_its_preset(trajectory):
@@ -52,8 +52,8 @@ def test_falls_then_comes_to_rest(trajectory):
 
 def test_is_the_same_for_a_seed_and_another_for_another():
     short = dataclasses.replace(GOOP, frames=5)
-    np.testing.assert_array_equal(simulate(short, 1).position, simulate(short, 1).position)
-    assert simulate(short, 1).position.shape != simulate(short, 2).position.shape
+    np.testing.assert_array_equal(short.simulate(1).position, short.simulate(1).position)
+    assert short.simulate(1).position.shape != short.simulate(2).position.shape
 
 
 def test_free_fall_is_exact_before_contact():

@@ -1,0 +1,58 @@
+"""Presets by their shipped names, or from YAML files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import omegaconf
+import yaml
+from omegaconf import OmegaConf
+
+from nmpm.errors import ConfigError
+from nmpm.sim.mpm_preset import MpmPreset
+from nmpm.sim.preset import Preset
+
+SOLVERS: dict[str, type[Preset]] = {kind.solver: kind for kind in (MpmPreset,)}
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the shipped presets."""
+    shipped = resources.files("nmpm.sim") / "presets"
+    return tuple(sorted(i.name.removesuffix(".yaml") for i in shipped.iterdir() if i.name.endswith(".yaml")))
+
+
+def load_preset(name_or_path: str | Path) -> Preset:
+    """A preset by its shipped name, or from a YAML file.
+
+    Raises:
+        ConfigError: if there is no such preset, or it cannot be read.
+    """
+    path = resources.files("nmpm.sim") / "presets" / f"{name_or_path}.yaml"
+    if str(name_or_path) not in preset_names():
+        path = Path(name_or_path)
+    if not path.is_file():
+        known = ", ".join(preset_names())
+        raise ConfigError(f"There is no preset or file {name_or_path}; shipped presets: {known}.")
+    try:
+        plain = OmegaConf.to_container(OmegaConf.create(path.read_text(encoding="utf-8")), resolve=True)
+        return preset_from_dict(plain)
+    except (yaml.YAMLError, omegaconf.errors.OmegaConfBaseException, UnicodeDecodeError, ConfigError) as error:
+        raise ConfigError(f"Preset {name_or_path}: {error}") from error
+
+
+def preset_from_dict(plain: Any) -> Preset:
+    """The preset that `Preset.to_dict` described.
+
+    Raises:
+        ConfigError: if the solver is unknown, or a key is unknown, missing or of the wrong kind.
+    """
+    if not isinstance(plain, Mapping):
+        raise ConfigError(f"the preset must map keys to values; it is {plain!r}.")
+    entries = dict(plain)
+    solver = entries.pop("solver", None)
+    if solver not in SOLVERS:
+        raise ConfigError(f"solver = {solver} is not one of {', '.join(SOLVERS)}.")
+    return SOLVERS[solver].from_dict(entries)
