@@ -41,3 +41,57 @@ def test_two_processes_measure_what_one_measures(make_dataset, tmp_path):
     counted = sorted(row["mse"] for row in report["per_trajectory"]["model"])
     assert counted == pytest.approx(sorted(row["mse"] for row in alone["per_trajectory"]["model"]), rel=1e-5)
     assert Path(root / "rollout.png").is_file()
+
+
+TRAIN_TO = """
+import sys
+from pathlib import Path
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+
+from nmpm.data.datamodule import TrajectoryDataModule
+
+
+class Diary(LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+
+    def training_step(self, batch, batch_idx):
+        with (Path(sys.argv[2]) / f"rank_{self.global_rank}.txt").open("a") as file:
+            file.write(f"{float(batch.frames.double().sum()):.12g}\\n")
+        return self.weight * batch.frames.mean()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+Path(sys.argv[2]).mkdir(exist_ok=True)
+data = TrajectoryDataModule(path=sys.argv[1], horizon=6, batch_size=2, buffer_size=2, passes=1, emphasis=0.3)
+trainer = Trainer(
+    accelerator="cpu", devices=2, strategy="ddp", max_steps=int(sys.argv[3]), limit_val_batches=0, logger=False,
+    enable_checkpointing=False, enable_progress_bar=False, default_root_dir=sys.argv[2],
+)
+trainer.fit(Diary(), datamodule=data, ckpt_path=sys.argv[4] if len(sys.argv) > 4 else None)
+trainer.save_checkpoint(Path(sys.argv[2]) / "last.ckpt")
+"""
+
+
+@pytest.mark.slow
+def test_resumed_processes_go_on_with_their_own_windows(make_dataset, tmp_path):
+    folder = make_dataset(train=((30, 9), (24, 7), (18, 8), (21, 6), (16, 5)))
+    (tmp_path / "train_to.py").write_text(TRAIN_TO)
+
+    def train_to(name: str, steps: int, *checkpoint: str) -> list[list[str]]:
+        words = [sys.executable, str(tmp_path / "train_to.py"), str(folder), str(tmp_path / name), str(steps)]
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        subprocess.run([*words, *checkpoint], check=True, env=environment, capture_output=True, timeout=240)
+        return [(tmp_path / name / f"rank_{rank}.txt").read_text().split() for rank in (0, 1)]
+
+    straight = train_to("straight", 23)
+    begun = train_to("begun", 10)
+    resumed = train_to("resumed", 23, str(tmp_path / "begun" / "last.ckpt"))
+    assert [len(seen) for seen in straight] == [23, 23]
+    assert not set(straight[0]) & set(straight[1])
+    assert [one + other for one, other in zip(begun, resumed, strict=True)] == straight

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import os
@@ -86,7 +85,7 @@ def request_of(
     """
     entry = describe(name)
     preset = load_preset(entry.preset)
-    preset = dataclasses.replace(preset, frames=preset.frames if frames is None else frames)
+    preset = preset if frames is None else preset.lasting(frames)
     return Request(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
 
 

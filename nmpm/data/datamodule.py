@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
-from collections.abc import Iterator, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
+import torch
 from lightning.pytorch import LightningDataModule
 
-from nmpm.data.buffer import TrajectoryBuffer, WindowPlan
-from nmpm.data.format import Metadata, Split, read_metadata, split_paths
-from nmpm.data.recording import Recordings, collate
-from nmpm.data.scenes import infer_scene
-from nmpm.errors import ConfigError, DataError
+from nmpm.data.buffer import Source, TrajectoryBuffer
+from nmpm.data.origins import Embedded, Folder, Hub, Live, Origin, Stated
+from nmpm.data.plan import WindowPlan
+from nmpm.data.recording import Recordings
+from nmpm.data.shelf import collate
+from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
+
+SourceName = Literal["disk", "simulate", "hub"]
+
+_GPU_SHARE = 0.25  # of the free memory; the rest is for the model
 
 
 class TrajectoryDataModule(LightningDataModule):
@@ -28,21 +32,25 @@ class TrajectoryDataModule(LightningDataModule):
     trajectories, each once over all ranks; prediction uses the test split.
 
     Args:
-        path: Folder of a dataset in the native layout.
+        path: A dataset: a folder in the native layout, or anything that `nmpm convert` reads, converted on first use.
         name: Embedded dataset, simulated on first use; either this or `path`.
+        source: "disk"; or "simulate" to train on trajectories of `name` fresh from the simulator, never written and
+            never seen twice; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
         horizon: Frames to predict in a training window: frames per bundle times bundles unrolled.
         batch_size: Training windows per batch and rank.
-        buffer_size: Training trajectories held in memory at a time; twice as many while the next are read.
+        buffer_size: Training trajectories held in memory at a time; up to three times as many while others are read.
         passes: How often the windows of a buffer are seen, on average, before the next buffer.
         emphasis: Share of the training windows that is drawn in proportion to the motion in them, in [0, 1]; the rest
             is drawn evenly. Worth it where recordings end in long rest.
         seed: Order of the training windows.
-        family: What the type ids in `path` mean where its metadata does not say: "deepmind" or "lagrangebench".
-        gravity: Acceleration in length/s² per axis, instead of that in the metadata of `path`.
-        boundary: "wall" or "periodic" per axis, instead of what the metadata of `path` says.
+        family: What the type ids in recorded data mean where its metadata does not say: "deepmind", "lagrangebench",
+            "jax-sph".
+        gravity: Acceleration in length/s² per axis, instead of that in the metadata of recorded data.
+        boundary: "wall" or "periodic" per axis, likewise.
+        bounds: (lower, upper) per axis, likewise.
         limit_eval: Validate on the first so many trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
-        generate: Options for the simulation of `name`, such as the number of trajectories.
+        generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
 
     Raises:
         ConfigError: if not exactly one of `path` and `name` is given, or a number is not positive.
@@ -52,6 +60,7 @@ class TrajectoryDataModule(LightningDataModule):
         self,
         path: str | None = None,
         name: str | None = None,
+        source: SourceName = "disk",
         horizon: int = 16,
         batch_size: int = 16,
         buffer_size: int = 16,
@@ -61,99 +70,65 @@ class TrajectoryDataModule(LightningDataModule):
         family: str | None = None,
         gravity: list[float] | None = None,
         boundary: list[Boundary] | None = None,
+        bounds: list[tuple[float, float]] | None = None,
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        _check_source(path, name, family=family, gravity=gravity, boundary=boundary, generate=generate)
+        stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds}
+        _check_source(path, name, source, stated, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
-        self.path, self.name, self.generate = path, name, dict(generate or {})
+        self.origin = _origin(path, name, source, Stated(**stated), dict(generate or {}))  # type: ignore[arg-type]
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
-        self.family, self.gravity, self.boundary = family, gravity, boundary
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
 
     def __str__(self) -> str:
         # Lightning's own would go through the endless training batches.
-        source = f"path={self.path!r}" if self.name is None else f"name={self.name!r}"
-        return f"{type(self).__name__}({source}, horizon={self.horizon}, batch_size={self.batch_size})"
+        return f"{type(self).__name__}({self.origin}, horizon={self.horizon}, batch_size={self.batch_size})"
 
-    @cached_property
+    @property
     def scene(self) -> Scene:
         """The scene of the dataset; an embedded one need not have been simulated for it.
 
         Raises:
-            DataError: if the files at `path` are missing or wrong.
+            DataError: if recorded files are missing or wrong.
             ConfigError: if there is no such embedded dataset.
         """
-        if self.name is not None:
-            from nmpm.data import catalog
-
-            return catalog.scene(self.name)
-        return infer_scene(self.folder, self.family, self.gravity, self.boundary)
-
-    @cached_property
-    def folder(self) -> Path:
-        """Where the dataset's files are; an embedded one is simulated if it has not been yet.
-
-        Raises:
-            ConfigError: if `generate` holds an unknown option.
-        """
-        if self.name is not None:
-            from nmpm.data import catalog
-
-            try:
-                inspect.signature(catalog.ensure).bind(self.name, **self.generate)
-            except TypeError as error:
-                raise ConfigError(f"generate = {self.generate}: {error}.") from error
-            return catalog.ensure(self.name, **self.generate)
-        return Path(self.path or "")
-
-    @cached_property
-    def metadata(self) -> Metadata:
-        """The dataset's metadata."""
-        return read_metadata(self.folder, self.family)
+        return self.origin.scene
 
     @property
     def description(self) -> str:
         """What the data are, in words: simulated data are named so."""
-        return f"{self.name}, simulated by nmpm" if self.name is not None else Path(self.path or "").name
-
-    def split(self, name: str) -> Split:
-        """The file of a split: "train", "valid" or "test".
-
-        Raises:
-            DataError: if the dataset has no such split, or its file is damaged.
-        """
-        paths = split_paths(self.folder)
-        if name not in paths:
-            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split at all'}).")
-        return Split(paths[name])
-
-    def recordings(self, name: str) -> Recordings:
-        """The trajectories of a split as tensors."""
-        return Recordings(self.split(name), self.metadata, self.scene)
+        return self.origin.description
 
     def prepare_data(self) -> None:
-        """Simulates an embedded dataset on first use, in one process."""
-        _ = self.folder
+        """Simulates, fetches or converts the dataset on first use, in one process."""
+        _ = self.origin.folder
 
     def train_dataloader(self) -> TrainingLoader:
         """Endless batches of training windows."""
-        recordings = self.recordings("train")
-        plan = WindowPlan(
-            frames=tuple(map(recordings.split.frames, range(len(recordings)))),
-            length=self.horizon + 2,
+        source, plan = self.origin.training(
+            self.horizon + 2,
             batch_size=self.batch_size,
             buffer_size=self.buffer_size,
             passes=self.passes,
             seed=self.seed,
             emphasis=self.emphasis,
         )
-        return TrainingLoader(TrajectoryBuffer(recordings, plan), self)
+        return TrainingLoader(TrajectoryBuffer(source, plan, self.buffer_device(source, plan)), self)
+
+    def buffer_device(self, source: Source, plan: WindowPlan) -> torch.device:
+        """Where the buffer is held: on the trainer's GPU if that has room, else in the processor's memory."""
+        device = self.trainer.strategy.root_device if self.trainer is not None else torch.device("cpu")
+        if device.type != "cuda":
+            return torch.device("cpu")
+        free, _ = torch.cuda.mem_get_info(device)
+        needed = 2 * min(plan.buffer_size, len(plan.frames)) * source.most_bytes
+        return device if needed <= _GPU_SHARE * free else torch.device("cpu")
 
     def val_dataloader(self) -> EvaluationLoader:
         """Whole trajectories of the valid split, or the first `limit_eval` of them."""
@@ -169,7 +144,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     def _evaluation(self, name: str, limit: int | None = None) -> EvaluationLoader:
         rank, world = self.ranks
-        return EvaluationLoader(self.recordings(name), self.eval_batch_size, limit, rank, world)
+        return EvaluationLoader(self.origin.recordings(name), self.eval_batch_size, limit, rank, world)
 
     @property
     def ranks(self) -> tuple[int, int]:
@@ -251,16 +226,34 @@ class EvaluationLoader:
 
     def _window(self, batch: Sequence[int]) -> Window:
         chosen = [self.recordings[index] for index in batch]
-        return collate(chosen, [0] * len(batch), len(chosen[0].frames), self.recordings.scene)
+        return collate(chosen, self.recordings.scene)
 
 
-def _check_source(path: str | None, name: str | None, **options: Any) -> None:
+def _origin(path: str | None, name: str | None, source: str, stated: Stated, generate: dict[str, Any]) -> Origin:
+    if path is not None:
+        return Folder(Path(path), stated)
+    named: dict[str, Callable[[str], Origin]] = {
+        "disk": lambda known: Embedded(known, generate),
+        "simulate": lambda known: Live(known, generate),
+        "hub": lambda known: Hub(Path(known), stated),
+    }
+    return named[source](str(name))
+
+
+def _check_source(
+    path: str | None, name: str | None, source: str, stated: Mapping[str, Any], generate: Mapping[str, Any] | None
+) -> None:
     if (path is None) == (name is None):
         raise ConfigError(
             f"Give either a dataset's `path` or the `name` of an embedded one; got path = {path}, name = {name}."
         )
-    belongs = {"family": "path", "gravity": "path", "boundary": "path", "generate": "name"}
-    given = "path" if path is not None else "name"
-    wrong = [key for key, value in options.items() if value is not None and belongs[key] != given]
+    if source not in get_args(SourceName):
+        raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")
+    if path is not None and source != "disk":
+        raise ConfigError(f"source = {source} needs the `name` of a dataset, not the path {path}.")
+    recorded = path is not None or source == "hub"
+    given = {"generate": generate} if recorded else stated
+    wrong = [key for key, value in given.items() if value is not None]
     if wrong:
-        raise ConfigError(f"{', '.join(wrong)} cannot be combined with `{given}`; leave it out.")
+        kind = f"recorded data ({path or name})" if recorded else f"the simulated dataset {name}"
+        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {kind}; leave it out.")

@@ -7,6 +7,7 @@ whole or not at all, so that the same call goes on wherever the last one was sto
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -14,14 +15,11 @@ import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nmpm.atomic import replacing
 from nmpm.data.folder_lock import locked
@@ -35,6 +33,7 @@ from nmpm.data.format import (
     write_metadata,
     write_split,
 )
+from nmpm.data.progress import shown
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
@@ -53,7 +52,7 @@ class Request:
 
     Args:
         preset: The family of scenes.
-        counts: Trajectories in each of the splits train, valid and test.
+        counts: Trajectories in each of the splits train, valid and test; a split of 0 gets no file.
         seed: From which the seed of every trajectory is derived.
 
     Raises:
@@ -65,11 +64,16 @@ class Request:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if set(self.counts) != set(SPLITS) or min(self.counts.values()) < 1 or self.seed < 0:
+        if set(self.counts) != set(SPLITS) or min(self.counts.values()) < 0 or not self.splits or self.seed < 0:
             raise ConfigError(
-                f"counts = {dict(self.counts)}, seed = {self.seed}: every one of {', '.join(SPLITS)} needs at least 1 "
-                "trajectory, and the seed must not be negative."
+                f"counts = {dict(self.counts)}, seed = {self.seed}: give the number of trajectories in each of "
+                f"{', '.join(SPLITS)}, at least 1 in all; neither they nor the seed may be negative."
             )
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits that have trajectories."""
+        return tuple(split for split in SPLITS if self.counts[split])
 
     def to_dict(self) -> dict[str, Any]:
         """What determines the data, as plain lists, strings and numbers."""
@@ -78,8 +82,12 @@ class Request:
 
     def trajectory_seed(self, split: str, index: int) -> int:
         """Seed of one trajectory, whatever the number of others."""
-        sequence = np.random.SeedSequence((self.seed, SPLITS.index(split), index))
-        return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+        return derived_seed(self.seed, SPLITS.index(split), index)
+
+
+def derived_seed(*entropy: int) -> int:
+    """A seed that depends on all of the numbers."""
+    return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def generate(
@@ -92,7 +100,7 @@ def generate(
     Args:
         preset: The family of scenes.
         folder: Where to; made if need be.
-        counts: Trajectories in each of the splits train, valid and test.
+        counts: Trajectories in each of the splits train, valid and test; a split of 0 gets no file.
         seed: From which the seed of every trajectory is derived.
         workers: Trajectories simulated at a time; as many as there are processor cores when left out.
 
@@ -119,9 +127,12 @@ def _complete(request: Request, folder: Path, workers: int) -> None:
     _open_parts(request, folder)
     _sweep(folder)
     _simulate_parts(request, folder, workers)
-    for split in SPLITS:
+    for split in request.splits:
         _assemble(request, folder, split)
-    write_metadata(folder, _metadata(request, Split(folder / "train.h5")))
+    metadata = metadata_of(request.preset)
+    first = Split(folder / f"{request.splits[0]}.h5")
+    extra = metadata.extra | _statistics(first) | {_KEY: request.to_dict()}
+    write_metadata(folder, dataclasses.replace(metadata, extra=extra))
     shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
 
@@ -170,7 +181,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
-    wanted = [(s, i) for s in SPLITS if not (folder / f"{s}.h5").is_file() for i in range(request.counts[s])]
+    wanted = [(s, i) for s in request.splits if not (folder / f"{s}.h5").is_file() for i in range(request.counts[s])]
     missing = [(s, i) for s, i in wanted if not _part(folder, s, i).is_file()]
     if not missing:
         return
@@ -179,7 +190,7 @@ def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
     # Threads suffice, as the kernels hold no lock; they need no second start of the interpreter, and die with it.
     pool = ThreadPoolExecutor(min(workers, len(missing)))
     try:
-        with _shown(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
+        with shown(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
             for future in as_completed([pool.submit(_simulate_part, request, folder, s, i) for s, i in missing]):
                 future.result()
                 advance()
@@ -201,7 +212,7 @@ def _assemble(request: Request, folder: Path, split: str) -> None:
     path = folder / f"{split}.h5"
     parts = [_part(folder, split, index) for index in range(request.counts[split])]
     if not path.is_file():
-        with _shown(f"Writing {path.name}", len(parts)) as advance:
+        with shown(f"Writing {path.name}", len(parts)) as advance:
             write_split(path, _read_parts(parts, advance))
     for part in parts:
         part.unlink(missing_ok=True)
@@ -218,24 +229,9 @@ def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Traj
         advance()
 
 
-@contextmanager
-def _shown(what: str, total: int, done: int = 0) -> Iterator[Callable[[], None]]:
-    """A progress bar on standard error; gives the function that moves it on by one."""
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(what, total=total, completed=done)
-        yield lambda: progress.advance(task)
-
-
-def _metadata(request: Request, train: Split) -> Metadata:
-    preset, scene = request.preset, request.preset.scene
-    provenance = {
-        "generator": f"nmpm {__version__}, {preset.generator}",
-        "note": "Simulated by nmpm from the preset below; not measured, and not anybody else's dataset.",
-    }
+def metadata_of(preset: Preset) -> Metadata:
+    """What holds for every trajectory that a preset simulates."""
+    scene = preset.scene
     return Metadata(
         bounds=scene.bounds,
         dt=scene.dt,
@@ -247,11 +243,10 @@ def _metadata(request: Request, train: Split) -> Metadata:
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,
         extra={
-            **_statistics(train),
             "default_connectivity_radius": round(1.8 * scene.particle_volume ** (1 / scene.dim), 6),
             "num_particles_max": preset.most_particles,
-            **provenance,
-            _KEY: request.to_dict(),
+            "generator": f"nmpm {__version__}, {preset.generator}",
+            "note": "Simulated by nmpm; not measured, and not anybody else's dataset.",
         },
     )
 

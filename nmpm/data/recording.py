@@ -1,4 +1,4 @@
-"""Trajectories as tensors, and windows cut from them.
+"""Trajectories as tensors.
 
 A recording holds what a scene's model needs of a trajectory: the particles that move, their materials, the static
 particles once, and gravity in length per frame squared. Everything a file may hold wrongly is found here.
@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.data.background import carry_on
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.errors import DataError
-from nmpm.particles import Window
 from nmpm.scene import Scene
 
 
@@ -36,30 +36,28 @@ class Recording:
     gravity: Tensor
 
 
-class Recordings(Sequence[Recording]):
-    """The trajectories of a split as recordings, read and checked when asked for.
+@dataclass(frozen=True)
+class Reader:
+    """Makes recordings of trajectories, and checks what a file may hold wrongly.
 
     Args:
-        split: The file.
-        metadata: What its type ids mean.
-        scene: What they are recordings of.
+        metadata: What the type ids mean.
+        scene: What the trajectories are recordings of.
     """
 
-    def __init__(self, split: Split, metadata: Metadata, scene: Scene) -> None:
-        if split.dim != scene.dim:
-            raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
-        self.split, self.metadata, self.scene = split, metadata, scene
+    metadata: Metadata
+    scene: Scene
 
-    def __len__(self) -> int:
-        return len(self.split)
+    def recording(self, trajectory: Trajectory, where: str) -> Recording:
+        """The trajectory as tensors.
 
-    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]
-        """Reads one trajectory.
+        Args:
+            trajectory: A trajectory of the scene.
+            where: Where it comes from, for messages.
 
         Raises:
-            DataError: if it cannot be read, leaves the scene's domain or is of a material that the scene lacks.
+            DataError: if it leaves the scene's domain or is of a material that the scene lacks.
         """
-        trajectory, where = self.split.read(index), self.split.where(index)
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
         moving = np.isin(types, self.metadata.moving_types)
@@ -73,19 +71,6 @@ class Recordings(Sequence[Recording]):
             obstacle=torch.from_numpy(trajectory.position[0, static]),
             gravity=self._gravity(trajectory, where),
         )
-
-    def require_frames(self, frames: int, purpose: str) -> None:
-        """Makes sure that every trajectory is long enough.
-
-        Raises:
-            DataError: naming the first that is shorter.
-        """
-        for index in range(len(self)):
-            if self.split.frames(index) < frames:
-                raise DataError(
-                    f"{self.split.where(index)}: it has {self.split.frames(index)} frames, {purpose} needs {frames}."
-                    " Shorten the horizon (frames per bundle x bundles unrolled) or leave the trajectory out."
-                )
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)
@@ -123,55 +108,55 @@ class Recordings(Sequence[Recording]):
         return (gravity * self.scene.dt**2).float()
 
 
-def collate(recordings: Sequence[Recording], starts: Sequence[int], length: int, scene: Scene) -> Window:
-    """Cuts one window out of each recording and pads them to a batch.
+class Recordings(Sequence[Recording]):
+    """The trajectories of a split as recordings, read and checked when asked for.
 
     Args:
-        recordings: B recordings of the scene.
-        starts: The first frame of each window.
-        length: Frames per window, T.
-        scene: Padding particles lie at the centre of its domain; on its periodic axes positions follow the particle
-            across the border, so that differences between frames are displacements.
-
-    Returns:
-        Window: of B scenes with T frames, padded to the largest.
+        split: The file.
+        metadata: What its type ids mean.
+        scene: What they are recordings of.
     """
-    cuts = [recording.frames[start : start + length] for recording, start in zip(recordings, starts, strict=True)]
-    centre = [(low + high) / 2 for low, high in scene.domain]
-    frames, mask = _padded(cuts, centre)
-    obstacle, obstacle_mask = _padded([recording.obstacle for recording in recordings], centre)
-    material, _ = _padded([recording.material[:, None] for recording in recordings], [0])
-    unwrap(frames, scene)
-    return Window(
-        frames=frames,
-        material=material[..., 0],
-        mask=mask,
-        obstacle=obstacle,
-        obstacle_mask=obstacle_mask,
-        gravity=torch.stack([recording.gravity for recording in recordings]),
-    )
 
+    def __init__(self, split: Split, metadata: Metadata, scene: Scene) -> None:
+        if split.dim != scene.dim:
+            raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
+        self.split, self.scene = split, scene
+        self.reader = Reader(metadata, scene)
 
-def _padded(parts: Sequence[Tensor], filler: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Stacks (..., N_i, C) tensors to (B, ..., N, C), N the largest, with (B, N) telling what is not filler."""
-    counts = [part.shape[-2] for part in parts]
-    # NumPy copies in this thread alone; PyTorch would wait for its thread pool, which training needs.
-    padded = np.empty((len(parts), *parts[0].shape[:-2], max(counts), len(filler)), dtype=parts[0].numpy().dtype)
-    for row, (part, count) in enumerate(zip(parts, counts, strict=True)):
-        padded[row, ..., :count, :] = part.numpy()
-        padded[row, ..., count:, :] = filler
-    mask = np.arange(max(counts)) < np.asarray(counts)[:, None]
-    return torch.from_numpy(padded), torch.from_numpy(mask)
+    def __len__(self) -> int:
+        return len(self.split)
 
+    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]
+        """Reads one trajectory.
 
-def unwrap(frames: Tensor, scene: Scene) -> None:
-    """Undoes, in place, the jumps of (B, T, N, D) positions across periodic borders, by minimum image.
+        Raises:
+            DataError: if it cannot be read, leaves the scene's domain or is of a material that the scene lacks.
+        """
+        return self.reader.recording(self.split.read(index), self.split.where(index))
 
-    The first frame stays where it is; a later one may lie outside the domain, by whole periods.
-    """
-    for axis, (low, high) in enumerate(scene.domain):
-        if scene.periodic[axis]:
-            period = high - low
-            along = frames[..., axis]
-            turns = torch.round(along.diff(dim=1) / period).cumsum(dim=1)
-            along[:, 1:] -= turns * period
+    @property
+    def most_bytes(self) -> int:
+        """Size of the positions of the largest trajectory."""
+        split = self.split
+        return max(4 * split.frames(index) * split.particles(index) * split.dim for index in range(len(self)))
+
+    def load(self, indices: Sequence[int]) -> list[Recording]:
+        """Reads several trajectories."""
+        return list(map(self._next, indices))
+
+    def _next(self, index: int) -> Recording:
+        carry_on()
+        return self[index]
+
+    def require_frames(self, frames: int, purpose: str) -> None:
+        """Makes sure that every trajectory is long enough.
+
+        Raises:
+            DataError: naming the first that is shorter.
+        """
+        for index in range(len(self)):
+            if self.split.frames(index) < frames:
+                raise DataError(
+                    f"{self.split.where(index)}: it has {self.split.frames(index)} frames, {purpose} needs {frames}."
+                    " Shorten the horizon (frames per bundle x bundles unrolled) or leave the trajectory out."
+                )

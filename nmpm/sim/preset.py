@@ -61,6 +61,15 @@ class Preset(abc.ABC):
     def most_particles(self) -> int:
         """A trajectory has no more particles than that, static ones included."""
 
+    def lasting(self, frames: int) -> Self:
+        """The same, with another number of frames.
+
+        Raises:
+            ConfigError: if it is not a positive whole number.
+        """
+        changed: Self = dataclasses.replace(self, frames=frames)  # type: ignore[type-var]
+        return changed
+
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]

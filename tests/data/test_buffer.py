@@ -8,9 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.buffer import Motion, TrajectoryBuffer, WindowPlan
+from nmpm.data.buffer import Motion, TrajectoryBuffer
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, read_metadata
+from nmpm.data.plan import WindowPlan
 from nmpm.data.recording import Recording, Recordings
 from nmpm.data.scenes import infer_scene
 from nmpm.errors import ConfigError, DataError
@@ -96,7 +97,7 @@ class TestBuffer:
         for index, window in enumerate(islice(buffer.batches(), 20)):
             for row, (trajectory, start) in enumerate(buffer.plan.batch(index, 0, 1)):
                 count = int(window.mask[row].sum())
-                truth = torch.from_numpy(buffer.recordings.split.read(trajectory, start, start + 5).position)
+                truth = torch.from_numpy(buffer.source.split.read(trajectory, start, start + 5).position)
                 assert torch.equal(window.frames[row, :, :count], truth[:, :count])
                 assert torch.equal(window.obstacle[row], truth[0, count:])
 
@@ -174,7 +175,7 @@ def test_emphasis_keeps_batches_a_function_of_their_number(make_dataset):
     resumed = list(islice(buffer.batches(start=3), 3))
     for one, other in zip(run[3:], resumed, strict=True):
         assert torch.equal(one.frames, other.frames)
-    plain = TrajectoryDataModule(path=data.path, horizon=4, batch_size=4).train_dataloader().buffer
+    plain = TrajectoryDataModule(path=str(data.origin.path), horizon=4, batch_size=4).train_dataloader().buffer
     assert any(not torch.equal(a.frames, b.frames) for a, b in zip(run, plain.batches(), strict=False))
 
 

@@ -151,10 +151,15 @@ class TestTrainer:
         assert model.evaluated == whole + whole[1:]
 
 
-def as_rank(module: TrajectoryDataModule, rank: int, world: int) -> TrajectoryDataModule:
+def as_rank(module: TrajectoryDataModule, rank: int, world: int, device: str = "cpu") -> TrajectoryDataModule:
     progress = SimpleNamespace(total=SimpleNamespace(processed=0))
     loop = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=progress))
-    module.trainer = SimpleNamespace(global_rank=rank, world_size=world, fit_loop=loop)  # type: ignore[assignment]
+    module.trainer = SimpleNamespace(  # type: ignore[assignment]
+        global_rank=rank,
+        world_size=world,
+        fit_loop=loop,
+        strategy=SimpleNamespace(root_device=torch.device(device)),
+    )
     return module
 
 
@@ -173,7 +178,7 @@ class TestEvaluation:
                 assert len(batch) == len(window.frames) <= batch_size
                 seen.update(batch)
                 for row, index in enumerate(batch):
-                    truth = torch.from_numpy(module.split("test").read(index).position)
+                    truth = torch.from_numpy(module.origin.recordings("test").split.read(index).position)
                     assert torch.equal(window.frames[row, :, window.mask[row]], truth)
         assert seen == Counter(range(7))
 
@@ -218,7 +223,7 @@ class TestEmbedded:
         model = Recorder()
         trainer_of(tmp_path, max_steps=2).fit(model, datamodule=module)
         assert len(model.seen) == 2
-        assert len(module.split("train")) == 2
+        assert len(module.origin.recordings("train")) == 2
 
     def test_unknown_option(self):
         with pytest.raises(ConfigError, match="'count'"):
@@ -230,6 +235,13 @@ class TestModule:
         loaders = [as_rank(module_of(make_dataset(train=TRAIN)), rank, 2).train_dataloader() for rank in (0, 1)]
         batches = [[window.frames.sum() for window in islice(loader, 6)] for loader in loaders]
         assert not set(map(float, batches[0])) & set(map(float, batches[1]))
+
+    @pytest.mark.parametrize(("free", "held_on"), [(10**9, "cuda"), (1000, "cpu")])
+    def test_holds_the_buffer_on_a_gpu_where_it_fits(self, make_dataset, monkeypatch, free, held_on):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
+        module = as_rank(module_of(make_dataset()), 0, 1, device="cuda")
+        source, plan = module.origin.training(5, batch_size=2, buffer_size=2, passes=1, seed=0)
+        assert module.buffer_device(source, plan).type == held_on
 
     def test_works_without_a_trainer(self, make_dataset):
         loader = module_of(make_dataset()).train_dataloader()
@@ -250,8 +262,8 @@ class TestModule:
             ({"path": "a", "name": "goop"}, "either"),
             ({"path": "a", "horizon": 0}, "horizon = 0"),
             ({"path": "a", "limit_eval": 0}, "limit_eval = 0"),
-            ({"path": "a", "generate": {"frames": 3}}, "generate cannot be combined with `path`"),
-            ({"name": "goop", "family": "deepmind"}, "family cannot be combined with `name`"),
+            ({"path": "a", "generate": {"frames": 3}}, "generate cannot be combined with recorded data"),
+            ({"name": "goop", "family": "deepmind"}, "family cannot be combined with the simulated dataset goop"),
         ],
     )
     def test_contradictory_options(self, options, named):

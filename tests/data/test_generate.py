@@ -200,7 +200,16 @@ def test_a_damaged_part_is_named(tmp_path, monkeypatch):
     assert not (tmp_path / "train.h5").exists()
 
 
-@pytest.mark.parametrize("counts", [{"train": 1}, {"train": 1, "valid": 1, "test": 0}, {**COUNTS, "more": 1}])
+def test_a_split_of_none_gets_no_file(tmp_path):
+    generate(TINY, tmp_path, {"train": 0, "valid": 1, "test": 0})
+    assert [path.name for path in tmp_path.glob("*.h5")] == ["valid.h5"]
+    assert len(read_metadata(tmp_path).extra["vel_std"]) == 2
+
+
+NONE = dict.fromkeys(COUNTS, 0)
+
+
+@pytest.mark.parametrize("counts", [{"train": 1}, {**COUNTS, "test": -1}, NONE, {**COUNTS, "more": 1}])
 def test_counts_that_cannot_be_are_refused(tmp_path, counts):
     with pytest.raises(ConfigError, match="train, valid, test"):
         generate(TINY, tmp_path, counts)

@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import Split, Trajectory, read_metadata, write_split
-from nmpm.data.recording import Recordings, collate, unwrap
+from nmpm.data.recording import Recordings
 from nmpm.data.scenes import infer_scene
+from nmpm.data.shelf import Shelf, collate, unwrap
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -81,7 +82,7 @@ def test_unknown_material_is_named(make_dataset):
 def test_padding_of_a_batch(make_dataset):
     recordings = recordings_of(make_dataset(statics=2))
     chosen = [recordings[i] for i in range(3)]
-    window = collate(chosen, [0, 3, 6], 5, recordings.scene)
+    window = Shelf.of(chosen, recordings.scene).window([0, 1, 2], [0, 3, 6], 5)
     assert window.frames.shape == (3, 5, 7, 2)
     assert window.mask.sum(dim=1).tolist() == [5, 7, 6]
     assert window.obstacle_mask.all()
@@ -128,7 +129,7 @@ def test_heated_channel_moves_little(recorded):
         recorded / "jaxsph-heated-channel-2d", family="lagrangebench", boundary=("periodic", "wall")
     )
     raw = recordings[0].frames
-    window = collate([recordings[0]], [0], 130, recordings.scene)
+    window = collate([recordings[0]], recordings.scene)
     assert raw[:, :, 0].diff(dim=0).abs().max() > 0.9
     assert window.frames.diff(dim=1).abs().max() < 0.1
     assert window.frames[..., 0].max() > 1.5
@@ -141,4 +142,4 @@ def test_dimensions_contradict_the_scene(make_dataset):
     path = recordings.split.path.with_name("deep.h5")
     write_split(path, [Trajectory(np.zeros((3, 2, 3)), np.full(2, 7))])
     with pytest.raises(DataError, match="positions have 3 dimensions, the scene has 2"):
-        Recordings(Split(path), recordings.metadata, recordings.scene)
+        Recordings(Split(path), recordings.reader.metadata, recordings.scene)

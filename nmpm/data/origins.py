@@ -1,0 +1,200 @@
+"""Where a datamodule's trajectories come from: a folder, an embedded dataset, the simulator itself, or a hub."""
+
+from __future__ import annotations
+
+import abc
+import inspect
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nmpm.data import catalog
+from nmpm.data.buffer import Source
+from nmpm.data.format import Metadata, Split, read_metadata, split_paths
+from nmpm.data.live import LiveRecordings
+from nmpm.data.plan import EndlessPlan, WindowPlan
+from nmpm.data.recording import Recordings
+from nmpm.data.scenes import infer_scene
+from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Boundary, Interval, Scene
+
+if TYPE_CHECKING:
+    from nmpm.data.convert import Options
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What a user says of recorded data where its files do not, or are wrong; as `infer_scene` takes it."""
+
+    family: str | None = None
+    gravity: Sequence[float] | None = None
+    boundary: Sequence[Boundary] | None = None
+    bounds: Sequence[Interval] | None = None
+
+    @property
+    def options(self) -> Options:
+        """The same for the converter of foreign formats."""
+        from nmpm.data.convert import Options
+
+        return Options(
+            family=self.family,
+            gravity=None if self.gravity is None else tuple(map(float, self.gravity)),
+            periodic=None if self.boundary is None else tuple(kind == "periodic" for kind in self.boundary),
+            bounds=None if self.bounds is None else tuple((float(low), float(high)) for low, high in self.bounds),
+        )
+
+
+class Origin(abc.ABC):
+    """A source of trajectories; below it, one class per kind. Nothing is read or simulated before it is asked for."""
+
+    @property
+    @abc.abstractmethod
+    def description(self) -> str:
+        """What the data are, in words; simulated data are named so."""
+
+    @property
+    @abc.abstractmethod
+    def folder(self) -> Path:
+        """A folder in the native layout that holds at least what is evaluated on; made if it is not there yet."""
+
+    @property
+    @abc.abstractmethod
+    def scene(self) -> Scene:
+        """The facts that the trajectories share."""
+
+    @cached_property
+    def metadata(self) -> Metadata:
+        """The metadata of the folder."""
+        return read_metadata(self.folder)
+
+    def recordings(self, name: str) -> Recordings:
+        """The trajectories of a split: "train", "valid" or "test".
+
+        Raises:
+            DataError: if there is no such split, or its file is damaged.
+        """
+        paths = split_paths(self.folder)
+        if name not in paths:
+            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split at all'}).")
+        return Recordings(Split(paths[name]), self.metadata, self.scene)
+
+    def training(self, length: int, **plan: Any) -> tuple[Source, WindowPlan]:
+        """What to train on.
+
+        Args:
+            length: Frames of a window.
+            plan: The other entries of `WindowPlan`, without `frames`.
+        """
+        recordings = self.recordings("train")
+        frames = tuple(map(recordings.split.frames, range(len(recordings))))
+        return recordings, WindowPlan(frames=frames, length=length, **plan)
+
+
+@dataclass(frozen=True)
+class Folder(Origin):
+    """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads.
+
+    Args:
+        path: The dataset.
+        stated: What its files leave open.
+    """
+
+    path: Path
+    stated: Stated = field(default_factory=Stated)
+
+    @property
+    def description(self) -> str:
+        return self.path.name
+
+    @cached_property
+    def folder(self) -> Path:
+        if not self.path.exists() or split_paths(self.path):
+            return self.path
+        from nmpm.data.convert.inplace import native_folder
+
+        return native_folder(self.path, self.stated.options)
+
+    @cached_property
+    def metadata(self) -> Metadata:
+        return read_metadata(self.folder, self.stated.family)
+
+    @cached_property
+    def scene(self) -> Scene:
+        stated = self.stated
+        return infer_scene(self.folder, stated.family, stated.gravity, stated.boundary, stated.bounds)
+
+
+@dataclass(frozen=True)
+class Hub(Folder):
+    """A dataset published on the Hugging Face hub, fetched on first use.
+
+    Args:
+        path: Its name, e.g. "WaterRamps" of `iSach/NeuralMPM`.
+    """
+
+    @property
+    def description(self) -> str:
+        return f"{self.path} of the Hugging Face hub"
+
+    @cached_property
+    def folder(self) -> Path:
+        from nmpm.data.convert.hub import hub_folder
+        from nmpm.data.convert.inplace import native_folder
+
+        return native_folder(hub_folder(str(self.path)), self.stated.options)
+
+
+@dataclass(frozen=True)
+class Embedded(Origin):
+    """An embedded dataset, simulated on first use.
+
+    Args:
+        name: One of `nmpm.data.catalog.catalog()`.
+        generate: Options of `nmpm.data.catalog.ensure`.
+    """
+
+    name: str
+    generate: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def description(self) -> str:
+        return f"{self.name}, simulated by nmpm"
+
+    @cached_property
+    def folder(self) -> Path:
+        return catalog.ensure(self.name, **self._checked())
+
+    @property
+    def scene(self) -> Scene:
+        return catalog.scene(self.name)
+
+    def _checked(self) -> dict[str, Any]:
+        try:
+            inspect.signature(catalog.ensure).bind(self.name, **self.generate)
+        except TypeError as error:
+            raise ConfigError(f"generate = {self.generate}: {error}.") from error
+        return self.generate
+
+
+@dataclass(frozen=True)
+class Live(Embedded):
+    """Training on trajectories fresh from the simulator, none seen twice; evaluation on those of the dataset."""
+
+    @property
+    def description(self) -> str:
+        return f"{self.name}, simulated by nmpm while training"
+
+    @cached_property
+    def folder(self) -> Path:
+        options = self._checked()
+        counts = dict(options.get("counts") or catalog.describe(self.name).counts)
+        return catalog.ensure(self.name, **(options | {"counts": counts | {"train": 0}}))
+
+    def training(self, length: int, **plan: Any) -> tuple[Source, WindowPlan]:
+        options = {key: value for key, value in self._checked().items() if key not in ("counts", "workers")}
+        request = catalog.request_of(self.name, **options)
+        recordings = LiveRecordings(request.preset, request.seed, self.generate.get("workers"))
+        frames = (request.preset.frames + 1,) * plan["buffer_size"]
+        return recordings, EndlessPlan(frames=frames, length=length, **plan)

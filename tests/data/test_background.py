@@ -1,0 +1,59 @@
+import subprocess
+import sys
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nmpm.data.background import in_background, spread
+
+
+def test_gives_the_result_of_another_thread():
+    assert in_background(threading.get_ident).result() != threading.get_ident()
+
+
+def test_gives_the_error_to_whoever_asks():
+    with pytest.raises(ZeroDivisionError):
+        in_background(lambda: 1 // 0).result()
+
+
+@given(items=st.lists(st.integers(), max_size=20), workers=st.integers(1, 5))
+def test_spread_keeps_the_order(items, workers):
+    assert spread(lambda item: 2 * item, items, workers) == [2 * item for item in items]
+
+
+def test_spread_stops_at_an_error():
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        if item == 2:
+            raise ValueError("two")
+
+    with pytest.raises(ValueError, match="two"):
+        spread(work, range(100), workers=1)
+    assert begun == [0, 1, 2]
+
+
+def test_the_program_ends_although_work_is_left():
+    script = """
+from nmpm.data.background import carry_on, in_background
+
+def work():
+    while True:
+        carry_on()
+
+in_background(work)
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=60, check=False).returncode == 0
+
+
+def test_the_program_ends_while_trajectories_are_read(make_dataset):
+    script = f"""
+from nmpm.data.datamodule import TrajectoryDataModule
+data = TrajectoryDataModule(path={str(make_dataset(train=((12, 5),) * 60))!r}, horizon=4, buffer_size=2, passes=0.01)
+for _, window in zip(range(20), data.train_dataloader()):
+    pass
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=60, check=False).returncode == 0

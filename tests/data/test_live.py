@@ -1,0 +1,99 @@
+import dataclasses
+from itertools import islice
+
+import pytest
+import torch
+
+from nmpm.data.buffer import TrajectoryBuffer
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.format import Split
+from nmpm.data.live import LiveRecordings
+from nmpm.data.plan import EndlessPlan
+from nmpm.errors import ConfigError
+from nmpm.sim import MpmPreset, load_preset
+
+GOOP = load_preset("goop")
+TINY = dataclasses.replace(GOOP, frames=8, blocks=dataclasses.replace(GOOP.blocks, particles=(40, 60)))
+PLAN = EndlessPlan(frames=(9, 9), length=5, batch_size=3, buffer_size=2, passes=1, seed=0)
+
+
+def live(**changes) -> LiveRecordings:
+    return LiveRecordings(TINY, **({"workers": 2} | changes))
+
+
+def test_a_number_is_always_the_same_trajectory():
+    one, other, again = live(), live(seed=1), live()
+    assert torch.equal(one[3].frames, again.load([5, 3])[1].frames)
+    assert one[3].frames.shape != one[4].frames.shape or not torch.equal(one[3].frames, one[4].frames)
+    assert one[3].frames.shape != other[3].frames.shape or not torch.equal(one[3].frames, other[3].frames)
+
+
+def test_simulates_no_trajectory_twice_for_the_same_request(monkeypatch):
+    seeds, simulate = [], MpmPreset.simulate
+    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, **_: seeds.append(seed) or simulate(preset, seed))
+    recordings = live()
+    for indices in ([0, 1], [2, 3], [0, 1], [2, 3]):
+        recordings.load(indices)
+    assert len(seeds) == len(set(seeds)) == 4
+
+
+def test_batches_go_on_anywhere():
+    straight = list(islice(TrajectoryBuffer(live(), PLAN).batches(), 12))
+    resumed = list(islice(TrajectoryBuffer(live(), PLAN).batches(start=5), 7))
+    for expected, window in zip(straight[5:], resumed, strict=True):
+        assert torch.equal(window.frames, expected.frames)
+
+
+def test_no_trajectory_is_in_two_buffers_or_ranks():
+    members = [PLAN.members(buffer, rank, 3) for buffer in range(4) for rank in range(3)]
+    assert sorted(index for buffer in members for index in buffer) == list(range(24))
+
+
+def test_a_buffers_windows_are_all_seen():
+    per_buffer = PLAN.batches_per_buffer(world=2)
+    drawn = {window for index in range(per_buffer) for window in PLAN.batch(index, rank=1, world=2)}
+    assert per_buffer == 3
+    assert {trajectory for trajectory, _ in drawn} == set(PLAN.members(0, 1, 2))
+    assert len(drawn) == 9
+
+
+def test_a_failed_simulation_is_reported():
+    fast = dataclasses.replace(TINY, blocks=dataclasses.replace(TINY.blocks, speed=1e200))
+    with pytest.raises(ConfigError, match=r"Preset goop, seed .*finite"):
+        LiveRecordings(fast).load([0, 1])
+
+
+def test_too_long_a_horizon():
+    with pytest.raises(ConfigError, match=r"goop: its trajectories have 9 frames, .* needs 10"):
+        TrajectoryBuffer(live(), dataclasses.replace(PLAN, length=10))
+
+
+class TestDataModule:
+    @pytest.fixture
+    def module(self, tmp_path, monkeypatch) -> TrajectoryDataModule:
+        monkeypatch.setenv("NMPM_HOME", str(tmp_path))
+        options = {"counts": {"train": 5, "valid": 1, "test": 1}, "frames": 6}
+        return TrajectoryDataModule(
+            name="goop", source="simulate", horizon=3, batch_size=2, buffer_size=2, generate=options
+        )
+
+    def test_trains_on_what_is_never_written(self, module):
+        window = next(iter(module.train_dataloader()))
+        assert window.frames.shape[:2] == (2, 5)
+        assert len(next(iter(module.val_dataloader())).frames) == 1
+        assert sorted(path.name for path in module.origin.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
+        assert "simulated by nmpm while training" in module.description
+
+    def test_evaluates_on_the_trajectories_of_the_dataset(self, module):
+        stored = TrajectoryDataModule(
+            name="goop", generate={"counts": {"train": 1, "valid": 1, "test": 1}, "frames": 6}
+        )
+        for split in ("valid", "test"):
+            live_file, stored_file = (Split(data.origin.folder / f"{split}.h5") for data in (module, stored))
+            assert (live_file.read(0).position == stored_file.read(0).position).all()
+
+    def test_needs_the_name_of_a_preset(self):
+        with pytest.raises(ConfigError, match="source = simulate needs the `name`"):
+            TrajectoryDataModule(path="somewhere", source="simulate")
+        with pytest.raises(ConfigError, match="source = tape is not one of disk, simulate, hub"):
+            TrajectoryDataModule(name="goop", source="tape")
