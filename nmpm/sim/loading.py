@@ -14,8 +14,9 @@ from omegaconf import OmegaConf
 from nmpm.errors import ConfigError
 from nmpm.sim.mpm_preset import MpmPreset
 from nmpm.sim.preset import Preset
+from nmpm.sim.sph.preset import SphPreset
 
-SOLVERS: dict[str, type[Preset]] = {kind.solver: kind for kind in (MpmPreset,)}
+SOLVERS: dict[str, type[Preset]] = {kind.solver: kind for kind in (MpmPreset, SphPreset)}
 
 
 def preset_names() -> tuple[str, ...]:

@@ -8,26 +8,44 @@ Jiang et al., "The affine particle-in-cell method", 2015). Kernels are quadratic
 Nodes are the centres of square cells of size h that fill the box, and of one more cell around it, so that a particle in
 cell i feels the nodes i, i + 1 and i + 2, counted from the outer cell. The wall acts at the centres of the outer and of
 the first inner cells. A particle's velocity towards the wall then falls with the square of its distance from the box's
-side, and it cannot cross.
+side, and it cannot cross. Walls that hold on to material act at the centres of the second inner cells as well, where
+particles then stop; the box's sides are a cell further out.
 """
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm.errors import DataError
 from nmpm.sim.compiled import compiled
 from nmpm.sim.materials import Material
 from nmpm.sim.materials.base import Array
+from nmpm.sim.solid import Solid, slide
 
 REVISION = 1
 """Raised whenever the same preset and seed would give other numbers."""
 
 # Distance from the box's sides, in cells, at which a particle is held back. Float32 can still tell it from the side.
 _MARGIN = 1e-4
+
+
+class Walls(enum.Enum):
+    """What the box's sides do with material that leaves them."""
+
+    SEPARATE = "separate"
+    """Let it go: they push and brake, and never pull."""
+
+    SLIP = "slip"
+    """Hold it, so that it only slides along."""
+
+    OPEN_CORNERS = "slip, open corners"
+    """Hold it; but at the very corner, the first node of both walls, along the first axis alone, so that what slides
+    down a side is not stopped a cell above the floor. So walls the solver that made DeepMind's recorded water."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +58,8 @@ class Grid:
         shape: Cells along each axis.
         friction: Coulomb friction of the walls.
         gravity: (2,) acceleration, in length per second squared.
+        walls: How the box's sides treat material.
+        solid: Obstacles within the box, if any.
     """
 
     low: Array
@@ -47,6 +67,8 @@ class Grid:
     shape: tuple[int, int]
     friction: float
     gravity: Array
+    walls: Walls = Walls.SEPARATE
+    solid: Solid | None = None
 
 
 class State:
@@ -66,12 +88,24 @@ class State:
         self.position = np.array(position, dtype=np.float64, order="C")
         self.velocity = np.array(velocity, dtype=np.float64, order="C")
         self.gradient: Array = np.zeros((count, 2, 2))
-        self.strain: Array = np.tile(np.array([1.0, 0.0, 1.0]), (count, 1))
+        self.strain: Array = _at_rest(groups)
         self.stress: Array = np.zeros((count, 3))
         self.volume = volume
         self.mass: Array = np.repeat([m.density * volume for m, _ in groups], [n for _, n in groups])
         ends = np.cumsum([0] + [n for _, n in groups])
         self.parts = tuple((m, slice(a, b)) for (m, _), a, b in zip(groups, ends[:-1], ends[1:], strict=True))
+
+
+def _at_rest(groups: tuple[tuple[Material, int], ...]) -> Array:
+    """Strains of unstrained particles, as wide as the widest material's; the others leave the last columns alone."""
+    width = max(len(material.rest(2)) for material, _ in groups)
+    strain = np.zeros((sum(count for _, count in groups), width))
+    first = 0
+    for material, count in groups:
+        rest = material.rest(2)
+        strain[first : first + count, : len(rest)] = rest
+        first += count
+    return strain
 
 
 class Stepper:
@@ -87,13 +121,27 @@ class Stepper:
         self.dt = dt
         self.held_back = 0
         """Particles held back at the box's sides so far, by the last safety that should never act."""
+        self.pushed_out = 0
+        """Particles put back to an obstacle's surface so far."""
         self._nodes: Array = np.zeros((grid.shape[0] + 2, grid.shape[1] + 2, 3))
         self._lower = grid.low + _MARGIN * grid.size
         self._upper = grid.low + (np.array(grid.shape) - _MARGIN) * grid.size
+        holds = grid.walls is not Walls.SEPARATE
+        self._walls = (holds, int(holds), grid.walls is Walls.OPEN_CORNERS)
 
     def enclose(self, state: State) -> None:
-        """Hold particles back at the box's sides, as every substep does; a state must begin so."""
+        """Hold particles back at the box's sides and out of obstacles, as every substep does; a state must begin so.
+
+        Raises:
+            DataError: if a particle finds no way out of an obstacle.
+        """
         np.clip(state.position, self._lower, self._upper, out=state.position)
+        if self.grid.solid is not None:
+            self.grid.solid.push_out(state.position.copy(), state.position, state.velocity, self._lower, self._upper)
+            depth = self.grid.solid.depth(state.position)
+            if depth.any():
+                worst = int(np.argmax(depth))
+                raise DataError(f"Particle {worst} at {state.position[worst].tolist()} is inside an obstacle.")
 
     def step(self, state: State) -> None:
         """One substep, in place.
@@ -108,13 +156,19 @@ class Stepper:
             nodes, grid.low, grid.size, dt * state.volume,
             state.position, state.velocity, state.gradient, state.stress, state.mass,
         )  # fmt: skip
-        _move(nodes, dt * grid.gravity, grid.friction)
+        before = None
+        if grid.solid is not None:
+            before = state.position.copy()
+            grid.solid.brake(nodes, dt * grid.gravity)
+        _move(nodes, dt * grid.gravity, grid.friction, *self._walls)
         held_back = _gather(
             nodes, grid.low, grid.size, dt, self._lower, self._upper, state.position, state.velocity, state.gradient
         )
         if held_back < 0:
             raise FloatingPointError("The state is not finite")
         self.held_back += held_back
+        if grid.solid is not None and before is not None:
+            self.pushed_out += grid.solid.push_out(before, state.position, state.velocity, self._lower, self._upper)
 
 
 @compiled
@@ -155,17 +209,8 @@ def _scatter(
 
 
 @compiled
-def _slide(normal: float, tangential: float, friction: float) -> tuple[float, float]:
-    """Velocity at a wall, which takes what goes into it (normal < 0) and brakes what slides along."""
-    if normal >= 0:
-        return normal, tangential
-    left = max(0.0, abs(tangential) + friction * normal)
-    return 0.0, left if tangential > 0 else -left
-
-
-@compiled
-def _move(nodes: Array, fall: Array, friction: float) -> None:
-    """Momenta to velocities, with gravity's change `fall` and the walls."""
+def _move(nodes: Array, fall: Array, friction: float, holds: bool, inset: int, open_corners: bool) -> None:
+    """Momenta to velocities, with gravity's change `fall` and the walls, which reach `inset` nodes further in."""
     nx, ny = nodes.shape[0], nodes.shape[1]
     for i in range(nx):
         for j in range(ny):
@@ -173,16 +218,19 @@ def _move(nodes: Array, fall: Array, friction: float) -> None:
                 continue
             u = nodes[i, j, 1] / nodes[i, j, 0] + fall[0]
             v = nodes[i, j, 2] / nodes[i, j, 0] + fall[1]
-            if i <= 1:
-                u, v = _slide(u, v, friction)
-            elif i >= nx - 2:
-                u, v = _slide(-u, v, friction)
-                u = -u
-            if j <= 1:
-                v, u = _slide(v, u, friction)
-            elif j >= ny - 2:
-                v, u = _slide(-v, u, friction)
-                v = -v
+            # Nodes from the walls' surface, 0 on it; negative within the box.
+            deep_x, deep_y = inset + 1 - min(i, nx - 1 - i), inset + 1 - min(j, ny - 1 - j)
+            at_x, at_y = deep_x >= 0, deep_y >= 0
+            if open_corners and at_x and at_y and min(deep_x, deep_y) == 0:
+                at_x, at_y = deep_x >= deep_y, deep_y > deep_x
+            if at_x:
+                sign = 1.0 if 2 * i < nx else -1.0
+                u, v = slide(sign * u, v, friction)
+                u = 0.0 if holds else sign * u
+            if at_y:
+                sign = 1.0 if 2 * j < ny else -1.0
+                v, u = slide(sign * v, u, friction)
+                v = 0.0 if holds else sign * v
             nodes[i, j, 1], nodes[i, j, 2] = u, v
 
 

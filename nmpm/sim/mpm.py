@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim.blocks import draw_start
-from nmpm.sim.mls_mpm import Grid, State, Stepper
+from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
 from nmpm.sim.mpm_preset import MpmPreset
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
@@ -80,9 +80,10 @@ def _advance(stepper: Stepper, state: State, substeps: int, frame: int) -> None:
 
 
 def _grid(preset: MpmPreset) -> Grid:
-    low = np.array([axis[0] for axis in preset.box])
+    low, high = np.array(preset.reach).T
+    columns, rows = (round(cells) for cells in (high - low) / preset.cell_size)
     gravity = np.array(preset.gravity, dtype=np.float64)
-    return Grid(low, preset.cell_size, preset.grid_shape, preset.wall_friction, gravity)
+    return Grid(low, preset.cell_size, (columns, rows), preset.wall_friction, gravity, Walls(preset.walls))
 
 
 def _check_state(
@@ -97,11 +98,11 @@ def _check_state(
         raise DataError(
             f"Counts {counts} do not divide {len(position)} particles among {len(preset.materials)} materials."
         )
-    low, high = np.array(preset.box).T
+    low, high = np.array(preset.reach).T
     inside = np.all((low <= position) & (position <= high) & np.isfinite(velocity), axis=1)
     if not inside.all():
         worst = int(np.argmin(inside))
         raise DataError(
             f"Particle {worst} at {position[worst].tolist()} with velocity {velocity[worst].tolist()} is not finite or "
-            f"not within the box {preset.box}."
+            f"not within {preset.reach}."
         )

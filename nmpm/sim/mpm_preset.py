@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.materials import MATERIALS, Material
-from nmpm.sim.mls_mpm import REVISION
+from nmpm.sim.mls_mpm import REVISION, Walls
 from nmpm.sim.preset import Preset, built, checked, require
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
@@ -62,7 +62,8 @@ class MpmPreset(Preset):
         frames: Simulated frames of a trajectory after its initial state.
         frame_dt: Time between frames, in seconds.
         substeps: Substeps of a frame.
-        box: Where particles may be, (lower, upper) along x and y, in length.
+        box: Where particles may be, (lower, upper) along x and y, in length; walls that hold let them into a layer
+            around it, see `reach`.
         domain: What an emulator's grid covers, likewise.
         cells: Grid cells along x, from side to side of the box.
         spacing: Distance between particles in the initial lattice, in length.
@@ -70,6 +71,7 @@ class MpmPreset(Preset):
         wall_friction: Coulomb friction at the walls.
         materials: What blocks are made of.
         blocks: How the initial state is drawn.
+        walls: What the walls do with material that leaves them, a value of `Walls`.
 
     Raises:
         ConfigError: if the numbers contradict each other or a substep is too long to be stable.
@@ -91,6 +93,7 @@ class MpmPreset(Preset):
     wall_friction: float
     materials: tuple[Material, ...]
     blocks: Blocks
+    walls: str = Walls.SEPARATE.value
 
     def __post_init__(self) -> None:
         for key in ("frames", "substeps", "cells"):
@@ -98,6 +101,8 @@ class MpmPreset(Preset):
         for key in ("frames", "frame_dt", "substeps", "cells", "spacing"):
             require(0 < getattr(self, key) < math.inf, f"{key} = {getattr(self, key)} must be positive and finite.")
         require(self.wall_friction >= 0, f"wall_friction = {self.wall_friction} must not be negative.")
+        known = [kind.value for kind in Walls]
+        require(self.walls in known, f"walls = {self.walls} is not one of {', '.join(map(repr, known))}.")
         require(bool(self.materials), f"materials is empty; known are {', '.join(MATERIALS)}.")
         (left, right), (bottom, top) = self.box
         require(left < right and bottom < top, f"box = {self.box} needs (lower, upper) along each axis.")
@@ -121,6 +126,13 @@ class MpmPreset(Preset):
     def grid_shape(self) -> tuple[int, int]:
         """Grid cells along x and y."""
         return self.cells, round((self.box[1][1] - self.box[1][0]) / self.cell_size)
+
+    @property
+    def reach(self) -> tuple[Interval, Interval]:
+        """How far particles can get: the box, and a cell and a half beyond it where walls hold what touches them."""
+        (left, right), (bottom, top) = self.box
+        layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
+        return (left - layer, right + layer), (bottom - layer, top + layer)
 
     @property
     def particle_volume(self) -> float:
@@ -155,7 +167,7 @@ class MpmPreset(Preset):
     @property
     def scene(self) -> Scene:
         return Scene(
-            bounds=self.box,
+            bounds=self.reach,
             domain=self.domain,
             dt=self.frame_dt,
             materials=tuple(material.name for material in self.materials),

@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 class Material(abc.ABC):
     """A constitutive model: how stress follows from the motion so far.
 
-    The simulator keeps one symmetric tensor per particle for it, the elastic left Cauchy-Green strain, as the three
-    components (xx, xy, yy), which is (1, 0, 1) at the start.
+    The simulator keeps a few numbers per particle for it, its strain; what they mean is the material's own affair.
+    Symmetric tensors are written as their upper triangle row by row: (xx, xy, yy), (xx, xy, xz, yy, yz, zz).
     """
 
     name: ClassVar[str]
@@ -35,12 +35,16 @@ class Material(abc.ABC):
         """Speed of the fastest elastic wave at rest, in length per second."""
 
     @abc.abstractmethod
+    def rest(self, dim: int) -> tuple[float, ...]:
+        """Strain of a particle in D dimensions that nothing has strained; its length is the number of components."""
+
+    @abc.abstractmethod
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         """Carry the strain over one substep, in place, and write the stress that it causes.
 
         Args:
-            strain: (N, 3) elastic left Cauchy-Green strain.
-            gradient: (N, 2, 2) velocity gradient, d v_i / d x_j, per second.
-            stress: (N, 3) Kirchhoff stress (xx, xy, yy), in Pa; overwritten.
+            strain: (N, S) strain, S at least the length of `rest(D)`; what is beyond belongs to others.
+            gradient: (N, D, D) velocity gradient, d v_i / d x_j, per second.
+            stress: (N, D (D + 1) / 2) Kirchhoff stress, in Pa; overwritten.
             dt: Length of the substep, in seconds.
         """

@@ -77,6 +77,11 @@ class Goop(Material):
     def wave_speed(self) -> float:
         return math.sqrt((self.bulk_modulus + self.shear_modulus) / self.density)
 
+    def rest(self, dim: int) -> tuple[float, ...]:
+        if dim != 2:
+            raise ConfigError(f"goop is known in two dimensions, not in {dim}.")
+        return 1.0, 0.0, 1.0
+
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         remaining = math.exp(-self.shear_modulus * dt / self.viscosity)
         _respond(strain, gradient, stress, dt, self.shear_modulus, self.bulk_modulus, self.yield_stress, remaining)

@@ -1,0 +1,1 @@
+"""Weakly compressible smoothed particle hydrodynamics, with walls, in two dimensions."""

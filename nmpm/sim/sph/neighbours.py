@@ -1,0 +1,168 @@
+"""Pairs of particles that are near each other, found through a grid of square cells as large as the reach.
+
+Particles are sorted by cell, row after row. The neighbours of a particle then lie in three runs of indices, one for
+each row of cells around it, and every pair is found once, from the particle that comes first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.sim.compiled import compiled
+from nmpm.sim.materials.base import Array
+
+Indices = NDArray[np.uint32]
+Pairs = tuple[Indices, Indices]
+"""First and second particle of each pair, K each."""
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """Square cells that cover a rectangle, with one more ring of cells that stay empty.
+
+    Args:
+        low: (2,) lower corner of the ring.
+        size: Side of a cell, the reach within which pairs are found.
+        shape: Cells along x and y, the ring included.
+    """
+
+    low: Array
+    size: float
+    shape: tuple[int, int]
+
+    @property
+    def inverse(self) -> float:
+        """Cells per length: a little fewer than size says, so that rounding never puts a pair two cells apart."""
+        return (1.0 - 1e-9) / self.size
+
+    @classmethod
+    def covering(cls, low: Array, high: Array, size: float) -> CellGrid:
+        """The grid that covers the rectangle from low to high."""
+        columns, rows = (int(n) + 4 for n in (high - low) / size)
+        return cls(np.asarray(low, np.float64) - 1.001 * size, size, (columns, rows))
+
+    def sorting(self, x: Array, y: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Order of the particles by cell, and where each cell's run of them starts (cells + 1 numbers).
+
+        Particles must lie in the rectangle; within a cell they keep their order.
+        """
+        columns, rows = self.shape
+        order = np.empty(len(x), np.int64)
+        starts = np.zeros(columns * rows + 2, np.int64)
+        _sort(x, y, self.low[0], self.low[1], self.inverse, columns, order, starts)
+        return order, starts[:-1]
+
+
+class PairFinder:
+    """Finds pairs within a grid's cell size, and keeps the memory for them.
+
+    Args:
+        grid: Covers all particles.
+    """
+
+    def __init__(self, grid: CellGrid) -> None:
+        self.grid = grid
+        self._memory = np.empty((2, 1024), np.uint32)
+
+    def within(self, x: Array, y: Array, starts: NDArray[np.int64]) -> Pairs:
+        """Every pair of sorted particles once; valid until the next call."""
+        return self._grown(lambda memory: _pairs_within(x, y, starts, *self._facts, memory))
+
+    def between(self, x: Array, y: Array, others_x: Array, others_y: Array, starts: NDArray[np.int64]) -> Pairs:
+        """Every pair of a particle and one of the others, which are sorted; valid until the next call."""
+        return self._grown(lambda memory: _pairs_between(x, y, others_x, others_y, starts, *self._facts, memory))
+
+    @property
+    def _facts(self) -> tuple[float, float, float, float, int]:
+        grid = self.grid
+        return float(grid.low[0]), float(grid.low[1]), grid.inverse, grid.size, grid.shape[0]
+
+    def _grown(self, fill: Callable[[Indices], int]) -> Pairs:
+        count = fill(self._memory)
+        if count >= self._memory.shape[1]:
+            self._memory = np.empty((2, count + count // 4 + 1), np.uint32)
+            fill(self._memory)
+        return self._memory[0, :count], self._memory[1, :count]
+
+
+@compiled
+def _sort(
+    x: Array,
+    y: Array,
+    left: float,
+    bottom: float,
+    inverse: float,
+    columns: int,
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
+) -> None:
+    """Counting sort; `starts` has two more entries than cells, and ends up shifted by one for the filling."""
+    cells = np.empty(x.shape[0], np.int64)
+    for i in range(x.shape[0]):
+        cells[i] = int((y[i] - bottom) * inverse) * columns + int((x[i] - left) * inverse)
+        starts[cells[i] + 2] += 1
+    for c in range(2, starts.shape[0]):
+        starts[c] += starts[c - 1]
+    for i in range(x.shape[0]):
+        order[starts[cells[i] + 1]] = i
+        starts[cells[i] + 1] += 1
+
+
+@compiled
+def _pairs_within(
+    x: Array,
+    y: Array,
+    starts: NDArray[np.int64],
+    left: float,
+    bottom: float,
+    inverse: float,
+    reach: float,
+    columns: int,
+    memory: Indices,
+) -> int:
+    """Pairs found; stored if there is more room. Every candidate is written and those too far away are overwritten."""
+    reach2, last, count = reach * reach, memory.shape[1] - 1, 0
+    for i in range(x.shape[0]):
+        xi, yi = x[i], y[i]
+        cell = int((yi - bottom) * inverse) * columns + int((xi - left) * inverse)
+        for row in range(2):
+            begin = i + 1 if row == 0 else starts[cell + columns - 1]
+            for j in range(begin, starts[cell + row * columns + 2]):
+                dx, dy = xi - x[j], yi - y[j]
+                slot = min(count, last)
+                memory[0, slot], memory[1, slot] = i, j
+                count += dx * dx + dy * dy < reach2
+    return count
+
+
+@compiled
+def _pairs_between(
+    x: Array,
+    y: Array,
+    others_x: Array,
+    others_y: Array,
+    starts: NDArray[np.int64],
+    left: float,
+    bottom: float,
+    inverse: float,
+    reach: float,
+    columns: int,
+    memory: Indices,
+) -> int:
+    """Pairs found; stored if there is more room. Every candidate is written and those too far away are overwritten."""
+    reach2, last, count = reach * reach, memory.shape[1] - 1, 0
+    for i in range(x.shape[0]):
+        xi, yi = x[i], y[i]
+        cell = int((yi - bottom) * inverse) * columns + int((xi - left) * inverse)
+        for row in range(-1, 2):
+            middle = cell + row * columns
+            for j in range(starts[middle - 1], starts[middle + 2]):
+                dx, dy = xi - others_x[j], yi - others_y[j]
+                slot = min(count, last)
+                memory[0, slot], memory[1, slot] = i, j
+                count += dx * dx + dy * dy < reach2
+    return count

@@ -1,0 +1,205 @@
+"""The sums over pairs of a weakly compressible fluid's step, compiled.
+
+h is the smoothing length and equals the particles' spacing; m is a particle's mass, V = m / ρ its area, W the kernel
+and F = W′(r) / r, so that ∇W = F (x_i − x_j). The F of a pair serves two sums, so it is kept.
+"""
+
+from __future__ import annotations
+
+import math
+
+from nmpm.sim.compiled import compiled
+from nmpm.sim.materials.base import Array
+from nmpm.sim.sph.kernel import NORM, slope, weight
+from nmpm.sim.sph.neighbours import Indices
+
+# Particles on the same spot have no direction to push each other in: a tiny distance, squared, keeps F finite.
+_SAME_SPOT = 1e-24
+
+
+@compiled
+def pair_geometry(
+    x: Array, y: Array, first: Indices, second: Indices, h: float, dx: Array, dy: Array, f: Array
+) -> None:
+    """Difference of position of each pair, first minus second, and F."""
+    inverse = 1.0 / h
+    scale = NORM * inverse**3
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        dx[k], dy[k] = x[i] - x[j], y[i] - y[j]
+    # A loop of its own, free of look-ups, is done several pairs at a time.
+    for k in range(f.shape[0]):
+        r = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k] + _SAME_SPOT)
+        f[k] = scale * slope(r * inverse) / r
+
+
+@compiled
+def wall_geometry(
+    x: Array,
+    y: Array,
+    wall_x: Array,
+    wall_y: Array,
+    first: Indices,
+    second: Indices,
+    h: float,
+    dx: Array,
+    dy: Array,
+    f: Array,
+    w: Array,
+) -> None:
+    """The same for pairs of a particle and a wall particle, and W."""
+    inverse = 1.0 / h
+    scale, norm = NORM * inverse**3, NORM * inverse**2
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        dx[k], dy[k] = x[i] - wall_x[j], y[i] - wall_y[j]
+        r = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k] + _SAME_SPOT)
+        f[k], w[k] = scale * slope(r * inverse) / r, norm * weight(r * inverse)
+
+
+@compiled
+def expansion(
+    first: Indices,
+    second: Indices,
+    dx: Array,
+    dy: Array,
+    f: Array,
+    vx: Array,
+    vy: Array,
+    density: Array,
+    mass: float,
+    diffusion: float,
+    layering: Array,
+    soft: float,
+    rate: Array,
+    drag: Array,
+) -> None:
+    """Adds Σ V_j F v_ij · x_ij, the rate at which density grows per density (Monaghan 2005), to `rate`.
+
+    To that comes diffusion of density, Σ V_j F `diffusion` (ρ_ij − ρ^H_ij), where ρ^H is the density of water at rest,
+    whose gradient is `layering` (Fourtakas, Dominguez, Vacondio & Rogers 2019).
+
+    `drag` becomes F v_ij · x_ij / (r² + soft) of each pair, which viscosity needs; `soft` stands for 0.01 h².
+    """
+    volume = mass / density
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        approach = f[k] * ((vx[i] - vx[j]) * dx[k] + (vy[i] - vy[j]) * dy[k])
+        drag[k] = approach
+        uneven = density[i] - density[j] - layering[0] * dx[k] - layering[1] * dy[k]
+        flux = diffusion * f[k] * uneven
+        rate[i] += volume[j] * (approach + flux)
+        rate[j] += volume[i] * (approach - flux)
+    for k in range(drag.shape[0]):
+        drag[k] /= dx[k] * dx[k] + dy[k] * dy[k] + soft
+
+
+@compiled
+def wall_expansion(
+    first: Indices,
+    second: Indices,
+    dx: Array,
+    dy: Array,
+    f: Array,
+    vx: Array,
+    vy: Array,
+    wall_volume: Array,
+    rate: Array,
+) -> None:
+    """The walls' part of `expansion`: they stand still."""
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        rate[i] += wall_volume[j] * f[k] * (vx[i] * dx[k] + vy[i] * dy[k])
+
+
+@compiled
+def push(
+    first: Indices,
+    second: Indices,
+    dx: Array,
+    dy: Array,
+    f: Array,
+    drag: Array,
+    density: Array,
+    pressure: Array,
+    mass: float,
+    viscosity: float,
+    ax: Array,
+    ay: Array,
+) -> None:
+    """Adds the accelerations of pressure (Adami et al. 2012, equations 6 and 7) and viscosity to ax and ay.
+
+    Viscosity is Monaghan's (2005, equation 4.2), for pairs that approach and that part alike; `viscosity` stands for
+    α h c plus eight times the kinematic viscosity. Both act along the line between two particles, so that momentum and
+    angular momentum are kept.
+    """
+    areas = 1.0 / (density * density)
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        ri, rj = density[i], density[j]
+        mean = rj * pressure[i] + ri * pressure[j]
+        strength = mass * (2.0 * viscosity * drag[k] - (areas[i] + areas[j]) * mean * f[k]) / (ri + rj)
+        ax[i] += strength * dx[k]
+        ay[i] += strength * dy[k]
+        ax[j] -= strength * dx[k]
+        ay[j] -= strength * dy[k]
+
+
+@compiled
+def wall_averages(
+    first: Indices,
+    second: Indices,
+    dx: Array,
+    dy: Array,
+    w: Array,
+    vx: Array,
+    vy: Array,
+    density: Array,
+    pressure: Array,
+    gravity: Array,
+    wall: Array,
+) -> None:
+    """Pressure and velocity of the walls, continued from the fluid (Adami et al. 2012, equations 22, 23 and 27).
+
+    Rows of `wall` become pressure, velocity along x and y, and the sum of the weights; nought where no fluid is near.
+    """
+    wall[:] = 0.0
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        fall = density[i] * (gravity[0] * dx[k] + gravity[1] * dy[k])
+        wall[0, j] += w[k] * (pressure[i] - fall)
+        wall[1, j] -= w[k] * vx[i]
+        wall[2, j] -= w[k] * vy[i]
+        wall[3, j] += w[k]
+    for j in range(wall.shape[1]):
+        if wall[3, j] > 0.0:
+            for row in range(3):
+                wall[row, j] /= wall[3, j]
+
+
+@compiled
+def wall_push(
+    first: Indices,
+    second: Indices,
+    dx: Array,
+    dy: Array,
+    f: Array,
+    vx: Array,
+    vy: Array,
+    density: Array,
+    pressure: Array,
+    wall: Array,
+    wall_density: Array,
+    mass: float,
+    viscosity: float,
+    ax: Array,
+    ay: Array,
+) -> None:
+    """Adds the walls' pressure and, with the dynamic viscosity, their no-slip drag (Adami et al. 2012, equation 8)."""
+    for k in range(first.shape[0]):
+        i, j = first[k], second[k]
+        ri, rj = density[i], wall_density[j]
+        mean = (rj * pressure[i] + ri * wall[0, j]) / (ri + rj)
+        areas = mass * f[k] * (1.0 / (ri * ri) + 1.0 / (rj * rj))
+        ax[i] += areas * (viscosity * (vx[i] - wall[1, j]) - mean * dx[k])
+        ay[i] += areas * (viscosity * (vy[i] - wall[2, j]) - mean * dy[k])

@@ -1,0 +1,186 @@
+"""Solids: the box and convex obstacles in it, as dummy particles for the fluid to feel and as surfaces not to cross.
+
+Dummy particles continue the fluid's lattice into the solid, three layers deep, the kernel's reach (Adami, Hu & Adams,
+"A generalized wall boundary condition for smoothed particle hydrodynamics", 2012): the first layer lies half a spacing
+behind the surface. Obstacles carry closed rings of them, parallel to their edges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.scene import Interval
+from nmpm.sim.compiled import compiled
+from nmpm.sim.materials.base import Array
+
+LAYERS = 3
+
+# Distance from a surface, in spacings, at which a particle is held back. Float32 can still tell it from the surface.
+_MARGIN = 1e-3
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A convex polygon.
+
+    Args:
+        corners: (V, 2) in length, counter-clockwise.
+    """
+
+    corners: Array
+
+    @property
+    def normals(self) -> Array:
+        """(V, 2) unit normals of the edges, outwards; edge k runs from corner k to the next."""
+        edge = np.roll(self.corners, -1, axis=0) - self.corners
+        return np.asarray(np.stack([edge[:, 1], -edge[:, 0]], -1) / np.linalg.norm(edge, axis=1, keepdims=True))
+
+    @property
+    def offsets(self) -> Array:
+        """(V,) such that a point x is inside where normals @ x < offsets."""
+        return np.asarray((self.normals * self.corners).sum(-1))
+
+    def depth(self, points: NDArray[np.floating]) -> Array:
+        """(N,) distance of each point to the nearest edge's line, positive inside and negative outside."""
+        return np.asarray((self.offsets - points @ self.normals.T).min(-1))
+
+
+def box_particles(box: tuple[Interval, Interval], spacing: float) -> tuple[Array, NDArray[np.int64]]:
+    """Dummy particles around a box.
+
+    Returns:
+        Positions (M, 2), and the layer of each, 0 being next to the fluid.
+    """
+    axes, layers = [], []
+    for low, high in box:
+        count = round((high - low) / spacing)
+        deep = np.arange(LAYERS)
+        inner = low + spacing * (np.arange(count) + 0.5)
+        axes.append(np.concatenate([low - spacing * (deep[::-1] + 0.5), inner, high + spacing * (deep + 0.5)]))
+        layers.append(np.concatenate([deep[::-1], np.full(count, -1), deep]))
+    position = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    layer = np.maximum(*np.meshgrid(*layers, indexing="ij")).reshape(-1)
+    return position[layer >= 0], layer[layer >= 0]
+
+
+def obstacle_particles(obstacle: Obstacle, spacing: float) -> Array:
+    """Dummy particles within an obstacle, (M, 2): rings at half a spacing, one and a half, … below its surface."""
+    rings = [_ring(obstacle, spacing * (layer + 0.5), spacing) for layer in range(LAYERS)]
+    return np.concatenate(rings)
+
+
+def _ring(obstacle: Obstacle, depth: float, spacing: float) -> Array:
+    """Points along the polygon that lies `depth` below the surface; none where the obstacle is thinner."""
+    normals, offsets = obstacle.normals, obstacle.offsets - depth
+    # Each inner corner is where two neighbouring edges, moved inwards, meet.
+    planes = np.stack([np.roll(normals, 1, axis=0), normals], axis=1)
+    corners = np.linalg.solve(planes, np.stack([np.roll(offsets, 1), offsets], -1)[..., None])[..., 0]
+    if np.any(obstacle.depth(corners) < depth * (1 - 1e-9)):
+        return np.empty((0, 2))
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    length = sides.sum()
+    along = np.arange(max(1, round(length / spacing))) * length / max(1, round(length / spacing))
+    closed = np.concatenate([corners, corners[:1]])
+    reached = np.concatenate([[0.0], np.cumsum(sides)])
+    return np.stack([np.interp(along, reached, closed[:, axis]) for axis in range(2)], -1)
+
+
+class Solids:
+    """The box and its obstacles.
+
+    Args:
+        box: Where the fluid may be, (lower, upper) along x and y, in length.
+        obstacles: Where it may not.
+        spacing: Of the particles, in length.
+    """
+
+    def __init__(self, box: tuple[Interval, Interval], obstacles: tuple[Obstacle, ...], spacing: float) -> None:
+        low, high = np.array(box, np.float64).T
+        self.margin = _MARGIN * spacing
+        around, layer = box_particles(box, spacing)
+        inner = _own_particles(obstacles, low, high, spacing)
+        self.position: Array = np.concatenate([around, inner])
+        """(M, 2) of all dummy particles."""
+        self.shown: NDArray[np.bool_] = np.concatenate([layer == 0, np.ones(len(inner), np.bool_)])
+        """(M,) whether a trajectory shows it: the box's first layer, and obstacles."""
+        self._planes = np.concatenate(
+            [np.column_stack([o.normals, o.offsets]) for o in obstacles] or [np.empty((0, 3))]
+        )
+        self._ends = np.cumsum([0] + [len(o.corners) for o in obstacles])
+        self._box, self._obstacles = (low, high), obstacles
+        self._low, self._high = low + self.margin, high - self.margin
+
+    def hold_back(self, x: Array, y: Array, vx: Array, vy: Array) -> int:
+        """Put particles that have crossed a surface back on it, without their velocity into the solid.
+
+        Returns:
+            How many there were.
+        """
+        held: int = _hold_back(x, y, vx, vy, self._low, self._high, self._planes, self._ends, self.margin)
+        return held
+
+    def inside(self, points: NDArray[np.floating]) -> int:
+        """How many points (N, 2) lie outside of the box or in an obstacle."""
+        low, high = self._box
+        wrong = ~np.all((points >= low) & (points <= high), axis=1)
+        for obstacle in self._obstacles:
+            wrong |= obstacle.depth(points) > 0
+        return int(wrong.sum())
+
+
+def _own_particles(obstacles: tuple[Obstacle, ...], low: Array, high: Array, spacing: float) -> Array:
+    """Dummy particles of all obstacles that lie in the box, and in no obstacle before their own."""
+    kept = [np.empty((0, 2))]
+    for index, obstacle in enumerate(obstacles):
+        points = obstacle_particles(obstacle, spacing)
+        mine = np.all((points > low) & (points < high), axis=1)
+        for earlier in obstacles[:index]:
+            mine &= earlier.depth(points) < 0
+        kept.append(points[mine])
+    return np.concatenate(kept)
+
+
+@compiled
+def _hold_back(
+    x: Array,
+    y: Array,
+    vx: Array,
+    vy: Array,
+    low: Array,
+    high: Array,
+    planes: Array,
+    ends: NDArray[np.int64],
+    margin: float,
+) -> int:
+    held = 0
+    for i in range(x.shape[0]):
+        before_x, before_y = x[i], y[i]
+        for k in range(ends.shape[0] - 1):
+            depth, nearest = math.inf, 0
+            for edge in range(ends[k], ends[k + 1]):
+                below = planes[edge, 2] + margin - planes[edge, 0] * x[i] - planes[edge, 1] * y[i]
+                if below < depth:
+                    depth, nearest = below, edge
+                    if depth <= 0.0:
+                        break
+            if depth > 0.0:
+                nx, ny = planes[nearest, 0], planes[nearest, 1]
+                into = min(0.0, nx * vx[i] + ny * vy[i])
+                x[i], y[i] = x[i] + depth * nx, y[i] + depth * ny
+                vx[i], vy[i] = vx[i] - into * nx, vy[i] - into * ny
+        # The box comes last: it holds even where an obstacle touches it.
+        if x[i] < low[0]:
+            x[i], vx[i] = low[0], max(0.0, vx[i])
+        elif x[i] > high[0]:
+            x[i], vx[i] = high[0], min(0.0, vx[i])
+        if y[i] < low[1]:
+            y[i], vy[i] = low[1], max(0.0, vy[i])
+        elif y[i] > high[1]:
+            y[i], vy[i] = high[1], min(0.0, vy[i])
+        if x[i] != before_x or y[i] != before_y:
+            held += 1
+    return held

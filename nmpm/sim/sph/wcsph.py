@@ -1,0 +1,261 @@
+"""Weakly compressible smoothed particle hydrodynamics in two dimensions.
+
+Water is a slightly compressible fluid: density follows the continuity equation, ρ̇_i = ρ_i Σ V_j (v_i − v_j) · ∇W, and
+pressure the density (Tait's equation), with a speed of sound about ten times that of the flow, so that density stays
+within about one per cent. The continuity equation is preferred to the sum of masses because a sum would see a lack of
+mass at the free surface and pull it in. Walls are dummy particles with pressure and velocity continued from the fluid
+(Adami, Hu & Adams, "A generalized wall boundary condition for smoothed particle hydrodynamics", 2012).
+
+Spray, particles with few neighbours, bears no tension, and its pressure fades within the time that sound takes past
+ten of them. Else a few particles far from the rest may hold each other in orbit while their densities drift apart until
+they burst, and a particle torn off under pressure would carry it through the air into the next wave.
+
+A step is kick, drift, kick: half a step of acceleration, a step of position, density from the new positions and the
+velocity in between, acceleration anew, and the second half of it. Pairs are listed with some room to spare, and
+listed anew once a particle has used up half of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.sim.compiled import compiled
+from nmpm.sim.materials.base import Array
+from nmpm.sim.preset import require
+from nmpm.sim.sph import sums
+from nmpm.sim.sph.kernel import SUPPORT
+from nmpm.sim.sph.neighbours import CellGrid, PairFinder
+from nmpm.sim.sph.walls import Solids
+
+REVISION = 1
+"""Raised whenever the same preset and seed would give other numbers."""
+
+# Room to spare in the list of pairs, in spacings: more room lists more pairs, less room lists them more often.
+_SKIN = 0.4
+
+# Listed neighbours below which a particle is spray: a third of what surrounds one within the fluid.
+_SPRAY = round(np.pi * (SUPPORT + _SKIN) ** 2 / 3)
+
+# Particles that sound passes while the excess of spray's density falls to 1 / e.
+_FADING = 10.0
+
+
+@dataclass(frozen=True)
+class Fluid:
+    """What flows.
+
+    Args:
+        density: At rest, in kg / m².
+        speed_of_sound: In m / s; ten times the fastest flow keeps density within one per cent.
+        exponent: Of Tait's equation, p = ρ₀ c² / γ ((ρ / ρ₀)^γ − 1).
+        alpha: Artificial viscosity; it amounts to a kinematic viscosity of α h c / 8.
+        viscosity: Dynamic, in Pa s, which also brakes the fluid at walls; none lets it slip.
+        diffusion: Of density, δ, which smooths what is uneven from particle to particle; 0.1 is usual.
+
+    Raises:
+        ConfigError: if a number is out of range.
+    """
+
+    density: float
+    speed_of_sound: float
+    exponent: float
+    alpha: float
+    viscosity: float
+    diffusion: float
+
+    def __post_init__(self) -> None:
+        for key in ("density", "speed_of_sound", "exponent"):
+            require(getattr(self, key) > 0, f"{key} = {getattr(self, key)} must be positive.")
+        for key in ("alpha", "viscosity", "diffusion"):
+            require(getattr(self, key) >= 0, f"{key} = {getattr(self, key)} must not be negative.")
+
+    def kinematic_viscosity(self, spacing: float) -> float:
+        """Artificial and physical viscosity together, in m² / s."""
+        return self.alpha * spacing * self.speed_of_sound / 8 + self.viscosity / self.density
+
+
+class State:
+    """N particles on the move, in an order that changes as they move.
+
+    Args:
+        position: (N, 2) in length.
+        velocity: (N, 2) in length per second.
+        density: Of all of them, at the start.
+    """
+
+    def __init__(self, position: NDArray[np.floating], velocity: NDArray[np.floating], density: float) -> None:
+        self.table: Array = np.zeros((7, len(position)))
+        self.table[0:2], self.table[2:4], self.table[4] = position.T, velocity.T, density
+        self.identity: NDArray[np.int64] = np.arange(len(position))
+        """(N,) number that each particle had at the start."""
+
+    def sort(self, order: NDArray[np.int64]) -> None:
+        """Bring the particles into another order."""
+        self.table[:] = self.table[:, order]
+        self.identity = self.identity[order]
+
+    @property
+    def position(self) -> Array:
+        """(N, 2) in the first order."""
+        return self._restored(slice(0, 2))
+
+    @property
+    def velocity(self) -> Array:
+        """(N, 2) in the first order."""
+        return self._restored(slice(2, 4))
+
+    @property
+    def density(self) -> Array:
+        """(N,) in the first order."""
+        return self._restored(slice(4, 5))[:, 0]
+
+    def _restored(self, rows: slice) -> Array:
+        restored = np.empty((self.table.shape[1], rows.stop - rows.start))
+        restored[self.identity] = self.table[rows].T
+        return restored
+
+
+class Stepper:
+    """Advances a state by steps of one length.
+
+    Args:
+        fluid: What flows.
+        solids: What it flows around.
+        spacing: Of the particles at rest; also the kernel's smoothing length.
+        gravity: (2,) acceleration, in length per second squared.
+        dt: Length of a step, in seconds.
+    """
+
+    def __init__(self, fluid: Fluid, solids: Solids, spacing: float, gravity: Array, dt: float) -> None:
+        self.fluid, self.solids, self.spacing, self.gravity, self.dt = fluid, solids, spacing, gravity, dt
+        self.mass = fluid.density * spacing**2
+        self.held_back = 0
+        """Particles held back at surfaces so far."""
+        position = solids.position
+        grid = CellGrid.covering(position.min(0), position.max(0), (SUPPORT + _SKIN) * spacing)
+        order, self._wall_starts = grid.sorting(*position.T)
+        self._wall_x, self._wall_y = (np.ascontiguousarray(axis) for axis in position[order].T)
+        self._grid, self._finder, self._wall_finder = grid, PairFinder(grid), PairFinder(grid)
+        self._wall = np.zeros((4, len(position)))
+        self._wall_density = np.full(len(position), fluid.density)
+        self._memory, self._wall_memory = np.empty((4, 0)), np.empty((4, 0))
+        self._listed_at = np.empty((2, 0))
+        self._spray = np.empty(0, np.int64)
+
+    def begin(self, state: State) -> None:
+        """Accelerations of a state; it must begin so."""
+        state.table[5:7] = 0.0
+        self._hold_back(state)
+        self._list(state)
+        self._interact(state, 0.0)
+
+    def step(self, state: State) -> None:
+        """One step, in place.
+
+        Raises:
+            FloatingPointError: if a position is no longer finite.
+        """
+        _kick(state.table, 0.5 * self.dt)
+        _drift(state.table, self.dt)
+        self._hold_back(state)
+        moved = _furthest(state.table, self._listed_at)
+        if not np.isfinite(moved):
+            raise FloatingPointError("The state is not finite")
+        if moved > 0.5 * _SKIN * self.spacing:
+            self._list(state)
+        self._interact(state, self.dt)
+        _kick(state.table, 0.5 * self.dt)
+
+    def pressure(self, state: State) -> Array:
+        """(N,) in the first order."""
+        return _pressure(state.density, self.fluid.density, self.fluid.speed_of_sound, self.fluid.exponent)
+
+    def _hold_back(self, state: State) -> None:
+        x, y, vx, vy = state.table[:4]
+        self.held_back += self.solids.hold_back(x, y, vx, vy)
+
+    def _list(self, state: State) -> None:
+        order, starts = self._grid.sorting(state.table[0], state.table[1])
+        state.sort(order)
+        x, y = state.table[:2]
+        self._listed_at = state.table[:2].copy()
+        self._pairs = self._finder.within(x, y, starts)
+        self._wall_pairs = self._wall_finder.between(x, y, self._wall_x, self._wall_y, self._wall_starts)
+        neighbours = sum(np.bincount(side, minlength=len(x)) for side in (*self._pairs, self._wall_pairs[0]))
+        self._spray = np.flatnonzero(neighbours < _SPRAY)
+        self._memory = _room(self._memory, len(self._pairs[0]))
+        self._wall_memory = _room(self._wall_memory, len(self._wall_pairs[0]))
+
+    def _interact(self, state: State, dt: float) -> None:
+        """Density after dt, then accelerations."""
+        fluid, h = self.fluid, self.spacing
+        rest, sound = fluid.density, fluid.speed_of_sound
+        x, y, vx, vy, density, ax, ay = state.table
+        pairs, walls = self._pairs, self._wall_pairs
+        dx, dy, f, drag = self._memory[:, : len(pairs[0])]
+        wall_dx, wall_dy, wall_f, wall_w = self._wall_memory[:, : len(walls[0])]
+        sums.pair_geometry(x, y, *pairs, h, dx, dy, f)
+        sums.wall_geometry(x, y, self._wall_x, self._wall_y, *walls, h, wall_dx, wall_dy, wall_f, wall_w)
+        rate = np.zeros_like(density)
+        sums.expansion(
+            *pairs, dx, dy, f, vx, vy, density, self.mass,
+            2 * fluid.diffusion * h * sound / rest, rest / sound**2 * self.gravity, 0.01 * h * h, rate, drag,
+        )  # fmt: skip
+        sums.wall_expansion(*walls, wall_dx, wall_dy, wall_f, vx, vy, self.mass / self._wall_density, rate)
+        density *= 1.0 + dt * rate
+        kept = np.exp(-dt * sound / (_FADING * h))
+        density[self._spray] = rest + kept * np.maximum(density[self._spray] - rest, 0.0)
+        pressure = _pressure(density, rest, sound, fluid.exponent)
+        sums.wall_averages(*walls, wall_dx, wall_dy, wall_w, vx, vy, density, pressure, self.gravity, self._wall)
+        self._wall_density = _density(self._wall[0], rest, sound, fluid.exponent)
+        ax[:], ay[:] = self.gravity[0], self.gravity[1]
+        viscosity = 8 * fluid.kinematic_viscosity(h)
+        sums.push(*pairs, dx, dy, f, drag, density, pressure, self.mass, viscosity, ax, ay)
+        sums.wall_push(
+            *walls, wall_dx, wall_dy, wall_f, vx, vy, density, pressure,
+            self._wall, self._wall_density, self.mass, fluid.viscosity, ax, ay,
+        )  # fmt: skip
+
+
+def _room(memory: Array, count: int) -> Array:
+    return memory if memory.shape[1] >= count else np.empty((memory.shape[0], count + count // 4))
+
+
+def _pressure(density: Array, rest: float, sound: float, exponent: float) -> Array:
+    """Tait's equation of state."""
+    return rest * sound**2 / exponent * ((density / rest) ** exponent - 1.0)
+
+
+def _density(pressure: Array, rest: float, sound: float, exponent: float) -> Array:
+    """Its inverse; far below any pressure that occurs, where there is none, a tenth of the density at rest."""
+    ratio = 1.0 + pressure * exponent / (rest * sound**2)
+    return np.asarray(rest * np.maximum(ratio, 0.1**exponent) ** (1.0 / exponent))
+
+
+@compiled
+def _kick(table: Array, dt: float) -> None:
+    for i in range(table.shape[1]):
+        table[2, i] += dt * table[5, i]
+        table[3, i] += dt * table[6, i]
+
+
+@compiled
+def _drift(table: Array, dt: float) -> None:
+    for i in range(table.shape[1]):
+        table[0, i] += dt * table[2, i]
+        table[1, i] += dt * table[3, i]
+
+
+@compiled
+def _furthest(table: Array, listed_at: Array) -> float:
+    """Largest way of a particle since the pairs were listed; infinite where one is not finite."""
+    most = 0.0
+    for i in range(table.shape[1]):
+        dx, dy = table[0, i] - listed_at[0, i], table[1, i] - listed_at[1, i]
+        way = dx * dx + dy * dy
+        if not way <= most:
+            most = way if way > most else np.inf
+    return float(np.sqrt(most))
