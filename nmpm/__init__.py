@@ -9,20 +9,24 @@ from typing import TYPE_CHECKING, Any
 from nmpm.version import __version__
 
 if TYPE_CHECKING:
+    from nmpm.data.convert.arrays import write_trajectories as write_trajectories
+    from nmpm.data.format import Trajectory as Trajectory
     from nmpm.emulator import Emulator as Emulator
     from nmpm.particles import Particles as Particles
     from nmpm.rollouts import rollout as rollout
     from nmpm.scene import Scene as Scene
     from nmpm.zoo import Zoo as Zoo
 
-__all__ = ["Emulator", "Particles", "Scene", "Zoo", "__version__", "rollout"]
+__all__ = ["Emulator", "Particles", "Scene", "Trajectory", "Zoo", "__version__", "rollout", "write_trajectories"]
 
 _HOMES = {
     "Emulator": "nmpm.emulator",
     "Particles": "nmpm.particles",
     "Scene": "nmpm.scene",
+    "Trajectory": "nmpm.data.format",
     "Zoo": "nmpm.zoo",
     "rollout": "nmpm.rollouts",
+    "write_trajectories": "nmpm.data.convert.arrays",
 }
 
 

@@ -14,6 +14,9 @@ COMMANDS = {
     "validate": ("nmpm.cli.training", "Roll a checkpoint out over the valid split."),
     "test": ("nmpm.cli.training", "Roll a checkpoint out over the test split; write table, picture and animation."),
     "predict": ("nmpm.cli.training", "Roll a checkpoint out over the test split and write the trajectories."),
+    "simulate": ("nmpm.cli.simulate", "Simulate a dataset of one of the shipped scenes, or of one's own."),
+    "convert": ("nmpm.cli.convert", "Bring a dataset of another format into the native layout."),
+    "inspect": ("nmpm.cli.inspect", "Say on one screen what a dataset holds, and what is odd about it."),
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
@@ -29,6 +32,7 @@ commands:
 first steps:
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --config goop.yaml --ckpt_path last go on after an interruption
+  nmpm inspect FOLDER                          look at recorded data, of any format that convert reads
   nmpm fit --config waterdrop.yaml --data.path FOLDER
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out

@@ -2,6 +2,7 @@
 
 The same id means different things in different families, so a dataset either names its types in its metadata or says
 which family it follows. DeepMind: Sanchez-Gonzalez et al., ICML 2020. LagrangeBench: Toshev et al., NeurIPS 2023.
+JAX-SPH: Toshev et al., 2024; its walls of fixed temperature bear the id of LagrangeBench's rigid bodies.
 """
 
 from __future__ import annotations
@@ -36,6 +37,10 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         ),
         "lagrangebench": Family(
             MappingProxyType({-1: PADDING, 0: "fluid", 1: "wall", 2: "moving wall", 3: "rigid"}), frozenset({1})
+        ),
+        "jax-sph": Family(
+            MappingProxyType({-1: PADDING, 0: "fluid", 1: "wall", 2: "moving wall", 3: "heated wall"}),
+            frozenset({1, 3}),
         ),
     }
 )

@@ -2,14 +2,15 @@
 
 A dataset is a folder with `metadata.json` and `train.h5`, `valid.h5`, `test.h5`. In each file there is a group per
 trajectory, named `00000`, `00001`, …, with the datasets `position` (T, N, D), float32, and `particle_type` (N,),
-integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`.
+integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`. Every further dataset of a group, such
+as `temperature` (T, N), is a field: kept as it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from nmpm.data.metadata import write_metadata as write_metadata
 from nmpm.errors import DataError
 
 SPLITS = ("train", "valid", "test")
+_CORE = ("position", "particle_type")
 _CHUNK_BYTES = 2**20
 _LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"
 
@@ -37,20 +39,25 @@ class Trajectory:
         position: (T, N, D) float32, in domain length.
         particle_type: (N,) int64 type ids.
         attributes: What else is known of it, e.g. `gravity` (D,) in length/s², `seed`.
+        fields: Further arrays of numbers by name, of any shape and unit, e.g. `temperature` (T, N).
 
     Raises:
-        DataError: if the shapes do not fit together or a position is not a finite number.
+        DataError: if the shapes do not fit together, a position is not a finite number, or a field not an array of
+            numbers.
     """
 
     position: np.ndarray
     particle_type: np.ndarray
     attributes: dict[str, Any] = field(default_factory=dict)
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_arrays(self.position, self.particle_type, "trajectory")
         object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float32))
         object.__setattr__(self, "particle_type", np.asarray(self.particle_type, dtype=np.int64))
         _check_finite(self.position, "trajectory", first_frame=0)
+        for name, values in self.fields.items():
+            _check_field(name, values)
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
@@ -80,6 +87,10 @@ def _write_trajectory(group: Any, trajectory: Trajectory) -> None:
         compression_opts=1,
     )
     group.create_dataset("particle_type", data=trajectory.particle_type)
+    for name in sorted(trajectory.fields):
+        packed = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
+        values = np.asarray(trajectory.fields[name])
+        group.create_dataset(name, data=values, **(packed if values.size > 1 else {}))
     for name in sorted(trajectory.attributes):
         group.attrs[name] = trajectory.attributes[name]
 
@@ -144,8 +155,33 @@ class Split:
         with _opened(self.path) as file:
             return dict(file[self._entries[index].name].attrs)
 
+    def fields(self, index: int) -> dict[str, np.ndarray]:
+        """Every dataset of a trajectory beside its positions and types, by name.
+
+        Raises:
+            DataError: if one does not hold numbers.
+        """
+        found: dict[str, np.ndarray] = {}
+        with _opened(self.path) as file:
+            group = file[self._entries[index].name]
+            names: list[str] = []
+            group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+            for name in names:
+                if name not in _CORE:
+                    found[name] = group[name][()]
+                    _check_field(name, found[name], self.where(index))
+        return found
+
+    def whole(self, index: int) -> Trajectory:
+        """A trajectory with all that its group holds.
+
+        Raises:
+            DataError: if it cannot be read, or holds a position that is not a finite number.
+        """
+        return replace(self.read(index), fields=self.fields(index))
+
     def read(self, index: int, start: int = 0, stop: int | None = None) -> Trajectory:
-        """The frames from `start` up to `stop` (to the end when None) of a trajectory.
+        """The frames from `start` up to `stop` (to the end when None) of a trajectory, without its fields.
 
         Raises:
             DataError: if they cannot be read or hold a position that is not a finite number.
@@ -187,7 +223,7 @@ def _entry(group: Any, name: str, path: Path) -> _Entry:
     where = f"{path}, trajectory {name}"
     if not isinstance(group, h5py.Group):
         raise DataError(f"{path}: {name!r} is not a group; {_LAYOUT}.")
-    missing = [key for key in ("position", "particle_type") if not isinstance(group.get(key), h5py.Dataset)]
+    missing = [key for key in _CORE if not isinstance(group.get(key), h5py.Dataset)]
     if missing:
         found = ", ".join(group) or "nothing"
         raise DataError(f"{where}: the key {' and '.join(map(repr, missing))} is missing (found: {found}); {_LAYOUT}.")
@@ -208,6 +244,14 @@ def _check_arrays(position: Any, particle_type: Any, where: str) -> None:
     if position.shape[1] != particle_type.shape[0]:
         raise DataError(
             f"{where}: position has {position.shape[1]} particles but particle_type has {particle_type.shape[0]}."
+        )
+
+
+def _check_field(name: str, values: Any, where: str = "trajectory") -> None:
+    kind = getattr(getattr(values, "dtype", None), "kind", None)
+    if name in _CORE or not name or kind is None or kind not in "biufS":
+        raise DataError(
+            f"{where}: the field {name!r} must be an array of numbers; it is {getattr(values, 'dtype', type(values))}."
         )
 
 

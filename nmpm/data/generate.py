@@ -34,6 +34,7 @@ from nmpm.data.format import (
     write_split,
 )
 from nmpm.data.progress import shown
+from nmpm.data.statistics import Statistics
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
@@ -130,8 +131,10 @@ def _complete(request: Request, folder: Path, workers: int) -> None:
     for split in request.splits:
         _assemble(request, folder, split)
     metadata = metadata_of(request.preset)
-    first = Split(folder / f"{request.splits[0]}.h5")
-    extra = metadata.extra | _statistics(first) | {_KEY: request.to_dict()}
+    first, statistics = Split(folder / f"{request.splits[0]}.h5"), Statistics(metadata)
+    for index in range(len(first)):
+        statistics.add(first.read(index))
+    extra = metadata.extra | statistics.result() | {_KEY: request.to_dict()}
     write_metadata(folder, dataclasses.replace(metadata, extra=extra))
     shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
@@ -249,19 +252,3 @@ def metadata_of(preset: Preset) -> Metadata:
             "note": "Simulated by nmpm; not measured, and not anybody else's dataset.",
         },
     )
-
-
-def _statistics(train: Split) -> dict[str, list[float]]:
-    """Mean and standard deviation, per axis, of velocity (length/frame) and acceleration (length/frame²)."""
-    sums = {"vel": np.zeros((3, 1)), "acc": np.zeros((3, 1))}
-    for index in range(len(train)):
-        velocity = np.diff(train.read(index).position.astype(np.float64), axis=0)
-        for key, values in (("vel", velocity), ("acc", np.diff(velocity, axis=0))):
-            flat = values.reshape(-1, values.shape[-1])
-            sums[key] = sums[key] + np.stack([np.full(flat.shape[1], len(flat)), flat.sum(0), (flat**2).sum(0)])
-    statistics = {}
-    for key, (count, total, squares) in sums.items():
-        mean = total / count
-        statistics[f"{key}_mean"] = mean.tolist()
-        statistics[f"{key}_std"] = np.sqrt(squares / count - mean**2).tolist()
-    return statistics

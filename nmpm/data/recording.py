@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nmpm.data.background import carry_on
 from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.statistics import first_that_moves
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -56,13 +57,15 @@ class Reader:
             where: Where it comes from, for messages.
 
         Raises:
-            DataError: if it leaves the scene's domain or is of a material that the scene lacks.
+            DataError: if it leaves the scene's domain, is of a material that the scene lacks, or has an obstacle that
+                moves.
         """
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
         moving = np.isin(types, self.metadata.moving_types)
         static = np.isin(types, list(self.metadata.static_types))
         self._check_inside(trajectory, moving | static, where)
+        self._check_still(trajectory, static, where)
         if not moving.any():
             raise DataError(f"{where}: none of its particles moves; check static_types in the metadata.")
         return Recording(
@@ -96,6 +99,16 @@ class Reader:
                 f"{where}: particle {particle} in frame {frame} is at {position[frame, particle].tolist()}, outside"
                 f" the domain {list(map(list, self.scene.domain))} ({int(outside.any(axis=0).sum())} particles leave"
                 " it). Give the metadata a `domain` that holds all positions, or leave the trajectory out."
+            )
+
+    def _check_still(self, trajectory: Trajectory, static: np.ndarray, where: str) -> None:
+        particle = first_that_moves(trajectory.position, static, self.scene.domain)
+        if particle is not None:
+            type_id = int(trajectory.particle_type[particle])
+            raise DataError(
+                f"{where}: particle {particle} is of the static type {type_id}"
+                f" ({self.metadata.particle_types[type_id]}) but moves. Obstacles must be at rest; if it should be"
+                " predicted like a material, take its type out of static_types in the metadata."
             )
 
     def _gravity(self, trajectory: Trajectory, where: str) -> Tensor:

@@ -69,11 +69,11 @@ class TestMetadata:
 
     def test_family_where_the_file_is_silent(self, write_keys):
         folder = write_keys(particle_types=None)
-        with pytest.raises(DataError, match=r"particle_types.*deepmind, lagrangebench"):
+        with pytest.raises(DataError, match=r"particle_types.*deepmind, jax-sph, lagrangebench"):
             read_metadata(folder)
         assert read_metadata(folder, "deepmind").particle_types[7] == "goop"
         assert read_metadata(folder, "lagrangebench").static_types == {1}
-        with pytest.raises(ConfigError, match=r"'dmcf'.*deepmind, lagrangebench"):
+        with pytest.raises(ConfigError, match=r"'dmcf'.*deepmind, jax-sph, lagrangebench"):
             read_metadata(folder, "dmcf")
 
     def test_the_file_knows_better_than_the_family(self, write_keys):

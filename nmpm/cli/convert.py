@@ -1,0 +1,47 @@
+"""`nmpm convert SOURCE DESTINATION`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from nmpm.cli.options import add_data_options, data_options
+
+_DESCRIPTION = """\
+Bring a dataset of another format into the native layout (LagrangeBench's HDF5 files with a metadata.json).
+
+The format is found out, or named by --format:
+{formats}
+
+Type ids keep their numbers. What they mean differs between families of datasets: 3 is a boundary for deepmind, a
+rigid body for lagrangebench, a heated wall for jax-sph. The command says which family it took.
+"""
+
+_EXAMPLES = """\
+examples:
+  nmpm convert datasets/WaterRamps water                 DeepMind's TFRecords
+  nmpm convert flume/test.npz flume --types 1=debris --bounds 0.02:1,0:0.2
+  nmpm convert heated-channel channel --family jax-sph --boundary periodic,wall
+"""
+
+
+def run(words: list[str]) -> None:
+    """Run the command, e.g. ["convert", "datasets/WaterRamps", "water"]."""
+    from nmpm.data.convert import FORMATS, convert
+
+    width = max(len(kind.name) for kind in FORMATS)
+    parser = argparse.ArgumentParser(
+        prog="nmpm convert",
+        description=_DESCRIPTION.format(formats="\n".join(f"  {f.name:<{width}}  {f.summary}" for f in FORMATS)),
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source", type=Path, help="file or folder to read")
+    parser.add_argument("destination", type=Path, help="folder to write; must not exist yet, or be empty")
+    parser.add_argument("--format", metavar="NAME", help="format of the source, where it is not recognised")
+    add_data_options(parser)
+    chosen = parser.parse_args(words[1:])
+    for note in convert(chosen.source, chosen.destination, chosen.format, data_options(chosen)):
+        sys.stdout.write(f"- {note}\n")
+    sys.stdout.write(f"wrote {chosen.destination}; to look at it: nmpm inspect {chosen.destination}\n")

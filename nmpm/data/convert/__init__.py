@@ -1,0 +1,54 @@
+"""Everybody's trajectories, brought into the native layout.
+
+A format is one class in one file; `FORMATS` lists them in the order in which they are tried.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nmpm.data.convert.base import Format as Format
+from nmpm.data.convert.base import Options as Options
+from nmpm.data.convert.base import Source as Source
+from nmpm.data.convert.deepmind import DeepMind
+from nmpm.data.convert.native import Native
+from nmpm.data.convert.run import detect, named, write_source
+
+FORMATS: tuple[Format, ...] = (Native(), DeepMind())
+
+
+def open_source(path: Path, format_name: str | None = None, options: Options | None = None) -> Source:
+    """Opens a dataset of any format.
+
+    Args:
+        path: A file or folder.
+        format_name: Name of the format; found out when left out.
+        options: What the files leave open.
+
+    Raises:
+        DataError: if there is nothing, of no known format, or damaged.
+        ConfigError: if there is no such format, or an option cannot be.
+    """
+    kind = named(format_name, FORMATS) if format_name else detect(Path(path), FORMATS)
+    return kind.open(Path(path), options or Options())
+
+
+def convert(
+    source: Path, destination: Path, format_name: str | None = None, options: Options | None = None
+) -> tuple[str, ...]:
+    """Converts a dataset of any format into the native layout, all of it or nothing.
+
+    Args:
+        source: A file or folder.
+        destination: A folder that does not exist yet, or is empty.
+        format_name: Name of the source's format; found out when left out.
+        options: What the files leave open.
+
+    Returns:
+        What was taken for what, and what is odd, as sentences.
+
+    Raises:
+        DataError: if the source is missing, damaged or of no known format, or the destination is taken.
+        ConfigError: if there is no such format, or an option cannot be.
+    """
+    return write_source(open_source(source, format_name, options), destination)

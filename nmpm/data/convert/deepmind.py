@@ -1,0 +1,128 @@
+"""DeepMind's Learning-to-Simulate datasets: TFRecord files beside a `metadata.json`, read without TensorFlow.
+
+Sanchez-Gonzalez et al., "Learning to simulate complex physics with graph networks", 2020. A record is one trajectory:
+context features `particle_type` (N int64 in one string) and `key`, and per frame `position` (N·D float32 in one
+string), in some datasets with further lists such as `step_context` or `force`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from nmpm.data.convert.base import Format, Options, Reread, Source, split_of
+from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
+from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
+from nmpm.errors import DataError
+
+_SUFFIX = ".tfrecord"
+
+
+class DeepMind(Format):
+    """A folder of TFRecord files with a `metadata.json`, or one such file beside it."""
+
+    name: ClassVar[str] = "deepmind"
+    summary: ClassVar[str] = "DeepMind's TFRecord files with metadata.json (Learning to Simulate)"
+
+    def recognises(self, path: Path) -> bool:
+        return any(path.glob(f"*{_SUFFIX}")) if path.is_dir() else path.suffix == _SUFFIX and path.is_file()
+
+    def open(self, path: Path, options: Options) -> Source:
+        files = _files(path)
+        if not files:
+            raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
+        family = options.family or "deepmind"
+        folder = next(iter(files.values())).parent
+        metadata = options.applied(read_metadata(folder, family))
+        offsets = {split: record_offsets(file) for split, file in files.items()}
+        for split, file in files.items():
+            if not offsets[split]:
+                raise DataError(f"{file}: the file holds no record.")
+        return Source(
+            metadata=metadata,
+            splits={s: Reread(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
+            notes=(f"Particle types are read after the {family} family.", *_naming(files)),
+            counts={split: len(found) for split, found in offsets.items()},
+        )
+
+
+def _files(path: Path) -> dict[str, Path]:
+    """The TFRecord of each split."""
+    found = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path] * (path.suffix == _SUFFIX and path.is_file())
+    named = {split: [file for file in found if split_of(file.stem) == split] for split in SPLITS}
+    for split, files in named.items():
+        if len(files) > 1:
+            raise DataError(f"{path}: {', '.join(f.name for f in files)} all mean {split}; give one of the files.")
+    if len(found) == 1 and not any(named.values()):
+        named["test"] = found
+    return {split: files[0] for split, files in named.items() if files}
+
+
+def _naming(files: dict[str, Path]) -> list[str]:
+    return [f"{file.name} becomes the {split} split." for split, file in files.items() if file.stem != split]
+
+
+def _trajectories(path: Path, offsets: tuple[int, ...], dim: int) -> Iterator[Trajectory]:
+    for index, offset in enumerate(offsets):
+        where = f"{path}: record {index}"
+        yield _trajectory(read_record(path, offset, index), dim, where)
+
+
+def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
+    if "position" not in example.steps or "particle_type" not in example.context:
+        found = ", ".join(sorted({*example.context, *example.steps})) or "nothing"
+        raise DataError(f"{where}: needs the features `particle_type` and `position`; found {found}.")
+    particle_type = _numbers(example.context["particle_type"], np.dtype("<i8"), f"{where}, particle_type")
+    particles = len(particle_type)
+    frames = [_numbers(step, np.dtype("<f4"), f"{where}, position") for step in example.steps["position"]]
+    wrong = [i for i, frame in enumerate(frames) if len(frame) != particles * dim]
+    if wrong or not frames or not particles:
+        got = f"; frame {wrong[0]} has {len(frames[wrong[0]])}" if wrong else ""
+        raise DataError(
+            f"{where}: {len(frames)} frames, {particles} particles: each frame needs {particles} x {dim} numbers{got}."
+            f" Is `dim` of {METADATA_FILE} right?"
+        )
+    try:
+        return Trajectory(
+            position=np.stack(frames).reshape(len(frames), particles, dim),
+            particle_type=particle_type,
+            attributes={k: _attribute(v) for k, v in example.context.items() if k != "particle_type" and len(v)},
+            fields={
+                name: _field(steps, particles, dim, f"{where}, {name}")
+                for name, steps in example.steps.items()
+                if name != "position"
+            },
+        )
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+
+
+def _numbers(feature: Feature, kind: np.dtype[Any], where: str) -> np.ndarray:
+    """A feature's numbers: as they are, or out of the one string that holds them."""
+    if isinstance(feature, np.ndarray):
+        return feature
+    if len(feature) != 1 or len(feature[0]) % kind.itemsize:
+        sizes = [len(part) for part in feature]
+        raise DataError(f"{where}: one string of {kind.itemsize}-byte numbers is due; found strings of {sizes} bytes.")
+    return np.frombuffer(feature[0], kind)
+
+
+def _attribute(feature: Feature) -> object:
+    if isinstance(feature, np.ndarray):
+        return feature.item() if feature.size == 1 else feature
+    return np.bytes_(feature[0]) if len(feature) == 1 else np.array(feature)
+
+
+def _field(steps: list[Feature], particles: int, dim: int, where: str) -> np.ndarray:
+    """(T, k) numbers per frame; (T, N, D) where they are as many as a position's."""
+    rows = [_numbers(step, np.dtype("<f4"), where) for step in steps]
+    if len({len(row) for row in rows}) > 1:
+        raise DataError(
+            f"{where}: frames hold {min(map(len, rows))} to {max(map(len, rows))} numbers; all need as many."
+        )
+    values = np.stack(rows) if rows else np.empty((0, 0), np.float32)
+    return values.reshape(len(values), particles, dim) if values.shape[1] == particles * dim else values

@@ -1,0 +1,56 @@
+"""Foreign formats used where they are: converted once, into the cache, and found there from then on."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+from nmpm.data.catalog import dataset_home
+from nmpm.data.convert import Options, convert
+from nmpm.data.folder_lock import locked
+from nmpm.data.format import METADATA_FILE
+
+_log = logging.getLogger(__name__)
+
+
+def native_folder(path: Path, options: Options | None = None) -> Path:
+    """A folder in the native layout with the same data: converted now, or by an earlier call.
+
+    The copy is made anew when a file of the source has changed (in size or time) or the options have.
+
+    Args:
+        path: A file or folder of any format that `nmpm convert` reads.
+        options: What its files leave open.
+
+    Raises:
+        DataError: if the source cannot be read, or the cache not be written.
+    """
+    path, options = Path(path).resolve(), options or Options()
+    cache = dataset_home() / "converted"
+    folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
+    with locked(cache):
+        if not (folder / METADATA_FILE).is_file():
+            for note in convert(path, folder, options=options):
+                _log.info("%s: %s", path.name, note)
+    return folder
+
+
+def _fingerprint(path: Path, options: Options) -> str:
+    told = repr((str(path), _plain(options), list(_stamps(path))))
+    return hashlib.sha256(told.encode()).hexdigest()[:10]
+
+
+def _plain(options: Options) -> list[tuple[str, object]]:
+    entries = dict(vars(options))
+    entries["types"] = sorted((options.types or {}).items())
+    entries["static"] = sorted(options.static) if options.static is not None else None
+    return sorted(entries.items())
+
+
+def _stamps(path: Path) -> Iterator[tuple[str, int, int]]:
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if file.is_file():
+            status = file.stat()
+            yield str(file.relative_to(path)), status.st_size, status.st_mtime_ns

@@ -1,0 +1,215 @@
+"""TFRecord files of `tf.train.SequenceExample`s, read without TensorFlow.
+
+A record is its length (uint64), the length's checksum (uint32), the payload and the payload's checksum, little endian.
+Checksums are CRC-32C (RFC 3720, appendix B.4), rotated and shifted as TFRecord's format asks. A payload is a protocol
+buffer; of its wire format only what the messages of `tensorflow/core/example/example.proto` need is read here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.errors import DataError
+
+_MASK_DELTA = 0xA282EAD8
+_LARGEST = 2**33  # bytes of a record; whatever claims more is damaged
+_BYTES, _FLOATS, _INTEGERS = 1, 2, 3  # fields of `Feature`
+
+Feature = list[bytes] | NDArray[np.float32] | NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SequenceExample:
+    """One record.
+
+    Args:
+        context: Features of the whole sequence, by name.
+        steps: For each name, a feature per time step.
+    """
+
+    context: dict[str, Feature]
+    steps: dict[str, list[Feature]]
+
+
+def record_offsets(path: Path) -> list[int]:
+    """Where the records of a file begin; the lengths are checked, the payloads are skipped.
+
+    Raises:
+        DataError: if the file is cut off or a length is damaged.
+    """
+    size = path.stat().st_size
+    offsets: list[int] = []
+    with path.open("rb") as file:
+        while file.tell() < size:
+            offset = file.tell()
+            length = _length(file, path, len(offsets), offset)
+            if offset + 12 + length + 4 > size:
+                raise _damaged(path, len(offsets), offset, "the file ends within it")
+            offsets.append(offset)
+            file.seek(length + 4, 1)
+    return offsets
+
+
+def read_record(path: Path, offset: int, index: int) -> SequenceExample:
+    """The record that begins at an offset.
+
+    Args:
+        path: The file.
+        offset: From `record_offsets`.
+        index: Number of the record, for messages.
+
+    Raises:
+        DataError: if the record is damaged or holds something else.
+    """
+    with path.open("rb") as file:
+        file.seek(offset)
+        length = _length(file, path, index, offset)
+        payload = file.read(length)
+        checksum = file.read(4)
+    if len(payload) < length or len(checksum) < 4:
+        raise _damaged(path, index, offset, "the file ends within it")
+    if masked_crc(payload) != struct.unpack("<I", checksum)[0]:
+        raise _damaged(path, index, offset, "its checksum does not fit its content")
+    try:
+        return _sequence_example(payload)
+    except (ValueError, IndexError, struct.error) as error:
+        raise _damaged(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
+
+
+def masked_crc(data: bytes) -> int:
+    """TFRecord's checksum of some bytes."""
+    crc = crc32c(data)
+    return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
+
+
+def crc32c(data: bytes) -> int:
+    """CRC-32C (Castagnoli)."""
+    return int(_crc32c(np.frombuffer(data, np.uint8), _TABLE)) ^ 0xFFFFFFFF
+
+
+def _table() -> NDArray[np.uint32]:
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, np.uint32(0x82F63B78) ^ (table >> 1), table >> 1)
+    return table.astype(np.uint32)
+
+
+_TABLE = _table()
+
+
+def _crc_loop(data: NDArray[np.uint8], table: NDArray[np.uint32]) -> np.uint32:
+    crc = np.uint32(0xFFFFFFFF)
+    for byte in data:
+        crc = table[(crc ^ byte) & np.uint32(0xFF)] ^ (crc >> np.uint32(8))
+    return crc
+
+
+_crc32c = numba.njit(cache=True, nogil=True)(_crc_loop)
+
+
+def _length(file: BinaryIO, path: Path, index: int, offset: int) -> int:
+    header = file.read(12)
+    if len(header) < 12:
+        raise _damaged(path, index, offset, "the file ends within its header")
+    length, checksum = struct.unpack("<QI", header)
+    if masked_crc(header[:8]) != checksum or length > _LARGEST:
+        raise _damaged(path, index, offset, "the checksum of its length does not fit")
+    return int(length)
+
+
+def _damaged(path: Path, index: int, offset: int, why: str) -> DataError:
+    return DataError(
+        f"{path}: record {index}, at byte {offset}, cannot be read: {why}. Is it a complete TFRecord? Copy or"
+        " download it again."
+    )
+
+
+def _sequence_example(payload: bytes) -> SequenceExample:
+    context: dict[str, Feature] = {}
+    steps: dict[str, list[Feature]] = {}
+    for number, value in _fields(payload):
+        for inner, entry in _fields(_bytes(value)):
+            if inner != 1:
+                continue
+            name, content = _entry(_bytes(entry))
+            if number == 1:
+                context[name] = _feature(content)
+            elif number == 2:
+                steps[name] = [_feature(_bytes(step)) for field, step in _fields(content) if field == 1]
+    return SequenceExample(context, steps)
+
+
+def _entry(message: bytes) -> tuple[str, bytes]:
+    """Key and value of a map's entry."""
+    parts = dict(_fields(message))
+    return _bytes(parts.get(1, b"")).decode("utf-8"), _bytes(parts.get(2, b""))
+
+
+def _feature(message: bytes) -> Feature:
+    for kind, content in _fields(message):
+        values = [value for number, value in _fields(_bytes(content)) if number == 1]
+        if kind == _BYTES:
+            return [_bytes(value) for value in values]
+        if kind == _FLOATS:
+            return np.frombuffer(b"".join(map(_bytes, values)), "<f4")
+        if kind == _INTEGERS:
+            return np.array([number for value in values for number in _integers(value)], np.int64)
+    return []
+
+
+def _integers(value: int | bytes) -> Iterator[int]:
+    """One number, or several packed into bytes; 64 bits in two's complement."""
+    place = 0
+    while isinstance(value, bytes) and place < len(value):
+        number, place = _varint(value, place)
+        yield number - (1 << 64) if number >> 63 else number
+    if isinstance(value, int):
+        yield value - (1 << 64) if value >> 63 else value
+
+
+def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
+    """Number and value of each field: an integer, or bytes for what has a length or a fixed width."""
+    place = 0
+    while place < len(message):
+        key, place = _varint(message, place)
+        number, wire = key >> 3, key & 7
+        if wire == 0:
+            integer, place = _varint(message, place)
+            yield number, integer
+            continue
+        if wire == 2:
+            width, place = _varint(message, place)
+        elif wire in (1, 5):
+            width = 8 if wire == 1 else 4
+        else:
+            raise ValueError(f"wire type {wire}")
+        if place + width > len(message):
+            raise ValueError("a field reaches beyond its message")
+        yield number, message[place : place + width]
+        place += width
+
+
+def _varint(message: bytes, place: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = message[place]
+        value |= (byte & 0x7F) << shift
+        place, shift = place + 1, shift + 7
+        if byte < 0x80:
+            return value & 0xFFFFFFFFFFFFFFFF, place
+        if shift > 63:
+            raise ValueError("a number that is too long")
+
+
+def _bytes(value: int | bytes) -> bytes:
+    if not isinstance(value, bytes):
+        raise ValueError("a number where bytes are due")
+    return value

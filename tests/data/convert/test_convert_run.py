@@ -1,0 +1,149 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from nmpm.data.convert import Options, Source, convert
+from nmpm.data.convert.base import Reread
+from nmpm.data.convert.run import write_source
+from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.scenes import infer_scene
+from nmpm.errors import ConfigError, DataError
+from tests.conftest import made_up_metadata, made_up_trajectory
+
+
+def source_of(*trajectories: Trajectory, **changes) -> Source:
+    return Source(made_up_metadata(**changes), {"train": Reread(lambda: iter(trajectories))})
+
+
+def test_a_taken_destination_is_left_alone(tmp_path):
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "precious.txt").write_text("mine")
+    with pytest.raises(DataError, match="taken: is there already"):
+        write_source(source_of(made_up_trajectory(5, 3)), tmp_path / "taken")
+    assert (tmp_path / "taken" / "precious.txt").read_text() == "mine"
+
+
+def test_an_error_half_way_leaves_nothing(tmp_path):
+    def broken():
+        yield made_up_trajectory(5, 3)
+        raise DataError("the second is damaged")
+
+    with pytest.raises(DataError, match="second is damaged"):
+        write_source(Source(made_up_metadata(), {"train": Reread(broken)}), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_killed_half_way_it_leaves_no_dataset_and_the_next_call_sweeps(tmp_path):
+    script = f"""
+import sys, time
+sys.path.insert(0, {str(Path.cwd())!r})
+from pathlib import Path
+from nmpm.data.convert import Source
+from nmpm.data.convert.base import Reread
+from nmpm.data.convert.run import write_source
+from tests.conftest import made_up_metadata, made_up_trajectory
+def slow():
+    yield made_up_trajectory(5, 3)
+    print("begun", flush=True)
+    time.sleep(60)
+write_source(Source(made_up_metadata(), {{"train": Reread(slow)}}), Path({str(tmp_path / "out")!r}))
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"begun\n"
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    time.sleep(0.1)
+    assert not (tmp_path / "out").exists()
+    write_source(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
+    assert [item.name for item in tmp_path.iterdir()] == ["out"]
+
+
+def test_says_what_is_odd(tmp_path):
+    still, moving = made_up_trajectory(5, 3, statics=2), made_up_trajectory(5, 3, seed=1, statics=2)
+    moving.position[:, -1, 0] += np.linspace(0, 0.1, 5, dtype=np.float32)
+    moving.position[2, 0, 1] = 0.95
+    notes = write_source(source_of(still, moving, extra={"vel_std": [1.0, 1.0]}), tmp_path / "out")
+    said = " ".join(notes)
+    assert "static type move in 1 of 2 trajectories" in said
+    assert "state vel_std = (1, 1)" in said
+    assert "Along y positions reach from" in said
+    assert "to 0.95, beyond the stated bounds [0.1, 0.9]" in said
+    assert "sequence_length 12; trajectories have 5 frames" in said
+    metadata = read_metadata(tmp_path / "out")
+    assert metadata.extra["stated_statistics"] == {"vel_std": [1.0, 1.0]}
+    assert metadata.extra["moving_boundaries"] is True
+    assert infer_scene(tmp_path / "out").domain[1][1] >= 0.95
+
+
+def test_says_nothing_of_clean_data(tmp_path):
+    notes = write_source(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "out")
+    assert notes == ()
+
+
+def test_unknown_types_are_refused_with_the_remedy(tmp_path):
+    trajectory = made_up_trajectory(5, 3)
+    strange = Trajectory(trajectory.position, np.full(3, 42))
+    with pytest.raises(DataError, match=r"train split, trajectory 0: unknown particle type 42"):
+        write_source(source_of(strange), tmp_path / "out")
+
+
+def test_what_is_of_no_format_is_refused(tmp_path):
+    (tmp_path / "a.txt").write_text("hello")
+    with pytest.raises(DataError, match=r"of no format that is known \(native, deepmind.*found a\.txt"):
+        convert(tmp_path, tmp_path / "out")
+    with pytest.raises(DataError, match="no such file or folder"):
+        convert(tmp_path / "nowhere", tmp_path / "out")
+    with pytest.raises(ConfigError, match="No format is called 'tf'"):
+        convert(tmp_path, tmp_path / "out", "tf")
+
+
+class TestNative:
+    def test_takes_over_what_is_stated(self, make_dataset, tmp_path):
+        folder = make_dataset(statics=1)
+        convert(folder, tmp_path / "out", options=Options(types={7: "honey"}, gravity=(0.0, -1.0), dt=0.5))
+        metadata = read_metadata(tmp_path / "out")
+        assert metadata.particle_types == {3: "boundary", 7: "honey"}
+        assert (metadata.dt, metadata.gravity) == (0.5, (0.0, -1.0))
+        for name in ("train", "valid", "test"):
+            old, new = Split(folder / f"{name}.h5"), Split(tmp_path / "out" / f"{name}.h5")
+            for index in range(len(old)):
+                np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
+
+    def test_fields_and_periodic_axes_survive(self, recorded, tmp_path):
+        options = Options(family="jax-sph", periodic=(True, False), dt=0.04545)
+        convert(recorded / "jaxsph-heated-channel-2d", tmp_path / "channel", options=options)
+        old = Split(recorded / "jaxsph-heated-channel-2d" / "test.h5")
+        new = Split(tmp_path / "channel" / "test.h5")
+        for index in range(len(old)):
+            with h5py.File(old.path) as file:
+                temperature = file[old.names[index]]["temperature"][()]
+            np.testing.assert_array_equal(new.whole(index).fields["temperature"], temperature)
+            np.testing.assert_array_equal(new.read(index).position, old.read(index).position)
+        metadata = read_metadata(tmp_path / "channel")
+        assert metadata.periodic == (True, False)
+        assert metadata.dt == pytest.approx(0.04545)
+        assert metadata.particle_types[3] == "heated wall"
+        # Shortest ways across the period: the file's own figures for the fluid.
+        assert metadata.extra["vel_std"] == pytest.approx(metadata.extra["stated_statistics"]["vel_std"], rel=0.05)
+
+    def test_our_data_open_with_plain_h5py_after_lagrangebench(self, tmp_path):
+        """As LagrangeBench documents it: a group per trajectory, `position` (T, N, D), `particle_type` (N,)."""
+        write_split(tmp_path / "train.h5", [made_up_trajectory(6, 4), made_up_trajectory(6, 4, seed=1)])
+        write_metadata(tmp_path, made_up_metadata())
+        with h5py.File(tmp_path / "train.h5", "r") as file:
+            keys = list(file.keys())
+            assert keys == ["00000", "00001"]
+            for key in keys:
+                position, kind = file[key]["position"], file[key]["particle_type"]
+                assert position.dtype == np.float32
+                assert position.shape == (6, 4, 2)
+                assert np.issubdtype(kind.dtype, np.integer)
+                assert kind.shape == (4,)

@@ -1,0 +1,124 @@
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.data.convert import DeepMind, Options, convert
+from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.scenes import infer_scene
+from nmpm.errors import ConfigError, DataError
+from tests.data.convert import records
+
+METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 4, "default_connectivity_radius": 0.015, "dim": 2,
+            "dt": 0.0025, "vel_std": [1e-3, 1e-3]}  # fmt: skip
+
+
+def made(frames: int = 5, particles: int = 4, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    position = np.random.default_rng(seed).uniform(0.2, 0.8, (frames, particles, 2)).astype(np.float32)
+    position[:, -1] = position[0, -1]
+    return position, np.array([5] * (particles - 1) + [3])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for split, number in (("train", 2), ("test", 1)):
+        rows = [records.trajectory_record(*made(seed=i), step_context=np.full((5, 6), i)) for i in range(number)]
+        records.write_records(tmp_path / "ramps" / f"{split}.tfrecord", *rows)
+    (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
+    return tmp_path / "ramps"
+
+
+def test_every_number_arrives(folder, tmp_path):
+    convert(folder, tmp_path / "native")
+    split = Split(tmp_path / "native" / "train.h5")
+    assert len(split) == 2
+    for index in range(2):
+        position, particle_type = made(seed=index)
+        trajectory = split.whole(index)
+        np.testing.assert_array_equal(trajectory.position, position)
+        np.testing.assert_array_equal(trajectory.particle_type, particle_type)
+        np.testing.assert_array_equal(trajectory.fields["step_context"], np.full((5, 6), index))
+        assert trajectory.attributes["key"] == 7
+    metadata = read_metadata(tmp_path / "native")
+    assert metadata.particle_types[5] == "water"
+    assert metadata.static_types == {3}
+    assert metadata.extra["default_connectivity_radius"] == 0.015
+    assert infer_scene(tmp_path / "native").obstacles
+
+
+def test_one_file_is_a_dataset_too(folder, tmp_path):
+    (folder / "test.tfrecord").rename(folder / "test_sub.tfrecord")
+    notes = convert(folder / "test_sub.tfrecord", tmp_path / "native")
+    assert (tmp_path / "native" / "test.h5").is_file()
+    assert any("test_sub.tfrecord becomes the test split" in note for note in notes)
+
+
+def test_says_which_family_it_took(folder, tmp_path):
+    assert any("deepmind family" in note for note in convert(folder, tmp_path / "a"))
+    assert any("jax-sph family" in n for n in convert(folder, tmp_path / "b", options=Options("jax-sph", {5: "oil"})))
+    assert read_metadata(tmp_path / "b").particle_types[5] == "oil"
+
+
+def test_wrong_dim_is_explained(folder, tmp_path):
+    (folder / "metadata.json").write_text(json.dumps(METADATA | {"dim": 3, "bounds": [[0, 1]] * 3}))
+    with pytest.raises(DataError, match=r"record 0: 5 frames, 4 particles: each frame needs 4 x 3 .* has 8"):
+        convert(folder, tmp_path / "native")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["ramps"]
+
+
+def test_a_missing_feature_is_named(folder, tmp_path):
+    payload = records.sequence_example({"key": records.integer_feature(0)}, {"place": [records.bytes_feature(b"")]})
+    records.write_records(folder / "train.tfrecord", records.record(payload))
+    with pytest.raises(DataError, match=r"needs the features `particle_type` and `position`; found key, place"):
+        convert(folder, tmp_path / "native")
+
+
+def test_options_must_fit_the_axes(folder, tmp_path):
+    with pytest.raises(ConfigError, match=r"gravity = .* each of the data's 2 axes"):
+        convert(folder, tmp_path / "native", options=Options(gravity=(0.0, 0.0, -9.81)))
+
+
+@given(place=st.integers(0, 5000), value=st.integers(0, 255), cut=st.integers(0, 5000))
+@settings(max_examples=80, deadline=None)
+def test_damage_within_the_messages_gives_errors_never_garbage(tmp_path_factory, place, value, cut):
+    """With checksums that fit, so that the parser itself meets the damage."""
+    folder = tmp_path_factory.mktemp("damage")
+    (folder / "metadata.json").write_text(json.dumps(METADATA))
+    data = bytearray(records.trajectory_record(*made(frames=3))[12:-4])
+    data[place % len(data)] = value
+    records.write_records(folder / "train.tfrecord", records.record(bytes(data[: len(data) - cut % 3])))
+    message = ""
+    trajectories: list[Trajectory] = []
+    try:
+        trajectories = list(DeepMind().open(folder, Options()).splits["train"])
+    except DataError as error:
+        message = str(error)
+    assert bool(trajectories) != ("train.tfrecord" in message)
+    assert all(np.isfinite(item.position).all() and item.position.shape[2] == 2 for item in trajectories)
+
+
+class TestRecorded:
+    def test_sand_equals_the_rollout_pickled_beside_it(self, recorded, tmp_path):
+        convert(recorded / "deepmind-sand-subset", tmp_path / "sand", "deepmind")
+        trajectory = Split(tmp_path / "sand" / "test.h5").read(0)
+        assert trajectory.position.shape == (321, 256, 2)
+        assert set(trajectory.particle_type.tolist()) == {6}
+        # Only these bytes, of a file whose content is known, are unpickled outside of the converter.
+        with (recorded / "deepmind-sand-subset" / "rollout_test_s0.pkl").open("rb") as file:
+            rollout = pickle.load(file)  # noqa: S301
+        truth = np.concatenate([rollout["initial_positions"], rollout["ground_truth_rollout"]])
+        np.testing.assert_array_equal(trajectory.position[:320], truth)
+
+    def test_forces_and_a_moving_tool_are_kept(self, recorded, tmp_path):
+        notes = convert(recorded / "mpm-excavation-3d", tmp_path / "sand")
+        trajectory = Split(tmp_path / "sand" / "train.h5").whole(0)
+        assert trajectory.position.shape == (11, 26945, 3)
+        assert trajectory.fields["force"].shape == (11, 3)
+        tool = trajectory.position[:, trajectory.particle_type == 3]
+        assert np.abs(tool[-1] - tool[0]).max() > 1e-3
+        assert any("static type move in 1 of 1" in note for note in notes)
+        assert read_metadata(tmp_path / "sand").extra["moving_boundaries"] is True

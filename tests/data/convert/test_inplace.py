@@ -1,0 +1,45 @@
+import json
+import os
+
+import numpy as np
+import pytest
+
+from nmpm.data.convert import Options
+from nmpm.data.convert.inplace import native_folder
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.format import read_metadata
+from tests.data.convert import records
+from tests.data.convert.test_deepmind import METADATA, made
+
+
+@pytest.fixture
+def foreign(tmp_path, monkeypatch):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    folder = tmp_path / "ramps"
+    for split in ("train", "valid", "test"):
+        records.write_records(folder / f"{split}.tfrecord", records.trajectory_record(*made(frames=8)))
+    (folder / "metadata.json").write_text(json.dumps(METADATA))
+    return folder
+
+
+def test_is_converted_once_and_again_when_something_changes(foreign):
+    first = native_folder(foreign)
+    stamp = (first / "train.h5").stat().st_mtime_ns
+    assert native_folder(foreign) == first
+    assert (first / "train.h5").stat().st_mtime_ns == stamp
+    assert native_folder(foreign, Options(gravity=(0.0, -9.81))) != first
+    os.utime(foreign / "train.tfrecord", ns=(1, 1))
+    assert native_folder(foreign) != first
+    assert read_metadata(first).particle_types[5] == "water"
+
+
+def test_foreign_data_can_be_trained_on_where_they_are(foreign):
+    data = TrajectoryDataModule(path=str(foreign), gravity=[0.0, -9.81], horizon=4, batch_size=1)
+    data.prepare_data()
+    data.setup("fit")
+    batch = next(iter(data.train_dataloader()))
+    assert data.scene.obstacles
+    assert data.scene.gravity == (0.0, -9.81)
+    position, _ = made(frames=8)
+    frames = batch.initial.position[0].numpy()
+    assert any(np.allclose(frames, position[i, :3], atol=1e-7) for i in range(8))
