@@ -10,13 +10,14 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
 from nmpm.data.generate import Request, generate
 from nmpm.errors import DataError
 from nmpm.scene import Scene
-from nmpm.sim import load_preset
+from nmpm.sim import load_preset, preset_names
 
 
 @dataclass(frozen=True)
@@ -28,17 +29,34 @@ class Entry:
         preset: Name of the simulator's preset.
         counts: Trajectories in each of the splits train, valid and test.
         seed: From which the seed of every trajectory is derived.
+        paper: Trajectories per split in the paper's dataset of the same kind, which `nmpm simulate` makes.
     """
 
     name: str
     preset: str
     counts: Mapping[str, int]
+    paper: Mapping[str, int]
     seed: int = 0
 
 
-_ENTRIES = MappingProxyType(
-    {entry.name: entry for entry in (Entry("goop", "goop", MappingProxyType({"train": 200, "valid": 10, "test": 30})),)}
-)
+def _splits(train: int, valid: int, test: int) -> Mapping[str, int]:
+    return MappingProxyType({"train": train, "valid": valid, "test": test})
+
+
+_USUAL = (_splits(200, 10, 30), _splits(1000, 100, 100))
+"""Few enough to be simulated while one waits; as many as in the paper (arXiv 2408.15753)."""
+
+_COUNTS = {
+    "goop": (_USUAL[0], _splits(1000, 30, 30)),
+    "dambreak2d": (_splits(50, 25, 25),) * 2,
+    "wbcsph": (_splits(30, 9, 9),) * 2,
+}
+
+
+@cache
+def _entries() -> Mapping[str, Entry]:
+    """Every shipped preset is a dataset."""
+    return MappingProxyType({name: Entry(name, name, *_COUNTS.get(name, _USUAL)) for name in preset_names()})
 
 
 def dataset_home() -> Path:
@@ -48,7 +66,7 @@ def dataset_home() -> Path:
 
 def catalog() -> tuple[str, ...]:
     """Names of the embedded datasets."""
-    return tuple(_ENTRIES)
+    return tuple(_entries())
 
 
 def describe(name: str) -> Entry:
@@ -57,12 +75,12 @@ def describe(name: str) -> Entry:
     Raises:
         DataError: if there is none of that name.
     """
-    if name not in _ENTRIES:
+    if name not in _entries():
         raise DataError(
-            f"No embedded dataset is called {name!r}; there are: {', '.join(_ENTRIES)}. For data of your own, give the "
-            "path of their folder."
+            f"No embedded dataset is called {name!r}; there are: {', '.join(_entries())}. For data of your own, give"
+            " the path of their folder."
         )
-    return _ENTRIES[name]
+    return _entries()[name]
 
 
 def scene(name: str) -> Scene:

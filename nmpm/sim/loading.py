@@ -31,6 +31,19 @@ def load_preset(name_or_path: str | Path) -> Preset:
     Raises:
         ConfigError: if there is no such preset, or it cannot be read.
     """
+    text = preset_text(name_or_path)
+    try:
+        return preset_from_dict(OmegaConf.to_container(OmegaConf.create(text), resolve=True))
+    except (yaml.YAMLError, omegaconf.errors.OmegaConfBaseException, ConfigError) as error:
+        raise ConfigError(f"Preset {name_or_path}: {error}") from error
+
+
+def preset_text(name_or_path: str | Path) -> str:
+    """The YAML of a preset, with its comments, by its shipped name or from a file.
+
+    Raises:
+        ConfigError: if there is no such preset, or it is not text.
+    """
     path = resources.files("nmpm.sim") / "presets" / f"{name_or_path}.yaml"
     if str(name_or_path) not in preset_names():
         path = Path(name_or_path)
@@ -38,9 +51,8 @@ def load_preset(name_or_path: str | Path) -> Preset:
         known = ", ".join(preset_names())
         raise ConfigError(f"There is no preset or file {name_or_path}; shipped presets: {known}.")
     try:
-        plain = OmegaConf.to_container(OmegaConf.create(path.read_text(encoding="utf-8")), resolve=True)
-        return preset_from_dict(plain)
-    except (yaml.YAMLError, omegaconf.errors.OmegaConfBaseException, UnicodeDecodeError, ConfigError) as error:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
         raise ConfigError(f"Preset {name_or_path}: {error}") from error
 
 

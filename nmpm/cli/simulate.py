@@ -1,0 +1,136 @@
+"""`nmpm simulate NAME --train 1000 --valid 30 --test 30 --seed 0 --workers 8 --out DIR`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nmpm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from nmpm.sim import Preset
+
+_EXAMPLES = """\
+examples:
+  nmpm simulate --list                                   the shipped scenes
+  nmpm simulate waterramps --preview ramps.png           draw one trajectory, write no data
+  nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
+  nmpm simulate my-scene.yaml --out mine                 a scene of one's own: start from a copy of a shipped one
+  nmpm simulate goop --show > my-scene.yaml              such a copy, with its comments
+
+The same preset, seed and numbers give the same data. After an interruption the same call goes on. What comes out is
+simulated by nmpm: it is nobody's recording, and its metadata say so.
+"""
+
+
+def run(words: list[str]) -> None:
+    """Run the command, e.g. ["simulate", "waterramps", "--out", "ramps"]."""
+    parser = argparse.ArgumentParser(
+        prog="nmpm simulate",
+        description="Simulate a dataset, ready to train on, of a shipped scene or of one's own.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("name", nargs="?", help="a shipped scene, or a YAML file")
+    parser.add_argument("--list", action="store_true", help="list the shipped scenes")
+    parser.add_argument("--show", action="store_true", help="print the scene's YAML")
+    parser.add_argument("--preview", type=Path, metavar="FILE", help="simulate one trajectory and draw it (PNG)")
+    for split in ("train", "valid", "test"):
+        parser.add_argument(f"--{split}", type=int, metavar="N", help=f"{split} trajectories (default: the paper's)")
+    parser.add_argument("--frames", type=int, help="frames after the initial one (default: the scene's)")
+    parser.add_argument("--seed", type=int, default=0, help="of the whole dataset (default: 0)")
+    parser.add_argument("--workers", type=int, help="trajectories at a time (default: one per processor core)")
+    parser.add_argument("--out", type=Path, help="folder to write (default: the scene's name)")
+    chosen = parser.parse_args(words[1:])
+    if chosen.list:
+        _list()
+        return
+    if chosen.name is None:
+        parser.error("name a scene, or use --list")
+    if chosen.show:
+        _show(chosen.name)
+    else:
+        _simulate(chosen)
+
+
+def _simulate(chosen: argparse.Namespace) -> None:
+    from nmpm.data.generate import generate
+    from nmpm.sim import load_preset
+
+    if chosen.workers is not None and chosen.workers < 1:
+        raise ConfigError(f"--workers {chosen.workers}: at least 1 is needed.")
+    preset = load_preset(chosen.name)
+    preset = preset if chosen.frames is None else preset.lasting(chosen.frames)
+    if chosen.preview is not None:
+        _preview(preset, chosen.seed, chosen.preview)
+        return
+    counts = dict(_paper_counts(chosen.name))
+    counts |= {name: getattr(chosen, name) for name in counts if getattr(chosen, name) is not None}
+    out = chosen.out or Path(preset.name)
+    generate(preset, out, counts, chosen.seed, chosen.workers)
+    sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
+    sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
+
+
+def _paper_counts(name: str) -> Mapping[str, int]:
+    from nmpm.data import catalog
+
+    return catalog.describe(name if name in catalog.catalog() else "goop").paper
+
+
+def _list() -> None:
+    from nmpm.data import catalog
+    from nmpm.sim import load_preset
+
+    sys.stdout.write(f"{'scene':<17}{'method':<9}{'axes':<6}{'particles':<11}{'frames':<8}{'splits':<15}materials\n")
+    for name in catalog.catalog():
+        preset, paper = load_preset(name), catalog.describe(name).paper
+        materials = ", ".join(preset.scene.materials)
+        splits = "/".join(map(str, paper.values()))
+        sys.stdout.write(
+            f"{name:<17}{preset.generator:<9}{preset.scene.dim:<6}{f'≤ {preset.most_particles}':<11}"
+            f"{preset.frames:<8}{splits:<15}{materials}{_varying(preset)}\n"
+        )
+
+
+def _varying(preset: Preset) -> str:
+    scene = preset.scene
+    told = [word for word, holds in (("obstacles", scene.obstacles), ("gravity varies", scene.gravity_varies)) if holds]
+    return f"; {', '.join(told)}" if told else ""
+
+
+def _show(name: str) -> None:
+    from nmpm.sim.loading import preset_text
+
+    sys.stdout.write(preset_text(name))
+
+
+def _preview(preset: Preset, seed: int, path: Path) -> None:
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from nmpm.sim.preset import BOUNDARY
+    from nmpm.viz import Exhibit, material_names, snapshots
+
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
+        made = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
+    moving, scene = made.particle_type != BOUNDARY, preset.scene
+    exhibit = Exhibit(
+        rows={"simulated": made.position[:, moving]},
+        material=material_names(made.particle_type[moving], preset.type_names),
+        bounds=scene.bounds,
+        dt=scene.dt,
+        domain=scene.domain,
+        obstacle=made.position[0, ~moving],
+        periodic=scene.periodic,
+        gravity=tuple(np.asarray(made.attributes.get("gravity", scene.gravity or ())).tolist()) or None,
+        title=f"{preset.name}, simulated by nmpm ({preset.generator})",
+    )
+    snapshots(exhibit, path)
+    sys.stdout.write(f"wrote {path}\n")
