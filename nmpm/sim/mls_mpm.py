@@ -64,7 +64,7 @@ class Grid:
 
     low: Array
     size: float
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
     friction: float
     gravity: Array
     walls: Walls = Walls.SEPARATE

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,15 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim.blocks import draw_start
+from nmpm.sim.gravity import turned
 from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
 from nmpm.sim.mpm_preset import MpmPreset
+from nmpm.sim.obstacles import Ramp, distance
+from nmpm.sim.preset import BOUNDARY
+from nmpm.sim.solid import Solid
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+
+STEPPERS = {2: Stepper}
 
 
 def simulate(preset: MpmPreset, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
@@ -20,12 +28,19 @@ def simulate(preset: MpmPreset, seed: int, progress: Progress | None = None) -> 
     Raises:
         ConfigError: if the preset leaves no room for its blocks, or the state is no longer finite.
     """
-    start = draw_start(preset, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
     try:
-        made = simulate_from(preset, start.position, start.velocity, preset.frames, start.counts, progress)
+        gravity = turned(preset.gravity, preset.gravity_turn, rng)
+        start = draw_start(preset, rng)
+        ramps = preset.ramps.draw(preset.box, start.extents, rng) if preset.ramps is not None else ()
+        made = simulate_from(
+            preset, start.position, start.velocity, preset.frames, start.counts, progress, gravity, ramps
+        )
     except ConfigError as error:
         raise ConfigError(f"Preset {preset.name}, seed {seed}: {error}") from error
     made.attributes["seed"] = seed
+    if preset.gravity_turn:
+        made.attributes["gravity"] = np.array(gravity)
     return made
 
 
@@ -36,36 +51,44 @@ def simulate_from(
     frames: int,
     counts: tuple[int, ...] | None = None,
     progress: Progress | None = None,
+    gravity: tuple[float, ...] | None = None,
+    ramps: tuple[Ramp, ...] = (),
 ) -> SimulatedTrajectory:
     """A trajectory from a given state, free of stress, under the preset's physics and grid.
 
     Args:
-        preset: Its blocks and number of frames are not used.
-        position: (N, 2) within the box, in length.
-        velocity: (N, 2) in length per second.
+        preset: Its blocks, ramps and number of frames are not used.
+        position: (N, D) within the box, in length.
+        velocity: (N, D) in length per second.
         frames: Frames to simulate after the given one; frames + 1 are returned.
         counts: Particles of each of the preset's materials, in order; all are of the first when left out.
         progress: Told how many frames are done, after each.
+        gravity: Instead of the preset's, in length per second squared.
+        ramps: Obstacles; their particles, at rest, follow the others.
 
     Raises:
-        DataError: if the arrays do not fit together, or a particle is outside of the box.
+        DataError: if the arrays do not fit together, or a particle is outside of the box or inside of a ramp.
         ConfigError: if the state is no longer finite; the message names the substep.
     """
     counts = counts or (len(position),) + (0,) * (len(preset.materials) - 1)
     _check_state(preset, position, velocity, counts)
     groups = tuple(zip(preset.materials, counts, strict=True))
     state = State(position, velocity, groups, preset.particle_volume)
-    stepper = Stepper(_grid(preset), preset.frame_dt / preset.substeps)
+    stepper = STEPPERS[preset.dim](_grid(preset, gravity or preset.gravity, ramps), preset.frame_dt / preset.substeps)
     stepper.enclose(state)
-    stored = np.empty((frames + 1, *state.position.shape), np.float32)
-    stored[0] = state.position
+    solid = np.concatenate([np.empty((0, preset.dim)), *(ramp.particles(preset.spacing) for ramp in ramps)])
+    moving = len(position)
+    stored = np.empty((frames + 1, moving + len(solid), preset.dim), np.float32)
+    stored[0, :moving], stored[:, moving:] = state.position, solid
     for frame in range(1, frames + 1):
         _advance(stepper, state, preset.substeps, frame)
-        stored[frame] = state.position
+        stored[frame, :moving] = state.position
         if progress is not None:
             progress(frame)
-    kinds = np.repeat([m.particle_type for m in preset.materials], counts).astype(np.int64)
-    return SimulatedTrajectory(stored, kinds, {"held_back": stepper.held_back})
+    types = [*(material.particle_type for material in preset.materials), BOUNDARY]
+    kinds = np.repeat(types, [*counts, len(solid)]).astype(np.int64)
+    counters = {"held_back": stepper.held_back} | ({"pushed_out": stepper.pushed_out} if ramps else {})
+    return SimulatedTrajectory(stored, kinds, counters)
 
 
 def _advance(stepper: Stepper, state: State, substeps: int, frame: int) -> None:
@@ -79,11 +102,14 @@ def _advance(stepper: Stepper, state: State, substeps: int, frame: int) -> None:
             ) from error
 
 
-def _grid(preset: MpmPreset) -> Grid:
+def _grid(preset: MpmPreset, gravity: tuple[float, ...], ramps: tuple[Ramp, ...]) -> Grid:
     low, high = np.array(preset.reach).T
-    columns, rows = (round(cells) for cells in (high - low) / preset.cell_size)
-    gravity = np.array(preset.gravity, dtype=np.float64)
-    return Grid(low, preset.cell_size, (columns, rows), preset.wall_friction, gravity, Walls(preset.walls))
+    shape = tuple(round(cells) for cells in (high - low) / preset.cell_size)
+    fall = np.array(gravity, dtype=np.float64)
+    grid = Grid(low, preset.cell_size, shape, preset.wall_friction, fall, Walls(preset.walls))
+    if not ramps:
+        return grid
+    return replace(grid, solid=Solid.sample(grid, partial(distance, ramps), preset.wall_friction))
 
 
 def _check_state(
@@ -92,8 +118,10 @@ def _check_state(
     velocity: NDArray[Any],
     counts: tuple[int, ...],
 ) -> None:
-    if position.ndim != 2 or position.shape[1] != 2 or velocity.shape != position.shape:
-        raise DataError(f"Positions {position.shape} and velocities {velocity.shape} must both have shape (N, 2).")
+    if position.ndim != 2 or position.shape[1] != preset.dim or velocity.shape != position.shape:
+        raise DataError(
+            f"Positions {position.shape} and velocities {velocity.shape} must both have shape (N, {preset.dim})."
+        )
     if len(counts) != len(preset.materials) or sum(counts) != len(position):
         raise DataError(
             f"Counts {counts} do not divide {len(position)} particles among {len(preset.materials)} materials."

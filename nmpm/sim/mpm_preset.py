@@ -12,7 +12,9 @@ from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.materials import MATERIALS, Material
 from nmpm.sim.mls_mpm import REVISION, Walls
-from nmpm.sim.preset import Preset, built, checked, require
+from nmpm.sim.obstacles import Ramps
+from nmpm.sim.preset import BOUNDARY, Preset, built, checked, require
+from nmpm.sim.solid import THINNEST
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
 CFL_LIMIT = 0.9
@@ -31,6 +33,7 @@ class Blocks:
         gap: Least distance between blocks, and from the box's sides.
         speed: Largest initial velocity along each axis, in length per second.
         jitter: Largest displacement of a particle off the lattice along each axis, in spacings.
+        floor: Least height of a block above the box's bottom, where it is more than the gap.
 
     Raises:
         ConfigError: if a range is empty or out of reach.
@@ -43,6 +46,7 @@ class Blocks:
     gap: float
     speed: float
     jitter: float
+    floor: float = 0.0
 
     def __post_init__(self) -> None:
         for key in ("number", "particles", "aspect"):
@@ -50,6 +54,7 @@ class Blocks:
             require(0 < low <= high, f"blocks.{key} = {[low, high]} needs two positive numbers, the lower first.")
         require(0 < self.share * self.number[1] <= 1, f"blocks.share = {self.share} is too large for the blocks.")
         require(0 <= self.jitter < 0.5, f"blocks.jitter = {self.jitter} must be at least 0 and below 0.5.")
+        require(self.floor >= 0, f"blocks.floor = {self.floor} must not be negative.")
         require(self.gap >= 0 and self.speed >= 0, "blocks.gap and blocks.speed must not be negative.")
 
 
@@ -62,8 +67,8 @@ class MpmPreset(Preset):
         frames: Simulated frames of a trajectory after its initial state.
         frame_dt: Time between frames, in seconds.
         substeps: Substeps of a frame.
-        box: Where particles may be, (lower, upper) along x and y, in length; walls that hold let them into a layer
-            around it, see `reach`.
+        box: Where particles may be, (lower, upper) along two or three axes, the second upright, in length; walls that
+            hold let them into a layer around it, see `reach`.
         domain: What an emulator's grid covers, likewise.
         cells: Grid cells along x, from side to side of the box.
         spacing: Distance between particles in the initial lattice, in length.
@@ -72,6 +77,8 @@ class MpmPreset(Preset):
         materials: What blocks are made of.
         blocks: How the initial state is drawn.
         walls: What the walls do with material that leaves them, a value of `Walls`.
+        gravity_turn: Angle by which gravity is turned in a trajectory, at most, in degrees; in two dimensions only.
+        ramps: Obstacles; in two dimensions only.
 
     Raises:
         ConfigError: if the numbers contradict each other or a substep is too long to be stable.
@@ -85,15 +92,17 @@ class MpmPreset(Preset):
     frames: int
     frame_dt: float
     substeps: int
-    box: tuple[Interval, Interval]
-    domain: tuple[Interval, Interval]
+    box: tuple[Interval, ...]
+    domain: tuple[Interval, ...]
     cells: int
     spacing: float
-    gravity: tuple[float, float]
+    gravity: tuple[float, ...]
     wall_friction: float
     materials: tuple[Material, ...]
     blocks: Blocks
     walls: str = Walls.SEPARATE.value
+    gravity_turn: float = 0.0
+    ramps: Ramps | None = None
 
     def __post_init__(self) -> None:
         for key in ("frames", "substeps", "cells"):
@@ -104,12 +113,7 @@ class MpmPreset(Preset):
         known = [kind.value for kind in Walls]
         require(self.walls in known, f"walls = {self.walls} is not one of {', '.join(map(repr, known))}.")
         require(bool(self.materials), f"materials is empty; known are {', '.join(MATERIALS)}.")
-        (left, right), (bottom, top) = self.box
-        require(left < right and bottom < top, f"box = {self.box} needs (lower, upper) along each axis.")
-        rows = (top - bottom) / self.cell_size
-        require(
-            abs(rows - round(rows)) < 1e-6, f"cells = {self.cells} along x make {rows:.3f} rows, not a whole number."
-        )
+        self._check_axes()
         least = self.least_substeps
         require(
             self.substeps >= least,
@@ -117,27 +121,51 @@ class MpmPreset(Preset):
             f"{CFL_LIMIT} cells in one. Take at least {least}, or a softer material.",
         )
 
+    def _check_axes(self) -> None:
+        require(self.dim in (2, 3), f"box = {self.box} has {self.dim} axes; 2 or 3 are possible.")
+        require(all(low < high for low, high in self.box), f"box = {self.box} needs (lower, upper) along each axis.")
+        for key in ("domain", "gravity"):
+            require(len(getattr(self, key)) == self.dim, f"{key} = {getattr(self, key)} needs {self.dim} entries.")
+        for low, high in self.box:
+            cells = (high - low) / self.cell_size
+            require(
+                abs(cells - round(cells)) < 1e-6,
+                f"cells = {self.cells} along x make {cells:.3f} from {low} to {high}, not a whole number.",
+            )
+        require(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
+        flat = self.dim == 2 or (self.ramps is None and not self.gravity_turn)
+        require(flat, "ramps and gravity_turn are known in two dimensions, not in three.")
+        thinnest = THINNEST * self.cell_size
+        require(
+            self.ramps is None or self.ramps.thickness >= thinnest,
+            f"ramps.thickness must be at least {THINNEST:g} cells, {thinnest:.4g}.",
+        )
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return len(self.box)
+
     @property
     def cell_size(self) -> float:
         """Side of a grid cell, in length."""
         return (self.box[0][1] - self.box[0][0]) / self.cells
 
     @property
-    def grid_shape(self) -> tuple[int, int]:
-        """Grid cells along x and y."""
-        return self.cells, round((self.box[1][1] - self.box[1][0]) / self.cell_size)
+    def grid_shape(self) -> tuple[int, ...]:
+        """Grid cells along each axis."""
+        return tuple(round((high - low) / self.cell_size) for low, high in self.box)
 
     @property
-    def reach(self) -> tuple[Interval, Interval]:
+    def reach(self) -> tuple[Interval, ...]:
         """How far particles can get: the box, and a cell and a half beyond it where walls hold what touches them."""
-        (left, right), (bottom, top) = self.box
         layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
-        return (left - layer, right + layer), (bottom - layer, top + layer)
+        return tuple((low - layer, high + layer) for low, high in self.box)
 
     @property
     def particle_volume(self) -> float:
-        """Area of one particle."""
-        return self.spacing**2
+        """Area of one particle, or volume in three dimensions."""
+        return self.spacing**self.dim
 
     @property
     def wave_speed(self) -> float:
@@ -172,16 +200,20 @@ class MpmPreset(Preset):
             dt=self.frame_dt,
             materials=tuple(material.name for material in self.materials),
             particle_volume=self.particle_volume,
-            gravity=self.gravity,
+            gravity=None if self.gravity_turn else self.gravity,
+            gravity_varies=self.gravity_turn > 0,
+            obstacles=self.ramps is not None,
         )
 
     @property
     def type_names(self) -> dict[int, str]:
-        return {material.particle_type: material.name for material in self.materials}
+        names = {material.particle_type: material.name for material in self.materials}
+        return names if self.ramps is None else names | {BOUNDARY: "boundary"}
 
     @property
     def most_particles(self) -> int:
-        return self.blocks.particles[1]
+        around = 0 if self.ramps is None else self.ramps.most_particles(self.spacing)
+        return self.blocks.particles[1] + around
 
     def to_dict(self) -> dict[str, Any]:
         return super().to_dict() | {"materials": {material.name: material.to_dict() for material in self.materials}}
@@ -191,6 +223,8 @@ class MpmPreset(Preset):
         entries = checked(cls, plain, "the preset")
         entries["blocks"] = built(Blocks, entries["blocks"], "blocks")
         entries["materials"] = _materials(entries["materials"])
+        if entries.get("ramps") is not None:
+            entries["ramps"] = built(Ramps, entries["ramps"], "ramps")
         preset: MpmPreset = built(cls, entries, "the preset")
         return preset
 

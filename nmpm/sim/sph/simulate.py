@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError, DataError
+from nmpm.sim.gravity import turned
 from nmpm.sim.preset import BOUNDARY
 from nmpm.sim.sph.preset import WATER, SphPreset
 from nmpm.sim.sph.walls import Obstacle, Solids
@@ -27,7 +27,7 @@ def simulate(preset: SphPreset, seed: int, progress: Progress | None = None) -> 
     """
     rng = np.random.default_rng(seed)
     try:
-        gravity = _turned(preset, rng)
+        gravity = turned(preset.gravity, preset.gravity_turn, rng)
         obstacles = preset.obstacles.draw(preset.box, rng) if preset.obstacles is not None else ()
         position, velocity = preset.start.draw(preset.box, preset.spacing, obstacles, rng)
         made = simulate_from(preset, position, velocity, preset.frames, gravity, obstacles, progress)
@@ -42,7 +42,7 @@ def simulate_from(
     position: NDArray[Any],
     velocity: NDArray[Any],
     frames: int,
-    gravity: tuple[float, float] | None = None,
+    gravity: tuple[float, ...] | None = None,
     obstacles: tuple[Obstacle, ...] = (),
     progress: Progress | None = None,
 ) -> SimulatedTrajectory:
@@ -103,15 +103,6 @@ def _advance(stepper: Stepper, state: State, substeps: int, frame: int) -> float
     if inside:
         raise ConfigError(f"{inside} particles are outside of the box or in an obstacle in frame {frame}.")
     return deviation
-
-
-def _turned(preset: SphPreset, rng: np.random.Generator) -> tuple[float, float]:
-    """The preset's gravity, turned by an angle drawn within its limit."""
-    if not preset.gravity_turn:
-        return preset.gravity
-    angle = math.radians(rng.uniform(-preset.gravity_turn, preset.gravity_turn))
-    (x, y), cos, sin = preset.gravity, math.cos(angle), math.sin(angle)
-    return cos * x - sin * y, sin * x + cos * y
 
 
 def _check_state(
