@@ -76,7 +76,8 @@ class Metadata:
             known = ", ".join(f"{i} {name}" for i, name in sorted(self.particle_types.items()))
             raise DataError(
                 f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {known}). Name it in"
-                f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or choose another family'
+                f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or where data are converted'
+                f" (--types {unknown[0]}=sand), or choose another family"
                 f" ({', '.join(sorted(FAMILIES))})."
             )
 
@@ -92,7 +93,23 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
         DataError: if the file is missing, is not JSON, lacks a key or holds a wrong value.
         ConfigError: if there is no such family.
     """
-    keys = _Keys(Path(folder) / METADATA_FILE)
+    path = Path(folder) / METADATA_FILE
+    return metadata_from_dict(_loaded(path), path, family)
+
+
+def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None = None) -> Metadata:
+    """The metadata in a JSON object, checked.
+
+    Args:
+        plain: The object; numbers, strings, lists and objects.
+        where: The file it comes from, for messages.
+        family: What type ids mean where it does not say so itself.
+
+    Raises:
+        DataError: if a key is missing or holds a wrong value.
+        ConfigError: if there is no such family.
+    """
+    keys = _Keys(where, dict(plain))
     dim = keys.take("dim", _whole)
     if dim not in (1, 2, 3):
         raise keys.error("dim", dim, "1, 2 or 3")
@@ -132,27 +149,28 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         part.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
 
+def _loaded(path: Path) -> dict[str, Any]:
+    if not path.parent.is_dir():
+        raise DataError(f"{path.parent}: no such folder. Give the folder that holds {METADATA_FILE}.")
+    if not path.is_file():
+        raise DataError(f"{path}: no such file. A dataset needs one with bounds, dt, dim and sequence_length.")
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON ({error}).") from error
+    if not isinstance(plain, dict):
+        raise DataError(f"{path}: expected a JSON object, found {type(plain).__name__}.")
+    return plain
+
+
 class _Keys:
     """The keys of a JSON object, taken one by one; each error names the file and the key."""
 
     _REQUIRED = object()
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, plain: dict[str, Any]) -> None:
         self.path = path
-        self.left = self._load()
-
-    def _load(self) -> dict[str, Any]:
-        if not self.path.parent.is_dir():
-            raise DataError(f"{self.path.parent}: no such folder. Give the folder that holds {METADATA_FILE}.")
-        if not self.path.is_file():
-            raise DataError(f"{self.path}: no such file. A dataset needs one with bounds, dt, dim and sequence_length.")
-        try:
-            plain = json.loads(self.path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise DataError(f"{self.path}: not valid JSON ({error}).") from error
-        if not isinstance(plain, dict):
-            raise DataError(f"{self.path}: expected a JSON object, found {type(plain).__name__}.")
-        return plain
+        self.left = plain
 
     def error(self, key: str, value: Any, wanted: str) -> DataError:
         return DataError(f"{self.path}: {key} = {json.dumps(value)[:80]} should be {wanted}.")

@@ -103,7 +103,9 @@ def _places(preset: MpmPreset, lattices: list[tuple[int, ...]], rng: np.random.G
     for lattice in lattices:
         side = preset.spacing * np.array(lattice)
         first, last = box_low + gap, box_high - gap - side
-        first[1] = max(first[1], box_low[1] + preset.blocks.floor)
+        if preset.blocks.height is not None:
+            lowest, highest = preset.blocks.height
+            first[1], last[1] = max(first[1], box_low[1] + lowest), min(last[1], box_low[1] + highest)
         if np.any(last < first):
             return None
         low = rng.uniform(first, last)

@@ -33,7 +33,8 @@ class Blocks:
         gap: Least distance between blocks, and from the box's sides.
         speed: Largest initial velocity along each axis, in length per second.
         jitter: Largest displacement of a particle off the lattice along each axis, in spacings.
-        floor: Least height of a block above the box's bottom, where it is more than the gap.
+        height: Least and largest height of a block above the box's bottom, where the gap leaves it; anywhere when
+            left out.
 
     Raises:
         ConfigError: if a range is empty or out of reach.
@@ -46,7 +47,7 @@ class Blocks:
     gap: float
     speed: float
     jitter: float
-    floor: float = 0.0
+    height: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for key in ("number", "particles", "aspect"):
@@ -54,7 +55,8 @@ class Blocks:
             require(0 < low <= high, f"blocks.{key} = {[low, high]} needs two positive numbers, the lower first.")
         require(0 < self.share * self.number[1] <= 1, f"blocks.share = {self.share} is too large for the blocks.")
         require(0 <= self.jitter < 0.5, f"blocks.jitter = {self.jitter} must be at least 0 and below 0.5.")
-        require(self.floor >= 0, f"blocks.floor = {self.floor} must not be negative.")
+        low, high = self.height or (0.0, 0.0)
+        require(0 <= low <= high, f"blocks.height = {self.height} needs two numbers, the lower first.")
         require(self.gap >= 0 and self.speed >= 0, "blocks.gap and blocks.speed must not be negative.")
 
 

@@ -11,10 +11,14 @@ from nmpm.data.convert.base import Format as Format
 from nmpm.data.convert.base import Options as Options
 from nmpm.data.convert.base import Source as Source
 from nmpm.data.convert.deepmind import DeepMind
+from nmpm.data.convert.dmcf import Dmcf
+from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
+from nmpm.data.convert.neuralmpm import NeuralMpm
+from nmpm.data.convert.pickles import RolloutPickle
 from nmpm.data.convert.run import detect, named, write_source
 
-FORMATS: tuple[Format, ...] = (Native(), DeepMind())
+FORMATS: tuple[Format, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
 
 
 def open_source(path: Path, format_name: str | None = None, options: Options | None = None) -> Source:

@@ -13,6 +13,9 @@ from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
 
+UNSTATED = 0
+"""For `Metadata.sequence_length`, where the files leave it open: conversion puts in what it finds."""
+
 
 @dataclass(frozen=True)
 class Options:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmpm.data.convert.base import Format, Source
+from nmpm.data.convert.base import UNSTATED, Format, Source
 from nmpm.data.format import SPLITS, Metadata, Trajectory, write_metadata, write_split
 from nmpm.data.progress import shown
 from nmpm.data.statistics import KEYS, Statistics, disagreements, first_that_moves
@@ -173,7 +173,8 @@ class _Seen:
                 f"Particles of a static type move in {self.moving_boundaries} of {self.number} trajectories. Their"
                 " positions are kept; to train on them, declare which types are static (--static)."
             )
-        return replace(self.metadata, extra=extra), notes + self._outside() + self._lengths()
+        length = self.metadata.sequence_length or max(self.frames, default=2) - 1
+        return replace(self.metadata, extra=extra, sequence_length=length), notes + self._outside() + self._lengths()
 
     def _outside(self) -> list[str]:
         if self.lower is None or self.upper is None:
@@ -189,7 +190,7 @@ class _Seen:
 
     def _lengths(self) -> list[str]:
         stated = self.metadata.sequence_length
-        if not self.frames or self.frames <= {stated, stated + 1}:
+        if stated == UNSTATED or self.frames <= {stated, stated + 1}:
             return []
         few, many = min(self.frames), max(self.frames)
         held = f"{few}" if few == many else f"{few} to {many}"

@@ -1,0 +1,171 @@
+"""DMCF's scenes: `*.msgpack.zst`, a compressed stream of frames.
+
+Prantl et al., "Guaranteed conservation of momentum for learning particle-based fluid dynamics", 2022.
+
+A file is one trajectory: a MessagePack array of maps with `pos` and `vel` (N, D), in the first also `box` and
+`box_normals` (M, D), the solid around. The y axis is upright.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from nmpm.data.convert.base import UNSTATED, Format, Options, Reread, Source, split_of
+from nmpm.data.families import find_family
+from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.errors import ConfigError, DataError
+
+_SUFFIX = ".msgpack.zst"
+_FLUID, _WALL = 0, 1
+_DT, _GRAVITY = 0.02, -9.81
+_MOST_BYTES = 2**31  # of one frame
+
+
+class Dmcf(Format):
+    """A file, a folder of files, or folders train, valid and test of them."""
+
+    name: ClassVar[str] = "dmcf"
+    summary: ClassVar[str] = "DMCF's *.msgpack.zst files (needs the extra: pip install nmpm[convert])"
+
+    def recognises(self, path: Path) -> bool:
+        return bool(_files(path))
+
+    def open(self, path: Path, options: Options) -> Source:
+        files = _files(path)
+        if not files:
+            raise DataError(f"{path}: no *{_SUFFIX} file there.")
+        family = options.family or "lagrangebench"
+        first = next(_frames(next(iter(files.values()))[0]))
+        return Source(
+            metadata=options.applied(_metadata(first, find_family(family).types, options)),
+            splits={split: Reread(partial(_trajectories, found)) for split, found in files.items()},
+            notes=(
+                f"The fluid becomes particle type {_FLUID}, the solid around it type {_WALL} ({family} family).",
+                *(() if options.dt else (f"The files do not state dt; {_DT:g} s was taken (--dt).",)),
+                *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y was taken.",)),
+            ),
+            counts={split: len(found) for split, found in files.items()},
+        )
+
+
+def _files(path: Path) -> dict[str, tuple[Path, ...]]:
+    if path.is_file():
+        return {split_of(path.name) or "test": (path,)} if path.name.endswith(_SUFFIX) else {}
+    folders = {split: sorted((path / split).glob(f"*{_SUFFIX}")) for split in SPLITS}
+    if not any(folders.values()):
+        folders = {"test": sorted(path.glob(f"*{_SUFFIX}"))}
+    return {split: tuple(found) for split, found in folders.items() if found}
+
+
+def _frames(path: Path) -> Iterator[dict[str, Any]]:
+    """The frames of a file, one at a time; whatever fails within names the file."""
+    try:
+        import msgpack
+        import zstandard
+    except ImportError as error:
+        raise ConfigError(f"{path}: reading it needs more packages: pip install 'nmpm[convert]'.") from error
+    try:
+        with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
+            reader = msgpack.Unpacker(stream, raw=True, max_buffer_size=_MOST_BYTES)
+            for index in range(reader.read_array_header()):
+                yield _decoded(reader.unpack(), f"{path}, frame {index}")
+    except (zstandard.ZstdError, msgpack.UnpackException, ValueError, OSError, RecursionError, MemoryError) as error:
+        reason = str(error)[:200] or type(error).__name__
+        raise DataError(f"{path}: cannot be read ({reason}). Is it complete? Copy or download it again.") from error
+
+
+def _decoded(frame: Any, where: str) -> dict[str, Any]:
+    if not isinstance(frame, dict) or not all(isinstance(key, bytes) for key in frame):
+        raise DataError(f"{where}: a map with names is due, found {type(frame).__name__}.")
+    return {key.decode("utf-8", "replace"): _value(value, f"{where}, {key!r}") for key, value in frame.items()}
+
+
+def _value(value: Any, where: str) -> Any:
+    """An array out of the map that msgpack-numpy makes of it; anything else as it is."""
+    if not isinstance(value, dict) or b"nd" not in value:
+        return value
+    try:
+        kind = np.dtype(bytes(value[b"type"]).decode("ascii"))
+        if kind.kind not in "biuf":
+            raise ValueError(f"numbers are due, found {kind}")
+        flat = np.frombuffer(value[b"data"], kind)
+        return flat.reshape([int(side) for side in value[b"shape"]]) if value[b"nd"] else flat.reshape(())
+    except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:
+        raise DataError(f"{where}: not an array as msgpack-numpy writes it ({str(error)[:100]}).") from error
+
+
+def _metadata(first: dict[str, Any], types: Any, options: Options) -> Metadata:
+    position = _array(first, "pos", "the first frame")
+    dim = position.shape[1]
+    everything = np.concatenate([position, *([first["box"]] if "box" in first else [])])
+    bounds = tuple((float(low), float(high)) for low, high in zip(everything.min(0), everything.max(0), strict=True))
+    return Metadata(
+        bounds=bounds,
+        dt=options.dt or _DT,
+        dim=dim,
+        sequence_length=UNSTATED,
+        particle_types=dict(types),
+        static_types=frozenset({_WALL}),
+        gravity=tuple(_GRAVITY if axis == 1 else 0.0 for axis in range(dim)),
+    )
+
+
+def _array(frame: dict[str, Any], name: str, where: str) -> np.ndarray:
+    found = frame.get(name)
+    if not isinstance(found, np.ndarray) or found.ndim != 2 or 0 in found.shape or found.dtype.kind != "f":
+        raise DataError(f"{where}: {name!r} should be floats of shape (N, D).")
+    return found
+
+
+def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
+    for path in files:
+        frames = list(_frames(path))
+        if not frames:
+            raise DataError(f"{path}: the file holds no frame.")
+        yield _trajectory(frames, path)
+
+
+def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
+    positions = [_array(frame, "pos", f"{path}, frame {index}") for index, frame in enumerate(frames)]
+    odd = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
+    if odd:
+        raise DataError(
+            f"{path}, frame {odd[0]}: {positions[odd[0]].shape[0]} particles, {positions[0].shape[0]} at the start."
+            " Particles that appear or vanish cannot be represented; cut the trajectory where their number changes."
+        )
+    fluid, first = np.stack(positions), frames[0]
+    wall = _array(first, "box", f"{path}, frame 0") if "box" in first else np.empty((0, fluid.shape[2]), np.float32)
+    if wall.shape[1] != fluid.shape[2]:
+        raise DataError(f"{path}: box {wall.shape} and pos {positions[0].shape} have different axes.")
+    kinds = np.repeat([_FLUID, _WALL], [fluid.shape[1], len(wall)]).astype(np.int64)
+    still = np.broadcast_to(wall, (len(fluid), *wall.shape))
+    try:
+        position = np.concatenate([fluid, still], axis=1).astype(np.float32)
+        return Trajectory(position, kinds, _attributes(first), _fields(frames))
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _attributes(first: dict[str, Any]) -> dict[str, Any]:
+    known: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}
+    grav = first.get("grav")
+    if isinstance(grav, np.ndarray) and grav.shape == (first["pos"].shape[1],):
+        known["gravity"] = grav.astype(np.float64)
+    return known
+
+
+def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """What frames hold beside positions: (T, …) where all have it in one shape, else that of the first frame."""
+    fields = {}
+    for key, value in frames[0].items():
+        if key in ("pos", "box") or not isinstance(value, np.ndarray):
+            continue
+        values = [frame.get(key) for frame in frames]
+        same = all(isinstance(item, np.ndarray) and item.shape == value.shape for item in values)
+        fields[key] = np.stack(values) if same else value  # type: ignore[arg-type]
+    return fields

@@ -1,0 +1,123 @@
+"""Datasets published on the Hugging Face hub, fetched into the cache; nothing in them is run."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import zipfile
+from pathlib import Path, PurePosixPath
+
+from nmpm.data.catalog import dataset_home
+from nmpm.data.folder_lock import locked
+from nmpm.data.format import SPLITS
+from nmpm.errors import ConfigError, DataError
+
+REPOSITORY = "iSach/NeuralMPM"
+"""Where names without an owner are looked up: the datasets of the paper's authors."""
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_DATA = (".h5", ".json", ".npz", ".tfrecord", ".zst")
+
+
+def hub_folder(name: str) -> Path:
+    """The folder of a published dataset, fetched now if it is not in the cache.
+
+    Archives in it are unpacked, of which only data files with plain names are taken.
+
+    Args:
+        name: "WaterRamps" of `iSach/NeuralMPM`, or "owner/repository" with or without "/folder".
+
+    Raises:
+        ConfigError: if the name cannot be one.
+        DataError: if it cannot be fetched, for lack of a connection or because there is none of that name.
+    """
+    repository, folder = _parsed(name)
+    fetched = _fetched(repository, folder)
+    archives = sorted(fetched.rglob("*.zip"))
+    if not archives:
+        return fetched
+    unpacked = dataset_home() / "hub" / repository.replace("/", "--") / (folder or "all")
+    with locked(unpacked.parent):
+        if not unpacked.is_dir():
+            _unpack(fetched, archives, unpacked)
+    return _root(unpacked)
+
+
+def _parsed(name: str) -> tuple[str, str]:
+    parts = name.strip("/").split("/")
+    if len(parts) > 3 or not all(_NAME.fullmatch(part) for part in parts):
+        raise ConfigError(
+            f"{name!r} is not the name of a dataset on the hub: give a folder of {REPOSITORY}, such as WaterRamps, or"
+            " owner/repository or owner/repository/folder."
+        )
+    if len(parts) == 1:
+        return REPOSITORY, parts[0]
+    return "/".join(parts[:2]), parts[2] if len(parts) == 3 else ""
+
+
+def _fetched(repository: str, folder: str) -> Path:
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
+
+    wanted = f"{repository}/{folder}" if folder else repository
+    try:
+        found = Path(
+            snapshot_download(repository, repo_type="dataset", allow_patterns=f"{folder}/*" if folder else None)
+        )
+    except RepositoryNotFoundError as error:
+        raise DataError(f"{wanted}: the hub has no dataset {repository}.") from error
+    except (LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
+        raise DataError(
+            f"{wanted}: not in the cache, and it cannot be fetched from the Hugging Face hub ({_first_line(error)})."
+            f" Where there is a connection, `hf download --repo-type dataset {repository}"
+            f"{f' --include {folder}/*' if folder else ''} --local-dir data` fetches it; unpack what is packed, copy"
+            " it here, and give its folder as the path."
+        ) from error
+    if not (found / folder).is_dir():
+        raise DataError(f"{wanted}: the dataset {repository} has no folder {folder}.")
+    return found / folder
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+
+
+def _unpack(fetched: Path, archives: list[Path], target: Path) -> None:
+    """All data files of the archives, and those beside them, into a folder that appears once it is whole."""
+    part = target.with_name(f".{target.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        for archive in archives:
+            _unpack_one(archive, part / archive.parent.relative_to(fetched))
+        for file in fetched.rglob("*"):
+            if file.suffix in _DATA:
+                place = part / file.relative_to(fetched)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, place)
+        part.rename(target)
+    except (zipfile.BadZipFile, OSError) as error:
+        raise DataError(f"{target}: cannot be unpacked ({error}).") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _unpack_one(archive: Path, target: Path) -> None:
+    with zipfile.ZipFile(archive) as file:
+        for item in file.infolist():
+            path = PurePosixPath(item.filename)
+            if item.is_dir() or path.suffix not in _DATA or "__MACOSX" in path.parts:
+                continue
+            if path.is_absolute() or not all(_NAME.fullmatch(part) for part in path.parts):
+                raise DataError(f"{archive}: refuses to unpack {item.filename!r}, which may lead out of the folder.")
+            place = target.joinpath(*path.parts)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            with file.open(item) as packed, place.open("wb") as out:
+                shutil.copyfileobj(packed, out)
+
+
+def _root(folder: Path) -> Path:
+    """The folder that holds the splits, which archives may have put a level deeper."""
+    for candidate in (folder, *sorted(item for item in folder.iterdir() if item.is_dir())):
+        if any((candidate / split).is_dir() or (candidate / f"{split}.h5").is_file() for split in SPLITS):
+            return candidate
+    return folder

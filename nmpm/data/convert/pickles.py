@@ -1,0 +1,241 @@
+"""Pickled arrays, read without trusting them; and the rollouts that DeepMind's code pickles.
+
+A pickle is a program. The reader below runs it with stand-ins for the few constructors that NumPy arrays need, which
+check what they are given, and with no others: whatever else a file asks for is an error that names it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from nmpm.data.convert.base import Format, Options, Reread, Source
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.metadata import metadata_from_dict
+from nmpm.errors import DataError
+
+_NDARRAY = "numpy.ndarray"
+"""Stands for the class, so that a pickle cannot call it and claim memory."""
+
+_KINDS = re.compile(r"[biuf][1248]|c8|c16|O8|O4|[SU]\d{1,4}")
+
+
+class _Kind:
+    """Stands for a dtype: NumPy's own takes a state that it does not check."""
+
+    def __init__(self, code: str, *_: object) -> None:
+        self.code, self.order = code, "="
+        if not isinstance(code, str) or not _KINDS.fullmatch(code):
+            raise pickle.UnpicklingError(f"an array of the kind {str(code)[:40]!r}")
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, self.order, *structure = state[:5]
+        if self.order not in ("<", ">", "=", "|") or any(part is not None for part in structure):
+            raise pickle.UnpicklingError("a structured array")
+
+    def read(self, data: bytes | bytearray, shape: Sequence[int], order: Literal["C", "F"] = "C") -> np.ndarray:
+        """The array that these bytes are."""
+        kind = np.dtype(object if self.code.startswith("O") else self.order.replace("|", "=") + self.code)
+        if kind.hasobject or len(data) != math.prod(shape) * kind.itemsize:
+            raise pickle.UnpicklingError(f"{len(data)} bytes for an array of {kind} and shape {tuple(shape)}")
+        return np.frombuffer(data, kind).reshape(shape, order=order)
+
+
+class _Array:
+    """Stands for an array while its pickle is read."""
+
+    value: np.ndarray | tuple[list[Any], tuple[int, ...], bool]
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        shape, kind, fortran, data = state[-4:]
+        if isinstance(data, str):
+            data = data.encode("latin1")
+        self.value = (
+            (data, shape, fortran) if isinstance(data, list) else kind.read(data, shape, "F" if fortran else "C")
+        )
+
+
+def _array(kind: object, *_: object) -> _Array:
+    if kind is not _NDARRAY:
+        raise pickle.UnpicklingError("an array of a class of its own")
+    return _Array()
+
+
+def _scalar(kind: _Kind, data: bytes | str) -> Any:
+    return kind.read(data.encode("latin1") if isinstance(data, str) else data, (1,))[0]
+
+
+def _from_buffer(data: bytes | bytearray, kind: _Kind, shape: Sequence[int], order: Literal["C", "F"]) -> np.ndarray:
+    return kind.read(data, shape, order)
+
+
+def _encoded(text: str, encoding: str) -> bytes:
+    """How bytes are written below pickle protocol 3."""
+    if encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError(f"text in {encoding}")
+    return text.encode("latin1")
+
+
+def _no_bytes() -> bytes:
+    """How b"" is written there."""
+    return b""
+
+
+_BASICS: Mapping[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): _NDARRAY,
+    ("numpy", "dtype"): _Kind,
+    ("_codecs", "encode"): _encoded,
+    ("__builtin__", "bytes"): _no_bytes,
+}
+_ALLOWED = _BASICS | {
+    (module, name): made
+    for core in ("numpy.core", "numpy._core")
+    for (module, name), made in {
+        (f"{core}.multiarray", "_reconstruct"): _array,
+        (f"{core}.multiarray", "scalar"): _scalar,
+        (f"{core}.numeric", "_frombuffer"): _from_buffer,
+    }.items()
+}
+
+
+class _ArraysOnly(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ALLOWED:
+            raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is not needed for arrays and not run")
+        return _ALLOWED[module, name]
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError(f"it refers to something outside of itself ({pid!r})")
+
+
+def load_pickled(data: bytes, where: str) -> Any:
+    """What a pickle of arrays, numbers, strings and containers of them holds.
+
+    Raises:
+        DataError: if it is damaged, or would run anything but the constructors of arrays.
+    """
+    try:
+        return _built(_ArraysOnly(io.BytesIO(data)).load(), {})
+    except Exception as error:
+        reason = str(error)[:200] or type(error).__name__
+        raise DataError(f"{where}: cannot be read as pickled arrays: {reason}.") from error
+
+
+def _built(value: Any, done: dict[int, Any]) -> Any:
+    """The content with arrays in the place of what stands for them; each thing once, however often it occurs."""
+    if id(value) not in done:
+        done[id(value)] = _made(value, done)
+    return done[id(value)]
+
+
+def _made(value: Any, done: dict[int, Any]) -> Any:
+    if isinstance(value, dict):
+        return {_built(key, done): _built(item, done) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_built(item, done) for item in value)
+    if not isinstance(value, _Array):
+        return value
+    if isinstance(value.value, np.ndarray):
+        return value.value
+    items, shape, fortran = value.value
+    array = np.empty(len(items), object)
+    for place, item in enumerate(items):
+        array[place] = _built(item, done)
+    return array.reshape(shape, order="F" if fortran else "C")
+
+
+def numbers(value: Any, where: str) -> np.ndarray:
+    """An array of numbers, also where each number is an object of its own.
+
+    Raises:
+        DataError: if it is something else.
+    """
+    array = np.asarray(value) if not isinstance(value, np.ndarray) else value
+    if array.dtype == object:
+        items = array.ravel().tolist()
+        if not all(isinstance(item, int | float | np.number | np.bool_) for item in items):
+            raise DataError(f"{where}: numbers are due, found objects such as {type(items[0]).__name__}.")
+        array = np.array(items).reshape(array.shape)
+    if array.dtype.kind not in "biuf":
+        raise DataError(f"{where}: numbers are due, found {array.dtype}.")
+    return array
+
+
+class RolloutPickle(Format):
+    """A `rollout_*.pkl` of DeepMind's code or its PyTorch successors, or a folder of them."""
+
+    name: ClassVar[str] = "rollout-pickle"
+    summary: ClassVar[str] = "rollouts as DeepMind's code pickles them (initial_positions, ground_truth_rollout, …)"
+
+    def recognises(self, path: Path) -> bool:
+        return bool(_files(path))
+
+    def open(self, path: Path, options: Options) -> Source:
+        files = _files(path)
+        if not files:
+            raise DataError(f"{path}: no .pkl file there.")
+        family = options.family or "deepmind"
+        return Source(
+            metadata=options.applied(_metadata(files[0], family)),
+            splits={"test": Reread(partial(_trajectories, files))},
+            notes=(
+                f"Particle types are read after the {family} family.",
+                "The true trajectories are taken as positions; the predictions are kept as the field"
+                " predicted_rollout, with the initial positions in front.",
+            ),
+            counts={"test": len(files)},
+        )
+
+
+def _files(path: Path) -> tuple[Path, ...]:
+    if path.is_dir():
+        return tuple(sorted(path.glob("*.pkl")))
+    return (path,) if path.suffix == ".pkl" and path.is_file() else ()
+
+
+def _content(path: Path) -> dict[str, Any]:
+    content = load_pickled(path.read_bytes(), str(path))
+    needed = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
+    if not isinstance(content, dict) or not all(key in content for key in needed):
+        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
+        raise DataError(f"{path}: a rollout has {', '.join(needed)}; found {found[:200]}.")
+    return content
+
+
+def _metadata(path: Path, family: str) -> Metadata:
+    plain = _content(path)["metadata"]
+    if not isinstance(plain, dict):
+        raise DataError(f"{path}: metadata should map keys to values; it is {type(plain).__name__}.")
+    return metadata_from_dict(_unboxed(plain), path, family)
+
+
+def _unboxed(value: Any) -> Any:
+    """NumPy's arrays and numbers as Python's."""
+    if isinstance(value, dict):
+        return {str(key): _unboxed(item) for key, item in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
+    for path in files:
+        content = _content(path)
+        initial = numbers(content["initial_positions"], f"{path}: initial_positions").astype(np.float32)
+        parts = {
+            key: numbers(content[key], f"{path}: {key}").astype(np.float32)
+            for key in ("ground_truth_rollout", "predicted_rollout")
+            if key in content
+        }
+        try:
+            whole: dict[str, np.ndarray] = {key: np.concatenate([initial, part]) for key, part in parts.items()}
+            types = numbers(content["particle_types"], f"{path}: particle_types")
+            yield Trajectory(whole.pop("ground_truth_rollout"), types, {}, whole)
+        except (DataError, ValueError) as error:
+            raise DataError(f"{path}: {error}") from error

@@ -1,0 +1,111 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.data.convert import GnsNpz, Options, convert
+from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.scenes import infer_scene
+from nmpm.errors import DataError
+from tests.data.convert.test_pickles import Runs
+
+METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 7, "dim": 2, "dt": 0.0025}
+
+
+def positions(seed: int, particles: int = 4) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.2, 0.8, (7, particles, 2)).astype(np.float32)
+
+
+def pair(*parts: object) -> np.ndarray:
+    array = np.empty(len(parts), object)
+    array[:] = parts
+    return array
+
+
+def write(folder: Path, **members: np.ndarray) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "metadata.json").write_text(json.dumps(METADATA))
+    np.savez(folder / "train.npz", **members)  # type: ignore[arg-type]
+    return folder
+
+
+def test_trajectories_come_in_the_order_of_their_numbers(tmp_path):
+    made = {f"simulation_trajectory_{i}": pair(positions(i, 3 + i), 6) for i in (10, 2, 0)}
+    convert(write(tmp_path / "sand", **made), tmp_path / "out")
+    split = Split(tmp_path / "out" / "train.h5")
+    for place, number in enumerate((0, 2, 10)):
+        np.testing.assert_array_equal(split.read(place).position, positions(number, 3 + number))
+        assert set(split.particle_type(place).tolist()) == {6}
+
+
+def test_types_per_particle_and_material_properties_are_kept(tmp_path):
+    types, angle = np.array([6, 6, 3, 3], dtype=object), np.array([20.0, 20.0, 0.0, 0.0])
+    convert(write(tmp_path / "a", simulation_0=pair(positions(0), types, angle)), tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").whole(0)
+    assert trajectory.particle_type.tolist() == [6, 6, 3, 3]
+    np.testing.assert_array_equal(trajectory.fields["material_property"], angle)
+
+
+def test_one_member_for_all_is_read_too(tmp_path):
+    rows = np.empty((2, 2), object)
+    for index in range(2):
+        rows[index] = [positions(index), 5]
+    convert(write(tmp_path / "a", gns_data=rows), tmp_path / "out")
+    split = Split(tmp_path / "out" / "train.h5")
+    assert len(split) == 2
+    np.testing.assert_array_equal(split.read(1).position, positions(1))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (pair(positions(0)), "found 1 parts"),
+        (pair(positions(0)[0], 5), r"shape \(T, N, D\)"),
+        (pair(positions(0), np.arange(3)), "one for each of 4 particles"),
+        (pair(positions(0) * np.nan, 5), r"simulation_0: .*finite"),
+        (pair(positions(0), Runs(eval, "1")), r"asks for builtins\.eval"),
+        (positions(0), "found 7 parts"),
+    ],
+)
+def test_what_does_not_fit_is_named(tmp_path, content, message):
+    with pytest.raises(DataError, match=message) as caught:
+        convert(write(tmp_path / "a", simulation_0=content), tmp_path / "out")
+    assert "train.npz: simulation_0" in str(caught.value)
+
+
+@given(place=st.integers(0, 3000), value=st.integers(0, 255), cut=st.integers(0, 300))
+@settings(deadline=None, max_examples=120)
+def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, place, value, cut):
+    folder = write(tmp_path_factory.mktemp("npz"), simulation_0=pair(positions(0), 5))
+    data = bytearray((folder / "train.npz").read_bytes())
+    data[place % len(data)] = value
+    (folder / "train.npz").write_bytes(data[: len(data) - (cut if cut < 100 else 0)])
+    found: list[Trajectory] = []
+    message = ""
+    try:
+        found = list(GnsNpz().open(folder, Options()).splits["train"])
+    except DataError as error:
+        message = str(error)
+    assert bool(found) != ("train.npz" in message)
+    assert all(np.isfinite(item.position).all() for item in found)
+
+
+def test_recorded_flume(recorded, tmp_path):
+    flume = recorded / "taichi-wave-flume-2d"
+    with pytest.raises(DataError, match=r"unknown particle type 1 .*--types 1=sand"):
+        convert(flume, tmp_path / "nameless")
+    notes = convert(flume, tmp_path / "flume", options=Options(types={1: "debris"}))
+    trajectory = Split(tmp_path / "flume" / "test.h5").read(0)
+    assert trajectory.position.shape == (400, 738, 2)
+    assert np.bincount(trajectory.particle_type).tolist() == [0, 62, 0, 0, 0, 676]
+    said = " ".join(notes)
+    assert "Along x positions reach from 0.02015 to 0.9966" in said
+    assert "vel_std = (0.399, 0.136)" in said
+    scene = infer_scene(tmp_path / "flume")
+    assert scene.materials == ("debris", "water")
+    low, high = trajectory.position.min((0, 1)), trajectory.position.max((0, 1))
+    assert all(a <= b and c <= d for (a, d), b, c in zip(scene.domain, low, high, strict=True))
+    assert read_metadata(tmp_path / "flume").extra["vel_std"] == pytest.approx([8.2e-4, 2.4e-4], rel=0.02)

@@ -1,0 +1,81 @@
+"""Without any connection: what the hub would give is put in place of it."""
+
+import zipfile
+from pathlib import Path
+
+import huggingface_hub
+import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError
+
+from nmpm.data.convert.hub import REPOSITORY, hub_folder
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.errors import ConfigError, DataError
+from tests.data.convert.test_neuralmpm import write
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    folder = tmp_path / "snapshot"
+    (folder / "Goop").mkdir(parents=True)
+    asked = []
+
+    def download(repository, *, repo_type, allow_patterns):
+        asked.append((repository, repo_type, allow_patterns))
+        return str(folder)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    yield folder
+    assert all(repo_type == "dataset" for _, repo_type, _ in asked)
+
+
+def packed(folder: Path, archive: Path, prefix: str = "") -> None:
+    with zipfile.ZipFile(archive, "w") as file:
+        for path in sorted(folder.rglob("*.h5")):
+            file.write(path, prefix + str(path.relative_to(folder)))
+
+
+def test_archives_are_unpacked_and_trained_on(hub, tmp_path):
+    for split in ("train", "valid", "test"):
+        write(tmp_path / "made" / split / "sim_0.h5")
+        packed(tmp_path / "made" / split, hub / "Goop" / f"{split}.zip", f"{split}/")
+    assert sorted(path.name for path in hub_folder("Goop").iterdir()) == ["test", "train", "valid"]
+    data = TrajectoryDataModule(name="Goop", source="hub", horizon=4, batch_size=1)
+    data.prepare_data()
+    data.setup("fit")
+    assert data.scene.materials == ("goop",)
+    assert next(iter(data.train_dataloader())).initial.position.shape[1] == 5
+
+
+def test_folders_that_are_not_packed_are_used_as_they_are(hub):
+    write(hub / "Goop" / "train" / "sim_0.h5")
+    assert hub_folder("Goop") == hub / "Goop"
+
+
+@pytest.mark.parametrize("name", ["../../etc/x.h5", "/etc/x.h5", "a/../../x.h5"])
+def test_archives_that_lead_out_are_refused(hub, tmp_path, name):
+    with zipfile.ZipFile(hub / "Goop" / "train.zip", "w") as file:
+        file.writestr(name, b"x")
+    with pytest.raises(DataError, match="refuses to unpack"):
+        hub_folder("Goop")
+    assert not list(tmp_path.rglob("x.h5"))
+
+
+@pytest.mark.parametrize("name", ["", "..", "../up", "a/b/c/d", "a/../b", "Goop;rm"])
+def test_names_that_cannot_be_are_refused(name):
+    with pytest.raises(ConfigError, match="is not the name of a dataset"):
+        hub_folder(name)
+
+
+def test_offline_says_what_to_do(monkeypatch, tmp_path):
+    def offline(*_, **__):
+        raise LocalEntryNotFoundError("no connection")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", offline)
+    with pytest.raises(DataError, match=f"{REPOSITORY}/WaterRamps: not in the cache.*hf download --repo-type dataset"):
+        hub_folder("WaterRamps")
+
+
+def test_an_unknown_folder_is_named(hub):
+    with pytest.raises(DataError, match="has no folder Treacle"):
+        hub_folder("Treacle")

@@ -1,0 +1,148 @@
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from nmpm.data.convert import Options, RolloutPickle, convert
+from nmpm.data.convert.pickles import load_pickled, numbers
+from nmpm.data.format import Split, Trajectory
+from nmpm.errors import DataError
+
+METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 9, "dim": 2, "dt": 0.0025,
+            "vel_std": np.array([1e-3, 1e-3])}  # fmt: skip
+
+
+def rollout(**changes: object) -> dict:
+    rng = np.random.default_rng(0)
+    made = {key: rng.uniform(0.2, 0.8, (n, 4, 2)).astype(np.float32) for key, n in (
+        ("initial_positions", 6), ("predicted_rollout", 4), ("ground_truth_rollout", 4))}  # fmt: skip
+    return made | {"particle_types": np.array([5, 5, 6, 3]), "metadata": METADATA} | changes
+
+
+def write(path: Path, content: object, protocol: int = 4) -> Path:
+    path.write_bytes(pickle.dumps(content, protocol))
+    return path
+
+
+class Runs:
+    """A pickle that runs something when it is loaded."""
+
+    def __init__(self, function, *arguments):
+        self.what = function, arguments
+
+    def __reduce__(self):
+        return self.what
+
+
+@given(
+    array=arrays.arrays(
+        st.sampled_from([np.float32, np.float64, np.int64, np.uint8, np.bool_]), arrays.array_shapes(min_side=0)
+    ),
+    protocol=st.integers(0, 5),
+)
+@settings(deadline=None)
+def test_arrays_come_back_as_they_were(array, protocol):
+    content = {"a": array, "b": [array[None], ("text", 1.5, None, array.dtype.type(1))]}
+    back = load_pickled(pickle.dumps(content, protocol), "here")
+    np.testing.assert_array_equal(back["a"], array)
+    assert back["a"].dtype == array.dtype
+    np.testing.assert_array_equal(back["b"][0], array[None])
+    assert back["b"][1] == ("text", 1.5, None, array.dtype.type(1))
+
+
+@pytest.mark.parametrize(
+    ("evil", "named"),
+    [
+        (Runs(os.system, "touch PLACE"), "posix.system"),
+        (Runs(eval, "open('PLACE', 'w')"), "eval"),
+        (Runs(getattr, "", "join"), "getattr"),
+        (Runs(np.fromfile, "PLACE"), "fromfile"),
+        (Runs(np.save, "PLACE", 1), "numpy.save"),
+        (Runs(bytearray, 10), "bytearray"),
+        (Runs(Path, "PLACE"), "pathlib"),
+    ],
+)
+def test_nothing_is_run(evil, named, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for content in (evil, [1, {"deep": (evil,)}], np.array([evil, None])):
+        for protocol in (0, 2, 4):
+            with pytest.raises(DataError, match=f"here: cannot be read as pickled arrays: it asks for .*{named}"):
+                load_pickled(pickle.dumps(content, protocol), "here")
+    assert not list(tmp_path.iterdir())
+
+
+def test_memory_is_not_claimed_by_name_alone():
+    with pytest.raises(DataError, match="cannot be read as pickled arrays"):
+        load_pickled(pickle.dumps(Runs(np.ndarray, (2**40,))), "here")
+    with pytest.raises(DataError, match="outside of itself"):
+        load_pickled(b"\x80\x04K\x01Q.", "here")
+
+
+@given(data=st.binary(max_size=200))
+@settings(deadline=None, max_examples=300)
+def test_noise_is_refused_or_harmless(data):
+    try:
+        load_pickled(data, "here")
+    except DataError as error:
+        assert str(error).startswith("here: ")  # noqa: PT017 - both ways are right
+
+
+@given(cut=st.integers(0, 2000), place=st.integers(0, 2000), value=st.integers(0, 255))
+@settings(deadline=None, max_examples=200)
+def test_damaged_rollouts_give_errors_or_finite_positions(tmp_path_factory, cut, place, value):
+    path = write(tmp_path_factory.mktemp("p") / "rollout_0.pkl", rollout())
+    data = bytearray(path.read_bytes())
+    data[place % len(data)] = value
+    path.write_bytes(data[: len(data) - (cut if cut < 50 else 0)])
+    found: list[Trajectory] = []
+    message = ""
+    try:
+        found = list(RolloutPickle().open(path, Options()).splits["test"])
+    except DataError as error:
+        message = str(error)
+    assert bool(found) != bool(message)
+    assert all(np.isfinite(item.position).all() for item in found)
+
+
+def test_a_rollout_becomes_a_trajectory_with_its_prediction(tmp_path):
+    content = rollout()
+    path = write(tmp_path / "rollout_test_0.pkl", content, 2)
+    notes = convert(path, tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    truth = np.concatenate([content["initial_positions"], content["ground_truth_rollout"]])
+    predicted = np.concatenate([content["initial_positions"], content["predicted_rollout"]])
+    np.testing.assert_array_equal(trajectory.position, truth)
+    np.testing.assert_array_equal(trajectory.fields["predicted_rollout"], predicted)
+    assert trajectory.particle_type.tolist() == [5, 5, 6, 3]
+    assert any("predicted_rollout" in note for note in notes)
+
+
+def test_what_is_no_rollout_says_what_is_missing(tmp_path):
+    path = write(tmp_path / "rollout_0.pkl", {"initial_positions": 1})
+    with pytest.raises(DataError, match=r"a rollout has initial_positions, ground_truth.*found initial_positions"):
+        convert(path, tmp_path / "out")
+    path = write(tmp_path / "rollout_0.pkl", rollout(particle_types=np.array([5, 5])))
+    with pytest.raises(DataError, match=r"rollout_0\.pkl: .*4 particles but particle_type has 2"):
+        convert(path, tmp_path / "out")
+
+
+def test_numbers_may_be_objects_but_nothing_else():
+    np.testing.assert_array_equal(numbers(np.array([1, 2.5, np.int64(3)], object), "here"), [1, 2.5, 3])
+    with pytest.raises(DataError, match="here: numbers are due, found objects such as str"):
+        numbers(np.array(["a", 1], object), "here")
+
+
+def test_recorded_rollout_equals_the_record_beside_it(recorded, tmp_path):
+    folder = recorded / "deepmind-sand-subset"
+    convert(folder / "rollout_test_s0.pkl", tmp_path / "rollout")
+    convert(folder / "test_sub.tfrecord", tmp_path / "record")
+    rolled = Split(tmp_path / "rollout" / "test.h5").whole(0)
+    record = Split(tmp_path / "record" / "test.h5").whole(0)
+    assert rolled.position.shape == (320, 256, 2)
+    np.testing.assert_array_equal(rolled.position, record.position[:320])
+    assert rolled.fields["predicted_rollout"].shape == (320, 256, 2)
