@@ -162,7 +162,7 @@ def _trajectory(content: dict[str, np.ndarray], material: int | None, path: Path
     types = content.pop("types", np.full(particles, -1 if material is None else material))
     if types.ndim != 1 or len(types) not in (particles, particles + wall.shape[1]):
         raise DataError(
-            f"{path}: types {types.shape} fit neither {particles} particles nor these and {wall.shape[1]} of the boundary."
+            f"{path}: types {types.shape} fit neither {particles} particles nor these and all of the boundary."
         )
     kinds = np.concatenate([types[-particles:], np.full(wall.shape[1], _BOUNDARY)]).astype(np.int64)
     gravity = content[_GRAVITY].astype(np.float64) if _GRAVITY in content else np.empty(0)

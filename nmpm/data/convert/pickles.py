@@ -89,13 +89,13 @@ def _no_bytes() -> bytes:
     return b""
 
 
-_BASICS: Mapping[tuple[str, str], Any] = {
+_BASICS: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NDARRAY,
     ("numpy", "dtype"): _Kind,
     ("_codecs", "encode"): _encoded,
     ("__builtin__", "bytes"): _no_bytes,
 }
-_ALLOWED = _BASICS | {
+_ALLOWED: Mapping[tuple[str, str], Any] = _BASICS | {
     (module, name): made
     for core in ("numpy.core", "numpy._core")
     for (module, name), made in {

@@ -19,6 +19,7 @@ from nmpm.errors import ConfigError, DataError
 
 STATED = "stated_statistics"
 MOVING_BOUNDARIES = "moving_boundaries"
+NOTES = "conversion"
 
 
 def detect(path: Path, formats: Sequence[Format]) -> Format:
@@ -111,9 +112,9 @@ def _write(source: Source, folder: Path) -> tuple[str, ...]:
             write_split(folder / f"{name}.h5", _watched(source.splits[name], seen, f"{name} split", advance))
             # Statistics are those of the first split, train where there is one.
             seen.statistics_done = True
-    metadata, notes = seen.concluded()
-    write_metadata(folder, metadata)
-    return (*source.notes, *notes)
+    metadata, odd = seen.concluded()
+    write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *odd]}))
+    return (*source.notes, *odd, *seen.outside())
 
 
 def _watched(
@@ -174,9 +175,10 @@ class _Seen:
                 " positions are kept; to train on them, declare which types are static (--static)."
             )
         length = self.metadata.sequence_length or max(self.frames, default=2) - 1
-        return replace(self.metadata, extra=extra, sequence_length=length), notes + self._outside() + self._lengths()
+        return replace(self.metadata, extra=extra, sequence_length=length), notes + self._lengths()
 
-    def _outside(self) -> list[str]:
+    def outside(self) -> list[str]:
+        """Where positions leave the stated bounds."""
         if self.lower is None or self.upper is None:
             return []
         stated_low, stated_high = np.asarray(self.metadata.bounds).T

@@ -1,0 +1,174 @@
+"""`nmpm inspect PATH`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nmpm.cli.options import add_data_options, data_options
+from nmpm.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from nmpm.data.convert import Options
+    from nmpm.data.inspection import Inspection
+    from nmpm.data.inspection.facts import Range
+    from nmpm.data.origins import Folder
+
+_WIDTH = 100
+_EXAMPLES = """\
+examples:
+  nmpm inspect ramps                                   a dataset in the native layout
+  nmpm inspect datasets/WaterRamps                     any format that nmpm convert reads
+  nmpm inspect waterdrop --family deepmind --gravity 0,-9.81
+  nmpm inspect ramps --json | jq .grids
+"""
+
+
+def run(words: list[str]) -> None:
+    """Run the command, e.g. ["inspect", "ramps"]."""
+    parser = argparse.ArgumentParser(
+        prog="nmpm inspect",
+        description="Say on one screen what a dataset holds and what is odd about it, and draw a picture of it.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON, draw nothing")
+    parser.add_argument("--trajectories", type=int, metavar="N", help="look at N of each split (default: 256 MiB)")
+    parser.add_argument("--out", type=Path, help="the picture (default: inspect-NAME.png)")
+    parser.add_argument("--no-picture", action="store_true", help="draw none")
+    add_data_options(parser)
+    chosen = parser.parse_args(words[1:])
+    if chosen.trajectories is not None and chosen.trajectories < 1:
+        raise ConfigError(f"--trajectories {chosen.trajectories}: at least 1 is needed.")
+    from nmpm.data.inspection import inspect
+
+    origin = _origin(chosen.path, data_options(chosen))
+    found = replace(inspect(origin, chosen.trajectories), path=str(chosen.path))
+    if chosen.json:
+        sys.stdout.write(json.dumps(found.to_dict(), indent=1) + "\n")
+        return
+    sys.stdout.write("\n".join(lines(found)) + "\n")
+    if chosen.no_picture:
+        return
+    try:
+        _draw(origin, found, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
+    except DataError as error:
+        sys.stdout.write(f"\nno picture: {error}\n")
+
+
+def _origin(path: Path, options: Options) -> Folder:
+    from nmpm.data.convert.inplace import native_folder
+    from nmpm.data.origins import Folder, Stated
+
+    path = path.parent if path.suffix == ".h5" and path.is_file() else path
+    if options.types or options.static is not None or options.dt is not None:
+        return Folder(native_folder(path, options))
+    boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
+    return Folder(path, Stated(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]
+
+
+def lines(found: Inspection) -> Iterator[str]:
+    """The screen, line by line, at most 100 characters wide."""
+    yield f"{found.path}: {found.dim}-D, {found.dt:g} s between frames"
+    for name, split in found.splits.items():
+        trajectories = "trajectory" if split.trajectories == 1 else "trajectories"
+        looked = "" if split.inspected == split.trajectories else f" ({split.inspected} looked at)"
+        static = f" + {_span(split.static)} at rest" if split.static[1] else ""
+        yield (
+            f"  {name:<6}{split.trajectories:>5} {trajectories}{looked} of {_span(split.frames)} frames,"
+            f" {_span(split.particles)} particles{static}"
+        )
+    yield _labelled("materials", ", ".join(f"{name} ({_span(n)})" for name, n in found.materials.items()))
+    if found.fields:
+        yield _labelled("fields", ", ".join(f"{name} {shape}" for name, shape in found.fields.items()))
+    yield _labelled("varies", ", ".join(found.varies) or "nothing but the initial state")
+    yield _labelled("bounds", _box(found.stated_bounds) + " stated")
+    yield _labelled("", _box(found.observed) + " observed")
+    yield _labelled("domain", f"{_box(found.domain)} for a grid; {', '.join(found.boundary)}")
+    yield _labelled("gravity", _gravity(found))
+    yield _labelled(
+        "occupied", f"{100 * found.occupied:.2g}% of the domain, one trajectory {100 * found.occupied_each:.2g}%"
+    )
+    yield _labelled("at rest", _rest(found))
+    yield ""
+    yield "  grid          particles per    cells per frame"
+    yield "                occupied cell    median    99.9%      max"
+    for grid in found.grids:
+        mark = "  <- recommended" if grid.cells == found.recommended else ""
+        shape = " x ".join(map(str, grid.shape))
+        yield (
+            f"  {shape:<14}{grid.per_cell:>10.2f}    {grid.median_speed:>9.3f}{grid.high_speed:>9.2f}"
+            f"{grid.most_speed:>9.2f}{mark}"
+        )
+    for title, items in (("notes", found.notes), ("suspicious", found.findings or ("nothing found",))):
+        yield from _listed(title, items)
+
+
+def _labelled(label: str, text: str) -> str:
+    return f"  {label:<10}{text}"
+
+
+def _span(values: Range) -> str:
+    return str(values[0]) if values[0] == values[1] else f"{values[0]}-{values[1]}"
+
+
+def _box(box: Iterable[tuple[float, float]]) -> str:
+    return " x ".join(f"{low:.4g}…{high:.4g}" for low, high in box)
+
+
+def _gravity(found: Inspection) -> str:
+    seen = ", ".join(f"{value:.3g}" for value in found.first_acceleration)
+    if "gravity" in found.varies:
+        told = "differs between trajectories"
+    else:
+        told = "not stated" if found.gravity is None else ", ".join(f"{value:g}" for value in found.gravity)
+    return f"{told}; median acceleration in the first frames: {seen}"
+
+
+def _rest(found: Inspection) -> str:
+    if found.rest is None:
+        return "no trajectory comes to rest"
+    middle, first, last = found.rest
+    moving = f"; {found.restless} still move at their end" if found.restless else ""
+    return f"from frame {middle} on ({first}-{last}), {middle * found.dt:.3g} s{moving}"
+
+
+def _listed(title: str, items: Iterable[str]) -> Iterator[str]:
+    items = list(items)
+    if items:
+        yield ""
+        yield f"  {title}"
+    for item in items:
+        yield from textwrap.wrap(item, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+
+
+def _draw(origin: Folder, found: Inspection, path: Path) -> None:
+    import numpy as np
+
+    from nmpm.data.format import Split, split_paths
+    from nmpm.viz import Exhibit, material_names, snapshots
+
+    metadata = origin.metadata
+    trajectory = Split(next(iter(split_paths(origin.folder).values()))).read(0)
+    moving = np.isin(trajectory.particle_type, metadata.moving_types)
+    static = np.isin(trajectory.particle_type, list(metadata.static_types))
+    exhibit = Exhibit(
+        rows={"recorded": trajectory.position[:, moving]},
+        material=material_names(trajectory.particle_type[moving], metadata.particle_types),
+        bounds=origin.scene.bounds,
+        dt=metadata.dt,
+        domain=origin.scene.domain,
+        obstacle=trajectory.position[0, static],
+        periodic=origin.scene.periodic,
+        gravity=origin.scene.gravity,
+        title=f"{Path(found.path).name}, first trajectory",
+    )
+    snapshots(exhibit, path)
+    sys.stdout.write(f"\nwrote {path}\n")

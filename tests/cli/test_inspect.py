@@ -1,0 +1,57 @@
+import json
+
+import pytest
+from PIL import Image
+
+from nmpm.cli import main
+
+
+@pytest.fixture
+def dataset(make_dataset):
+    return make_dataset(train=((12, 40), (12, 50)), valid=(), test=((12, 45),), statics=4)
+
+
+def test_one_screen_and_a_picture(dataset, tmp_path, capsys):
+    assert main(["inspect", str(dataset), "--out", str(tmp_path / "look.png")]) == 0
+    said = capsys.readouterr().out
+    lines = said.splitlines()
+    assert len(lines) <= 45
+    assert max(map(len, lines)) <= 100
+    assert "train     2 trajectories of 12 frames, 40-50 particles + 4 at rest" in said
+    assert "<- recommended" in said
+    assert "nothing found" in said
+    with Image.open(tmp_path / "look.png") as picture:
+        assert min(picture.size) > 200
+
+
+def test_json_is_all_there_is_on_standard_output(dataset, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["inspect", str(dataset), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["splits"]["train"]["particles"] == [40, 50]
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_one_split_stands_for_its_dataset(dataset, capsys):
+    assert main(["inspect", str(dataset / "test.h5"), "--no-picture"]) == 0
+    assert "train     2 trajectories" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere"], "nowhere"),
+        ([".", "--trajectories", "0"], "--trajectories 0"),
+        ([".", "--gravity", "down"], "--gravity down"),
+    ],
+)
+def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["inspect", *words]) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_types_that_the_files_do_not_name_can_be_named(dataset, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    assert main(["inspect", str(dataset), "--types", "7=honey", "--no-picture"]) == 0
+    assert "honey (40-50)" in capsys.readouterr().out

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from nmpm.cli import main
+from nmpm.data.format import Split, read_metadata
+from nmpm.data.origins import Folder
+from nmpm.sim import preset_names
+
+
+def test_lists_every_scene(capsys):
+    assert main(["simulate", "--list"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in preset_names())
+    assert "1000/100/100" in said
+
+
+def test_makes_a_dataset_to_train_on(tmp_path, capsys):
+    words = ["simulate", "waterramps", "--train", "2", "--valid", "1", "--test", "0", "--frames", "3"]
+    assert main([*words, "--out", str(tmp_path / "ramps"), "--workers", "1"]) == 0
+    assert "wrote 2 train, 1 valid trajectories" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "ramps").glob("*.h5")) == ["train.h5", "valid.h5"]
+    origin = Folder(tmp_path / "ramps")
+    assert origin.scene.obstacles
+    assert origin.recordings("train")[0].obstacle.shape[0] > 0
+    extra = read_metadata(tmp_path / "ramps").extra
+    assert "Simulated by nmpm" in extra["note"]
+
+
+def test_the_same_call_gives_the_same_data_and_another_seed_other(tmp_path):
+    for out, seed in (("a", "3"), ("b", "3"), ("c", "4")):
+        words = ["simulate", "goop", "--train", "1", "--valid", "0", "--test", "0", "--frames", "2", "--seed", seed]
+        assert main([*words, "--out", str(tmp_path / out)]) == 0
+    a, b, c = (Split(tmp_path / out / "train.h5").read(0).position for out in "abc")
+    np.testing.assert_array_equal(a, b)
+    assert a.shape != c.shape or not np.array_equal(a, c)
+
+
+def test_a_scene_of_ones_own_starts_from_a_copy(tmp_path, capsys):
+    assert main(["simulate", "goop", "--show"]) == 0
+    text = capsys.readouterr().out
+    assert "# m / s²" in text
+    (tmp_path / "thick.yaml").write_text(text.replace("name: goop", "name: thick").replace("60.0 ", "90.0 "))
+    words = ["simulate", str(tmp_path / "thick.yaml"), "--train", "1", "--valid", "0", "--test", "0", "--frames", "1"]
+    assert main([*words, "--out", str(tmp_path / "thick")]) == 0
+    assert Folder(tmp_path / "thick").scene.materials == ("goop",)
+
+
+def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "sandramps", "--frames", "6", "--preview", "look.png"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["look.png"]
+    with Image.open("look.png") as picture:
+        assert min(picture.size) > 200
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["treacle"], "no preset or file treacle"),
+        (["goop", "--workers", "0"], "--workers 0"),
+        (["goop", "--train", "-1"], "may be negative"),
+        (["goop", "--frames", "0"], "frames = 0"),
+    ],
+)
+def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", *words]) == 1
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,112 @@
+"""What holds for every scene that ships, of whatever method."""
+
+import json
+
+import numpy as np
+import pytest
+
+from nmpm.errors import ConfigError
+from nmpm.sim import load_preset, preset_from_dict, preset_names
+from nmpm.sim.preset import BOUNDARY
+
+MPM = [name for name in preset_names() if load_preset(name).solver == "mls_mpm"]
+SIZES = {
+    "goop": (2000, 400),
+    "waterramps": (2300, 600),
+    "sandramps": (3300, 400),
+    "multimaterial": (2000, 1000),
+    "waterdrop": (1000, 1000),
+    "waterdrop-xl": (9000, 1000),
+    "dambreak2d": (5000, 400),
+    "wbcsph": (15000, 3200),
+}
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_survives_its_own_file(name):
+    preset = load_preset(name)
+    assert preset.name == name
+    assert preset_from_dict(json.loads(json.dumps(preset.to_dict()))) == preset
+
+
+@pytest.mark.parametrize(("name", "particles", "frames"), [(name, *size) for name, size in SIZES.items()])
+def test_sizes_are_those_of_the_paper(name, particles, frames):
+    preset = load_preset(name)
+    assert preset.frames == frames
+    most = preset.blocks.particles[1] if name in MPM else preset.start.most_particles(preset.spacing)
+    assert most == particles
+
+
+@pytest.mark.parametrize("name", MPM)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_every_mpm_scene_begins_well(name, seed):
+    preset = load_preset(name).lasting(4)
+    made = preset.simulate(seed)
+    moving, scene = made.particle_type != BOUNDARY, preset.scene
+    low, high = np.array(scene.bounds, np.float32).T
+    assert made.position.dtype == np.float32
+    assert np.all((made.position[:, moving] >= low) & (made.position[:, moving] <= high))
+    assert made.position.shape[1] <= preset.most_particles
+    assert scene.obstacles == (not moving.all())
+    assert np.array_equal(made.position[0, ~moving], made.position[-1, ~moving])
+    assert {preset.type_names[kind] for kind in made.particle_type[moving].tolist()} == set(scene.materials)
+    np.testing.assert_array_equal(preset.simulate(seed).position, made.position)
+    assert not np.array_equal(preset.simulate(seed + 7).position[0, :50], made.position[0, :50])
+    fall = np.array(made.attributes.get("gravity", scene.gravity)) * preset.frame_dt**2
+    second = np.median(np.diff(made.position[:3, moving].astype(float), n=2, axis=0), axis=(0, 1))
+    np.testing.assert_allclose(second, fall, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_particle_gets_into_a_ramp_or_out_of_the_box(seed):
+    preset = load_preset("waterramps").lasting(120)
+    rng = np.random.default_rng(seed)
+    from nmpm.sim.blocks import draw_start
+    from nmpm.sim.obstacles import distance
+
+    start = draw_start(preset, rng)
+    ramps = preset.ramps.draw(preset.box, start.extents, rng)
+    made = preset.simulate(seed)
+    moving = made.particle_type != BOUNDARY
+    assert distance(ramps, start.position).min() >= preset.ramps.gap
+    np.testing.assert_allclose(
+        made.position[0, ~moving], np.concatenate([ramp.particles(preset.spacing) for ramp in ramps]), atol=1e-7
+    )
+    nearest = min(distance(ramps, frame[moving].astype(float)).min() for frame in made.position)
+    assert nearest > 0
+    assert made.attributes["held_back"] == 0
+
+
+def test_gravity_turns_from_trajectory_to_trajectory():
+    preset = load_preset("variablegravity").lasting(1)
+    drawn = np.array([preset.simulate(seed).attributes["gravity"] for seed in range(6)])
+    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 9.81)
+    assert len(np.unique(drawn.round(6), axis=0)) == 6
+    assert preset.scene.gravity is None
+    assert preset.scene.gravity_varies
+
+
+def test_every_material_is_in_every_scene_of_several():
+    preset = load_preset("multimaterial").lasting(1)
+    for seed in range(5):
+        assert set(preset.simulate(seed).particle_type.tolist()) == {5, 6, 7}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gravity_turn": 200.0}, "gravity_turn"),
+        ({"gravity": [0.0, 0.0, -9.81]}, "gravity = .* needs 2 entries"),
+        ({"box": [[0.1, 0.9]]}, "1 axes; 2 or 3"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        preset_from_dict(load_preset("waterramps").to_dict() | changes)
+
+
+def test_ramps_must_be_thick_enough_for_the_grid():
+    plain = load_preset("waterramps").to_dict()
+    plain["ramps"]["thickness"] = 0.015
+    with pytest.raises(ConfigError, match=r"thickness must be at least 2 cells, 0\.02"):
+        preset_from_dict(plain)
