@@ -50,14 +50,14 @@ class Walls(enum.Enum):
 
 @dataclass(frozen=True)
 class Grid:
-    """Square cells that fill a box.
+    """Square cells, cubes in three dimensions, that fill a box.
 
     Args:
-        low: (2,) lower corner of the box, in length.
+        low: (D,) lower corner of the box, in length.
         size: Side of a cell, in length.
         shape: Cells along each axis.
         friction: Coulomb friction of the walls.
-        gravity: (2,) acceleration, in length per second squared.
+        gravity: (D,) acceleration, in length per second squared.
         walls: How the box's sides treat material.
         solid: Obstacles within the box, if any.
     """
@@ -72,44 +72,44 @@ class Grid:
 
 
 class State:
-    """Particles on the move, N of them, sorted by material.
+    """Particles on the move, N of them in D dimensions, sorted by material.
 
     Args:
-        position: (N, 2) in length.
-        velocity: (N, 2) in length per second.
+        position: (N, D) in length.
+        velocity: (N, D) in length per second.
         groups: Material and number of particles of each group, in the particles' order.
-        volume: Area of a particle at rest.
+        volume: Area of a particle at rest, or volume in three dimensions.
     """
 
     def __init__(
         self, position: NDArray[Any], velocity: NDArray[Any], groups: tuple[tuple[Material, int], ...], volume: float
     ) -> None:
-        count = len(position)
+        count, dim = position.shape
         self.position = np.array(position, dtype=np.float64, order="C")
         self.velocity = np.array(velocity, dtype=np.float64, order="C")
-        self.gradient: Array = np.zeros((count, 2, 2))
-        self.strain: Array = _at_rest(groups)
-        self.stress: Array = np.zeros((count, 3))
+        self.gradient: Array = np.zeros((count, dim, dim))
+        self.strain: Array = _at_rest(groups, dim)
+        self.stress: Array = np.zeros((count, dim * (dim + 1) // 2))
         self.volume = volume
         self.mass: Array = np.repeat([m.density * volume for m, _ in groups], [n for _, n in groups])
         ends = np.cumsum([0] + [n for _, n in groups])
         self.parts = tuple((m, slice(a, b)) for (m, _), a, b in zip(groups, ends[:-1], ends[1:], strict=True))
 
 
-def _at_rest(groups: tuple[tuple[Material, int], ...]) -> Array:
+def _at_rest(groups: tuple[tuple[Material, int], ...], dim: int) -> Array:
     """Strains of unstrained particles, as wide as the widest material's; the others leave the last columns alone."""
-    width = max(len(material.rest(2)) for material, _ in groups)
+    width = max(len(material.rest(dim)) for material, _ in groups)
     strain = np.zeros((sum(count for _, count in groups), width))
     first = 0
     for material, count in groups:
-        rest = material.rest(2)
+        rest = material.rest(dim)
         strain[first : first + count, : len(rest)] = rest
         first += count
     return strain
 
 
 class Stepper:
-    """Advances a state by substeps of one length.
+    """Advances a state of two dimensions by substeps of one length.
 
     Args:
         grid: Where the state lives.
@@ -123,7 +123,7 @@ class Stepper:
         """Particles held back at the box's sides so far, by the last safety that should never act."""
         self.pushed_out = 0
         """Particles put back to an obstacle's surface so far."""
-        self._nodes: Array = np.zeros((grid.shape[0] + 2, grid.shape[1] + 2, 3))
+        self._nodes: Array = np.zeros((*(cells + 2 for cells in grid.shape), len(grid.shape) + 1))
         self._lower = grid.low + _MARGIN * grid.size
         self._upper = grid.low + (np.array(grid.shape) - _MARGIN) * grid.size
         holds = grid.walls is not Walls.SEPARATE
@@ -149,26 +149,40 @@ class Stepper:
         Raises:
             FloatingPointError: if a position is no longer finite.
         """
-        grid, nodes, dt = self.grid, self._nodes, self.dt
+        grid, dt = self.grid, self.dt
         for material, part in state.parts:
             material.respond(state.strain[part], state.gradient[part], state.stress[part], dt)
-        _scatter(
-            nodes, grid.low, grid.size, dt * state.volume,
-            state.position, state.velocity, state.gradient, state.stress, state.mass,
-        )  # fmt: skip
+        self._to_nodes(state)
         before = None
         if grid.solid is not None:
             before = state.position.copy()
-            grid.solid.brake(nodes, dt * grid.gravity)
-        _move(nodes, dt * grid.gravity, grid.friction, *self._walls)
-        held_back = _gather(
-            nodes, grid.low, grid.size, dt, self._lower, self._upper, state.position, state.velocity, state.gradient
-        )
+            grid.solid.brake(self._nodes, dt * grid.gravity)
+        self._move()
+        held_back = self._from_nodes(state)
         if held_back < 0:
             raise FloatingPointError("The state is not finite")
         self.held_back += held_back
         if grid.solid is not None and before is not None:
             self.pushed_out += grid.solid.push_out(before, state.position, state.velocity, self._lower, self._upper)
+
+    def _to_nodes(self, state: State) -> None:
+        """Mass and momentum onto the nodes."""
+        _scatter(
+            self._nodes, self.grid.low, self.grid.size, self.dt * state.volume,
+            state.position, state.velocity, state.gradient, state.stress, state.mass,
+        )  # fmt: skip
+
+    def _move(self) -> None:
+        """Momenta to velocities, under gravity and the walls."""
+        _move(self._nodes, self.dt * self.grid.gravity, self.grid.friction, *self._walls)
+
+    def _from_nodes(self, state: State) -> int:
+        """Velocities and their gradients from the nodes, and the move they make; see `_gather`."""
+        held_back: int = _gather(
+            self._nodes, self.grid.low, self.grid.size, self.dt, self._lower, self._upper,
+            state.position, state.velocity, state.gradient,
+        )  # fmt: skip
+        return held_back
 
 
 @compiled

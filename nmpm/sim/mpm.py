@@ -13,13 +13,14 @@ from nmpm.errors import ConfigError, DataError
 from nmpm.sim.blocks import draw_start
 from nmpm.sim.gravity import turned
 from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
+from nmpm.sim.mls_mpm_3d import Stepper3d
 from nmpm.sim.mpm_preset import MpmPreset
 from nmpm.sim.obstacles import Ramp, distance
 from nmpm.sim.preset import BOUNDARY
 from nmpm.sim.solid import Solid
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
-STEPPERS = {2: Stepper}
+STEPPERS: dict[int, type[Stepper]] = {2: Stepper, 3: Stepper3d}
 
 
 def simulate(preset: MpmPreset, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:

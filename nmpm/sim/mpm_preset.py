@@ -135,8 +135,12 @@ class MpmPreset(Preset):
                 f"cells = {self.cells} along x make {cells:.3f} from {low} to {high}, not a whole number.",
             )
         require(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
-        flat = self.dim == 2 or (self.ramps is None and not self.gravity_turn)
-        require(flat, "ramps and gravity_turn are known in two dimensions, not in three.")
+        flat = self.dim == 2 or (
+            self.ramps is None and not self.gravity_turn and self.walls != Walls.OPEN_CORNERS.value
+        )
+        require(flat, "ramps, gravity_turn and open corners are known in two dimensions, not in three.")
+        for material in self.materials:
+            material.rest(self.dim)
         thinnest = THINNEST * self.cell_size
         require(
             self.ramps is None or self.ramps.thickness >= thinnest,
