@@ -29,6 +29,13 @@ WAITING = "[_TrainingEpochLoop].train_dataloader_next"
 REPEATS = 5
 
 
+class QuietProfiler(SimpleProfiler):
+    """Keeps its table to itself."""
+
+    def summary(self) -> str:
+        return ""
+
+
 def buffer_rate(data: TrajectoryDataModule, batches: int = 40) -> list[float]:
     """Windows per second out of a filled buffer, several times."""
     rates = []
@@ -44,7 +51,7 @@ def buffer_rate(data: TrajectoryDataModule, batches: int = 40) -> list[float]:
 
 def waiting(data: TrajectoryDataModule, steps: int) -> dict[str, float]:
     """A training's rate and the share of its time in which it waited for a batch; the first batch is not counted."""
-    profiler = SimpleProfiler()
+    profiler = QuietProfiler()
     model = EmulatorModule(data.scene, frames=FRAMES, unroll=UNROLL, processor=UNet(width=32, perceptron=(32,)))
     trainer = Trainer(
         max_steps=steps,
