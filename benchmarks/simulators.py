@@ -32,9 +32,7 @@ def rate(preset: MpmPreset, workers: int, seed: int) -> float:
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "names", nargs="*", default=[n for n in preset_names() if isinstance(load_preset(n), MpmPreset)]
-    )
+    parser.add_argument("names", nargs="*", help="presets (default: all of the method's)")
     parser.add_argument("--frames", type=int, default=60, help="of each trajectory (default: 60)")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path, help="write the figures to this file")

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.options import add_data_options, data_options
+from nmpm.cli.options import add_data_options, data_options, new_ids
 
 _DESCRIPTION = """\
 Bring a dataset of another format into the native layout (LagrangeBench's HDF5 files with a metadata.json).
@@ -23,6 +23,7 @@ examples:
   nmpm convert datasets/WaterRamps water                 DeepMind's TFRecords
   nmpm convert flume/test.npz flume --types 1=debris --bounds 0.02:1,0:0.2
   nmpm convert heated-channel channel --family jax-sph --boundary periodic,wall
+  nmpm convert ramps ramps-for-lagrangebench --ids 5=0,3=1      0 fluid and 1 wall, as LagrangeBench numbers them
 """
 
 
@@ -40,8 +41,10 @@ def run(words: list[str]) -> None:
     parser.add_argument("source", type=Path, help="file or folder to read")
     parser.add_argument("destination", type=Path, help="folder to write; must not exist yet, or be empty")
     parser.add_argument("--format", metavar="NAME", help="format of the source, where it is not recognised")
+    parser.add_argument("--ids", metavar="OLD=NEW,...", help="new type ids in what is written, e.g. 5=0,3=1")
     add_data_options(parser)
     chosen = parser.parse_args(words[1:])
-    for note in convert(chosen.source, chosen.destination, chosen.format, data_options(chosen)):
+    options, ids = data_options(chosen), new_ids(chosen.ids)
+    for note in convert(chosen.source, chosen.destination, chosen.format, options, ids):
         sys.stdout.write(f"- {note}\n")
     sys.stdout.write(f"wrote {chosen.destination}; to look at it: nmpm inspect {chosen.destination}\n")

@@ -46,6 +46,20 @@ def data_options(chosen: argparse.Namespace) -> Options:
     )
 
 
+def new_ids(text: str | None) -> dict[int, int] | None:
+    """The pairs of `--ids`.
+
+    Raises:
+        ConfigError: if they cannot be read.
+    """
+    pairs: dict[int, int] | None = _parsed("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
+    return pairs
+
+
+def _pairs(text: str) -> dict[int, int]:
+    return {number: int(name) for number, name in _names(text).items()}
+
+
 def _parsed(flag: str, text: str | None, parse: Callable[[str], Any], wanted: str) -> Any:
     if text is None:
         return None

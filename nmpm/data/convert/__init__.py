@@ -5,6 +5,7 @@ A format is one class in one file; `FORMATS` lists them in the order in which th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from nmpm.data.convert.base import Format as Format
@@ -16,6 +17,7 @@ from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.pickles import RolloutPickle
+from nmpm.data.convert.renumber import renumbered
 from nmpm.data.convert.run import detect, named, write_source
 
 FORMATS: tuple[Format, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
@@ -38,7 +40,11 @@ def open_source(path: Path, format_name: str | None = None, options: Options | N
 
 
 def convert(
-    source: Path, destination: Path, format_name: str | None = None, options: Options | None = None
+    source: Path,
+    destination: Path,
+    format_name: str | None = None,
+    options: Options | None = None,
+    ids: Mapping[int, int] | None = None,
 ) -> tuple[str, ...]:
     """Converts a dataset of any format into the native layout, all of it or nothing.
 
@@ -47,6 +53,7 @@ def convert(
         destination: A folder that does not exist yet, or is empty.
         format_name: Name of the source's format; found out when left out.
         options: What the files leave open.
+        ids: New particle type ids by old ones, for whoever reads the result; those not named stay.
 
     Returns:
         What was taken for what, and what is odd, as sentences.
@@ -55,4 +62,5 @@ def convert(
         DataError: if the source is missing, damaged or of no known format, or the destination is taken.
         ConfigError: if there is no such format, or an option cannot be.
     """
-    return write_source(open_source(source, format_name, options), destination)
+    opened = open_source(source, format_name, options)
+    return write_source(renumbered(opened, ids) if ids else opened, destination)

@@ -117,6 +117,23 @@ class TestNative:
             for index in range(len(old)):
                 np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
 
+    def test_types_are_renumbered_for_the_next_reader(self, make_dataset, tmp_path):
+        folder = make_dataset(statics=2)
+        convert(folder, tmp_path / "out", ids={7: 0, 3: 1})
+        metadata = read_metadata(tmp_path / "out")
+        assert metadata.particle_types == {0: "goop", 1: "boundary"}
+        assert metadata.static_types == {1}
+        assert Split(tmp_path / "out" / "train.h5").particle_type(0).tolist() == [0] * 5 + [1] * 2
+
+    @pytest.mark.parametrize(
+        ("ids", "message"),
+        [({5: 0}, "no particle type 5"), ({7: 0, 3: 0}, "the same id"), ({7: 3}, "type 3 occurs, and its id")],
+    )
+    def test_renumbering_loses_no_type(self, make_dataset, tmp_path, ids, message):
+        with pytest.raises(ConfigError, match=message):
+            convert(make_dataset(statics=2), tmp_path / "out", ids=ids)
+        assert not (tmp_path / "out").exists()
+
     def test_fields_and_periodic_axes_survive(self, recorded, tmp_path):
         options = Options(family="jax-sph", periodic=(True, False), dt=0.04545)
         convert(recorded / "jaxsph-heated-channel-2d", tmp_path / "channel", options=options)

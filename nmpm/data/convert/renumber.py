@@ -1,0 +1,53 @@
+"""Other type ids, for whoever reads the files next: LagrangeBench knows 0 fluid and 1 wall, for example."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from nmpm.data.convert.base import Reread, Source
+from nmpm.data.format import Trajectory
+from nmpm.errors import ConfigError
+
+
+def renumbered(source: Source, ids: Mapping[int, int]) -> Source:
+    """The same dataset with other particle type ids; names and what is static go along.
+
+    Args:
+        source: The dataset.
+        ids: New ids by old ones; those that are not named stay.
+
+    Raises:
+        ConfigError: if two types would have the same id, or there is no type of an id.
+    """
+    metadata = source.metadata
+    unknown = sorted(set(ids) - set(metadata.particle_types))
+    if unknown:
+        known = ", ".join(f"{i} {name}" for i, name in sorted(metadata.particle_types.items()))
+        raise ConfigError(f"There is no particle type {', '.join(map(str, unknown))}; there are {known}.")
+    # A name that nothing bears gives way to one that is asked for.
+    kept = {i: name for i, name in metadata.particle_types.items() if i in ids or i not in ids.values()}
+    types = {ids.get(i, i): name for i, name in kept.items()}
+    if len(types) < len(kept):
+        raise ConfigError(f"{dict(ids)} gives two particle types the same id.")
+    static = frozenset(ids.get(i, i) for i in metadata.static_types if i in kept)
+    return replace(
+        source,
+        metadata=replace(metadata, particle_types=types, static_types=static),
+        splits={name: Reread(partial(_each, split, ids, kept)) for name, split in source.splits.items()},
+    )
+
+
+def _each(split: Iterable[Trajectory], ids: Mapping[int, int], kept: Mapping[int, str]) -> Iterator[Trajectory]:
+    for trajectory in split:
+        old = trajectory.particle_type
+        lost = sorted(set(np.unique(old).tolist()) - set(kept))
+        if lost:
+            raise ConfigError(f"Particle type {lost[0]} occurs, and its id is given to another; give it a new one.")
+        new = old.copy()
+        for before, after in ids.items():
+            new[old == before] = after
+        yield replace(trajectory, particle_type=new)
