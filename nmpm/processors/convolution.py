@@ -13,16 +13,32 @@ TRANSPOSED: dict[int, Callable[..., nn.Module]] = {1: nn.ConvTranspose1d, 2: nn.
 
 
 class Convolution(nn.Module):
-    """A convolution that keeps the grid's size, or divides it by `stride` where its kernel is 2 * stride wide."""
+    """A convolution that keeps the grid's size, or divides it by `stride` where its kernel is 2 * stride wide.
+
+    Args:
+        in_channels: C.
+        out_channels: C'.
+        kernel: Cells along each axis.
+        periodic: Whether each axis wraps.
+        stride: Cells from one output to the next.
+        groups: Channels are mixed within groups only; C for a convolution of each channel by itself.
+    """
 
     def __init__(
-        self, in_channels: int, out_channels: int, kernel: int, periodic: Sequence[bool], stride: int = 1
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel: int,
+        periodic: Sequence[bool],
+        stride: int = 1,
+        groups: int = 1,
     ) -> None:
         super().__init__()
         pad = (kernel - stride + 1) // 2
         self.padding = _circular_padding(periodic, pad)
         zeros = tuple(0 if wraps else pad for wraps in periodic)
-        self.convolution = CONVOLUTIONS[len(periodic)](in_channels, out_channels, kernel, stride, zeros)
+        kind = CONVOLUTIONS[len(periodic)]
+        self.convolution = kind(in_channels, out_channels, kernel, stride, zeros, groups=groups)
 
     def forward(self, grid: Tensor) -> Tensor:
         """Map (B, C, *S) to (B, C', *S / stride)."""

@@ -18,6 +18,7 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import Convolution, Upsampling, pointwise
+from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
 
 
 @dataclass(frozen=True)
@@ -42,18 +43,7 @@ class UNet(Processor):
         return UNetNetwork(self, layout)
 
     def check_grid(self, grid: Grid) -> None:
-        multiple = 2**self.depth
-        if min(grid.shape) < multiple:
-            raise ConfigError(
-                f"A grid of {grid.shape} cells is too small for a U-Net of depth {self.depth}, which halves it "
-                f"{self.depth} times: use at least {multiple} cells along each axis, or a smaller depth."
-            )
-        for axis, (cells, wraps) in enumerate(zip(grid.shape, grid.periodic, strict=True)):
-            if wraps and cells % multiple:
-                raise ConfigError(
-                    f"Axis {axis} is periodic, so its {cells} cells must be a multiple of {multiple} for a U-Net of "
-                    f"depth {self.depth}; the nearest is {round(cells / multiple) * multiple or multiple}."
-                )
+        check_multiple(grid, 2**self.depth, f"a U-Net of depth {self.depth}")
 
 
 class UNetNetwork(GridProcessor):
@@ -75,7 +65,7 @@ class UNetNetwork(GridProcessor):
 
     def forward(self, grid: Tensor) -> Tensor:
         shape = grid.shape[2:]
-        hidden = self.encoder(_pad_to_multiple(grid, self.multiple))
+        hidden = self.encoder(pad_to_multiple(grid, self.multiple))
         skips = []
         for convolve, coarsen in zip(self.down, self.coarsen, strict=False):
             skips.append(_activate(convolve(hidden)))
@@ -87,25 +77,8 @@ class UNetNetwork(GridProcessor):
             if level > 0:
                 hidden = _activate(self.refine[level - 1](hidden))
         fields = torch.stack([decoder(hidden) for decoder in self.decoders], dim=2)
-        return _cropped(fields, shape)
+        return cropped(fields, shape, first=3)
 
 
 def _activate(hidden: Tensor) -> Tensor:
     return functional.leaky_relu(hidden, inplace=True)
-
-
-def _cropped(fields: Tensor, shape: torch.Size) -> Tensor:
-    """The first cells of each space axis, (B, m, C, *shape)."""
-    for axis, cells in enumerate(shape, start=3):
-        fields = fields.narrow(axis, 0, cells) if fields.shape[axis] > cells else fields
-    return fields
-
-
-def _pad_to_multiple(grid: Tensor, multiple: int) -> Tensor:
-    """Extend each axis at its upper end to a multiple of cells, repeating the last one."""
-    for axis in range(2, grid.dim()):
-        missing = -grid.shape[axis] % multiple
-        if missing:
-            last = grid.narrow(axis, grid.shape[axis] - 1, 1)
-            grid = torch.cat([grid, last.expand(*grid.shape[:axis], missing, *grid.shape[axis + 1 :])], dim=axis)
-    return grid

@@ -3,7 +3,18 @@ import torch
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors import FNO, GridLayout, Pointwise, UNet
+from nmpm.processors import (
+    FFNO,
+    FNO,
+    TFNO,
+    Axial,
+    ConvNeXt,
+    GridLayout,
+    Identity,
+    Pointwise,
+    UNet,
+    UNetModern,
+)
 from nmpm.testing import ProcessorContract
 
 
@@ -13,6 +24,34 @@ class TestUNet(ProcessorContract):
 
 class TestFNO(ProcessorContract):
     recipe = FNO(modes=4, width=6, layers=2)
+
+
+class TestTFNO(ProcessorContract):
+    recipe = TFNO(modes=4, width=6, layers=2, rank=0.5)
+
+
+class TestFFNO(ProcessorContract):
+    recipe = FFNO(modes=4, width=6, layers=2)
+
+
+class TestUNetModern(ProcessorContract):
+    recipe = UNetModern(width=4, growth=(1, 2, 3))
+
+
+class TestUNetModernWithNorm(ProcessorContract):
+    recipe = UNetModern(width=4, growth=(1, 2), blocks=2, groups=2)
+
+
+class TestConvNeXt(ProcessorContract):
+    recipe = ConvNeXt(width=6, depth=2, kernel=5)
+
+
+class TestAxial(ProcessorContract):
+    recipe = Axial(width=16, layers=2, heads=2, patch=4)
+
+
+class TestIdentity(ProcessorContract):
+    recipe = Identity()
 
 
 class TestPointwise(ProcessorContract):
@@ -25,11 +64,42 @@ def test_unet_has_the_published_number_of_parameters(depth, parameters):
     assert sum(p.numel() for p in network.parameters()) == parameters
 
 
-def test_unet_commutes_with_shifts_along_a_periodic_axis():
-    network = UNet(width=6, depth=2, perceptron=(5,)).build(GridLayout(3, 2, 2, (True, False)))
-    grid = torch.randn(1, 3, 16, 12)
+SMALL = [
+    UNet(width=6, depth=2, perceptron=(5,)),
+    UNetModern(width=4, growth=(1, 2, 3)),
+    ConvNeXt(width=6, depth=2, kernel=5),
+    FNO(modes=4, width=6, layers=2),
+    FFNO(modes=4, width=6, layers=2),
+    Axial(width=16, layers=2, heads=2, patch=4),
+    Pointwise(hidden=(6,)),
+    Identity(),
+]
+
+
+@pytest.mark.parametrize("recipe", SMALL)
+@pytest.mark.parametrize("shape", [(16, 12), (8, 8, 12)])
+def test_commutes_with_shifts_along_a_periodic_axis(recipe, shape):
+    periodic = (True,) + (False,) * (len(shape) - 1)
+    network = recipe.build(GridLayout(3, 2, 2, periodic))
+    grid = torch.randn(1, 3, *shape)
     shifted = network(grid.roll(4, 2))
-    torch.testing.assert_close(shifted, network(grid).roll(4, 3), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(shifted, network(grid).roll(4, 3), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("recipe", SMALL)
+def test_a_box_twice_as_wide_is_a_grid_like_any_other(recipe):
+    network = recipe.build(GridLayout(3, 2, 2, (False, False)))
+    recipe.check_grid(Grid((32, 16), (0.0, 0.0), (1.0, 1.0), (False, False)))
+    assert network(torch.randn(1, 3, 32, 16)).shape == (1, 2, 2, 32, 16)
+
+
+@pytest.mark.parametrize("recipe", SMALL)
+def test_half_precision_stays_near_full_precision(recipe):
+    network, grid = recipe.build(GridLayout(3, 2, 2, (False, False))), torch.randn(2, 3, 16, 16)
+    full = network(grid)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = network(grid).float()
+    assert (half - full).abs().max() < 0.05 * full.abs().max() + 1e-6
 
 
 def test_pointwise_sees_only_its_own_cell():
@@ -49,7 +119,21 @@ def test_unet_refuses_a_grid_smaller_than_its_depth():
         UNet(depth=3).check_grid(Grid((20, 64), (0.0, 0.0), (1.0, 1.0), (True, False)))
 
 
-@pytest.mark.parametrize("recipe", [UNet(width=0), UNet(kernel=2), FNO(modes=0), FNO(padding=2.0)])
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        UNet(width=0),
+        UNet(kernel=2),
+        FNO(modes=0),
+        FNO(padding=2.0),
+        TFNO(rank=0.0),
+        FFNO(layers=0),
+        UNetModern(growth=()),
+        UNetModern(width=6, groups=4),
+        ConvNeXt(kernel=4),
+        Axial(width=30, heads=4),
+    ],
+)
 def test_impossible_hyperparameters_are_named(recipe):
     with pytest.raises(ConfigError, match=type(recipe).__name__):
         recipe.build(GridLayout(3, 2, 1, (False, False)))
