@@ -67,6 +67,15 @@ class ProcessorContract:
             for shape in self.shapes:
                 assert self.network(shape)(scale * torch.randn(1, 4, *shape)).isfinite().all()
 
+    def test_memory_format_does_not_matter(self) -> None:
+        for shape in self.shapes:
+            if len(shape) == 2:
+                network, grid = self.network(shape).eval(), torch.randn(2, 4, *shape)
+                plain = network(grid)
+                network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
+                last = network(grid.contiguous(memory_format=torch.channels_last))
+                torch.testing.assert_close(last, plain, rtol=1e-4, atol=1e-5)
+
     def test_weights_survive_saving(self) -> None:
         shape = self.shapes[0]
         first, grid = self.network(shape).eval(), torch.randn(1, 4, *shape)

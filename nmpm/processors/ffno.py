@@ -83,8 +83,10 @@ class Layer(nn.Module):
     def __init__(self, recipe: FFNO, dim: int) -> None:
         super().__init__()
         width = recipe.width
-        # Real and imaginary parts: complex parameters are poorly supported by optimisers and file formats.
-        weights = torch.randn(dim, recipe.modes, 2, width, width) * math.sqrt(1 / (2 * width))
+        self.dim, self.modes = dim, recipe.modes
+        # Real and imaginary parts: complex parameters are poorly supported by optimisers and file formats. Three axes,
+        # as those of four and five are taken for convolutions' by torch's memory formats.
+        weights = torch.randn(dim * recipe.modes, width * width, 2) * math.sqrt(1 / (2 * width))
         self.weight = nn.Parameter(weights)
         kind = CONVOLUTIONS[dim]
         wide = recipe.expansion * width
@@ -94,7 +96,7 @@ class Layer(nn.Module):
         """Map (B, C, *S) to the same shape."""
         with torch.autocast(hidden.device.type, enabled=False):
             full = hidden.float()
-            mixed = torch.stack([self._along(full, axis) for axis in range(len(self.weight))]).sum(0)
+            mixed = torch.stack([self._along(full, axis) for axis in range(self.dim)]).sum(0)
         out: Tensor = hidden + self.perceptron(mixed)
         return out
 
@@ -102,8 +104,9 @@ class Layer(nn.Module):
         """The lowest modes along one axis, mixed across channels, each with its own matrix."""
         moved = hidden.movedim((1, axis + 2), (-1, -2))
         spectrum = torch.fft.rfft(moved, dim=-2, norm="ortho")
-        kept = min(spectrum.shape[-2], self.weight.shape[1])
-        matrix = torch.view_as_complex(self.weight[axis, :kept].movedim(1, -1).contiguous())
+        kept, first = min(spectrum.shape[-2], self.modes), axis * self.modes
+        width = spectrum.shape[-1]
+        matrix = torch.view_as_complex(self.weight[first : first + kept]).unflatten(-1, (width, width))
         mixed = torch.einsum("...kc,kcd->...kd", spectrum[..., :kept, :], matrix)
         back: Tensor = torch.fft.irfft(mixed, n=moved.shape[-2], dim=-2, norm="ortho")
         return back.movedim((-1, -2), (1, axis + 2))
