@@ -15,13 +15,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nmpm.errors import ConfigError
+
 
 class Decoder(ABC):
     """What is known of the velocities of a bundle. Subclasses are stateless; all quantities in grid units."""
 
     @abstractmethod
     def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:
-        """The velocity that the bundle starts from and holds.
+        """The velocity (B, N, D) that the bundle starts from.
 
         Args:
             own: (B, N, D) the particles' own velocities at the bundle's start.
@@ -29,8 +31,22 @@ class Decoder(ABC):
         """
 
     @abstractmethod
-    def gained(self, gravity: Tensor, frame: int) -> Tensor:
-        """The velocity (B, D) that a known gravity (B, D) has added by `frame` (1 … m) of the bundle."""
+    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:
+        """The velocity (B, N, D) that is known for a frame.
+
+        Args:
+            carried: (B, N, D), from `carried`.
+            previous: (B, N, D) velocity of the frame before, `carried` for the first.
+            gravity: (B, 1, D) known acceleration.
+            frame: 1 … m.
+        """
+
+
+class _Held(Decoder):
+    """Decoders that hold what the bundle starts from, and let known gravity act on it."""
+
+    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
+        return carried + gravity * frame
 
 
 @dataclass(frozen=True)
@@ -40,23 +56,20 @@ class Absolute(Decoder):
     def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002 (nothing is known)
         return torch.zeros_like(own)
 
-    def gained(self, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
-        return torch.zeros_like(gravity)
+    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
+        return carried
 
 
 @dataclass(frozen=True)
-class Residual(Decoder):
+class Residual(_Held):
     """The network gives increments to the grid's current velocity u: v_i = u + i g + g2p(output_i)."""
 
     def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
         return smoothed
 
-    def gained(self, gravity: Tensor, frame: int) -> Tensor:
-        return gravity * frame
-
 
 @dataclass(frozen=True)
-class Flip(Decoder):
+class Flip(_Held):
     """The network gives increments to each particle's own velocity: v_i = v_0 + i g + g2p(output_i).
 
     Source: Brackbill & Ruppel, FLIP, J. Comput. Phys. 65 (1986): less smoothing than `Residual`, more noise.
@@ -65,5 +78,39 @@ class Flip(Decoder):
     def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
         return own
 
-    def gained(self, gravity: Tensor, frame: int) -> Tensor:
-        return gravity * frame
+
+@dataclass(frozen=True)
+class Blend(_Held):
+    """Between `Residual` and `Flip`: v_0 is mixed from each particle's own velocity and the grid's.
+
+    Source: Zhu & Bridson, Animating sand as a fluid, SIGGRAPH 2005: a little smoothing takes FLIP's noise away.
+
+    Args:
+        flip: Share of the particle's own velocity, from 0 to 1.
+
+    Raises:
+        ConfigError: if it is not within 0 and 1.
+    """
+
+    flip: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.flip <= 1:
+            raise ConfigError(f"Blend.flip = {self.flip} must be from 0 to 1.")
+
+    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:
+        return self.flip * own + (1 - self.flip) * smoothed
+
+
+@dataclass(frozen=True)
+class Acceleration(Decoder):
+    """The network gives accelerations beside the known gravity: v_i = v_{i-1} + g + g2p(output_i), v_0 the grid's.
+
+    Each frame's output acts where the particle is by then and stays with it, as forces do.
+    """
+
+    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
+        return smoothed
+
+    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
+        return previous + gravity

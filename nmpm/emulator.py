@@ -117,12 +117,12 @@ class Emulator(nn.Module):
 
     def _advect(self, particles: Particles, cells: Tensor, velocity: Tensor, state: Tensor, fields: Tensor) -> Bundle:
         material = particles.material
-        gravity = self.grid.to_cell_displacement(particles.gravity)
+        gravity = self.grid.to_cell_displacement(particles.gravity).unsqueeze(1)
         smoothed = self._gather(state[:, : fields.shape[2]], cells, material)
-        carried = self.decoder.carried(velocity, smoothed)
+        carried = velocity = self.decoder.carried(velocity, smoothed)
         path = []
         for frame, field in enumerate(fields.unbind(1), start=1):  # indexing would cost a zero-fill each, backwards
-            known = carried + self.decoder.gained(gravity, frame).unsqueeze(1)
+            known = self.decoder.known(carried, velocity, gravity, frame)
             step = known + self._gather(field, cells, material)
             arrived = self._confine(cells + step)
             velocity = arrived - cells
@@ -190,9 +190,11 @@ class Emulator(nn.Module):
         """(B, m, N, D) true velocities less what the decoder knows, in cells per frame."""
         steps = self.grid.to_cell_displacement(window.frames[:, 1:].diff(dim=1))[:, : self.frames]
         velocity = self.grid.to_cell_displacement(window.initial.velocity)
-        gravity = self.grid.to_cell_displacement(window.gravity)
-        known = [self.decoder.gained(gravity, frame) for frame in range(1, self.frames + 1)]
-        return steps - self.decoder.carried(velocity, velocity).unsqueeze(1) - torch.stack(known, 1).unsqueeze(2)
+        gravity = self.grid.to_cell_displacement(window.gravity).unsqueeze(1)
+        carried = self.decoder.carried(velocity, velocity)
+        before = [carried, *steps.unbind(1)]
+        known = [self.decoder.known(carried, before[frame - 1], gravity, frame) for frame in range(1, self.frames + 1)]
+        return steps - torch.stack(known, dim=1)
 
 
 def _nonzero(scale: Tensor) -> Tensor:

@@ -28,9 +28,7 @@ def grid_state(
         solid: (B, C_solid, *S).
     """
     membership = _membership(particles, len(scene.materials))
-    momentum = (membership.unsqueeze(-1) * velocity.unsqueeze(-2)).flatten(-2)
-    sums = transfer.p2g(torch.cat([momentum, membership], dim=-1), cells, grid)
-    momentum, count = sums.split([momentum.shape[-1], membership.shape[-1]], dim=1)
+    momentum, count = transfer.momentum(velocity, membership, cells, grid)
     mean = momentum / _positive(count).repeat_interleave(scene.dim, dim=1)
     volume = count * (scene.particle_volume / grid.cell_volume)
     parts = [mean, volume, solid]

@@ -50,6 +50,23 @@ class Transfer(ABC):
         summed = scatter(self.scatter_stencil(cells, grid), values, grid.size)
         return summed.transpose(1, 2).reshape(len(summed), -1, *grid.shape)
 
+    def momentum(self, velocity: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Momentum and number of particles of each material on the nodes, each particle of mass 1.
+
+        Args:
+            velocity: (B, N, D).
+            membership: (B, N, M), one at a particle's material and zero elsewhere; all zero for padding.
+            cells: (B, N, D).
+            grid: The grid.
+
+        Returns:
+            (B, M D, *S) momentum, all axes of a material together, and (B, M, *S) numbers.
+        """
+        momentum = (membership.unsqueeze(-1) * velocity.unsqueeze(-2)).flatten(-2)
+        sums = self.p2g(torch.cat([momentum, membership], dim=-1), cells, grid)
+        momentum, count = sums.split([momentum.shape[-1], membership.shape[-1]], dim=1)
+        return momentum, count
+
     def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Interpolate a grid field (B, C, *S) at `cells` (B, N, D), (B, N, C)."""
         return gather(self.gather_stencil(cells, grid), field.flatten(2).transpose(1, 2))

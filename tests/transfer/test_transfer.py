@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from nmpm.grid import Grid
 from nmpm.testing import TransferContract
-from nmpm.transfer import Linear, Nearest, Quadratic, gather
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic, gather
 
 
 class TestNearest(TransferContract):
@@ -19,6 +19,10 @@ class TestLinear(TransferContract):
 
 class TestQuadratic(TransferContract):
     transfer = Quadratic()
+
+
+class TestAffine(TransferContract):
+    transfer = Affine()
 
 
 @pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic()])

@@ -1,0 +1,114 @@
+import pytest
+import torch
+
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
+from nmpm.transfer import Affine, Quadratic
+
+EXACT = Affine(damping=0.0)
+GRIDS = (
+    Grid((9, 14), (0.0, 0.0), (0.1, 0.2), (False, False)),
+    Grid((8, 6), (-1.0, 3.0), (1.0, 1.0), (True, False)),
+    Grid((5, 7, 6), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (False, True, False)),
+)
+
+
+def scene(grid: Grid, per_cell: int = 6, materials: int = 2, seed: int = 0):
+    """Particles all over a grid, in float64: places, velocities and membership."""
+    generator = torch.Generator().manual_seed(seed)
+    count = per_cell * grid.size
+    cells = torch.rand(2, count, grid.dim, generator=generator, dtype=torch.float64) * torch.tensor(grid.shape)
+    velocity = torch.randn(2, count, grid.dim, generator=generator, dtype=torch.float64)
+    kind = torch.randint(materials, (2, count), generator=generator)
+    return cells, velocity, torch.nn.functional.one_hot(kind, materials).double()
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("transfer", [EXACT, Affine(), Quadratic()])
+def test_momentum_and_mass_are_conserved_everywhere(grid, transfer):
+    cells, velocity, membership = scene(grid)
+    cells = cells.clone()
+    cells[:, :4] = torch.tensor([[0.0], [-1.0], [1e6], [0.5]], dtype=torch.float64)
+    momentum, count = transfer.momentum(velocity, membership, cells, grid)
+    expected = (membership.unsqueeze(-1) * velocity.unsqueeze(-2)).flatten(-2).sum(1)
+    torch.testing.assert_close(momentum.flatten(2).sum(-1), expected, rtol=1e-10, atol=1e-9)
+    torch.testing.assert_close(count.flatten(2).sum(-1), membership.sum(1), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("grid", [GRIDS[0], Grid((5, 7, 6), (0.0,) * 3, (1.0,) * 3, (False,) * 3)])
+def test_linear_velocities_arrive_as_they_are(grid):
+    cells, _, membership = scene(grid, per_cell=12)
+    slope = torch.randn(grid.dim, grid.dim, dtype=torch.float64)
+    momentum, count = EXACT.momentum(cells @ slope.T + 1.5, membership, cells, grid)
+    mean = momentum.unflatten(1, (2, grid.dim)) / count.unsqueeze(2)
+    axes = [torch.arange(n, dtype=torch.float64) + 0.5 for n in grid.shape]
+    nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    wanted = (nodes @ slope.T + 1.5).movedim(-1, 0)[None, None].expand_as(mean)
+    inner = (..., *(slice(2, n - 2) for n in grid.shape))  # beyond, weights are folded at the walls
+    torch.testing.assert_close(mean[inner], wanted[inner], rtol=1e-8, atol=1e-8)
+    plain, count = Quadratic().momentum(cells @ slope.T + 1.5, membership, cells, grid)
+    smoothed = plain.unflatten(1, (2, grid.dim)) / count.unsqueeze(2)
+    assert (smoothed[inner] - wanted[inner]).abs().max() > 1e-2  # what the gradient mends
+
+
+def test_a_turning_disc_keeps_its_spin():
+    grid = Grid((24, 24), (0.0, 0.0), (1.0, 1.0), (False, False))
+    generator = torch.Generator().manual_seed(0)
+    place = 24 * torch.rand(1, 6000, 2, generator=generator, dtype=torch.float64)
+    place = place[:, ((place[0] - 12).norm(dim=-1) < 4)]
+    turning = torch.stack([-(place[..., 1] - 12), place[..., 0] - 12], dim=-1)
+    one = torch.ones(1, place.shape[1], 1, dtype=torch.float64)
+    centres = torch.arange(24, dtype=torch.float64) + 0.5 - 12
+    x, y = torch.meshgrid(centres, centres, indexing="ij")
+
+    def spin(transfer):
+        momentum, _ = transfer.momentum(turning, one, place, grid)
+        return (x * momentum[0, 1] - y * momentum[0, 0]).sum()
+
+    truth = (place - 12).square().sum()
+    # A quadratic kernel spreads each particle by a quarter of a cell² per axis, which a turning disc then carries.
+    spread = truth + 2 * 0.25 * place.shape[1]
+    assert spin(Affine()) == pytest.approx(spread.item(), rel=2e-3)
+    assert spin(Quadratic()) == pytest.approx(truth.item(), rel=1e-9)
+
+
+def test_padding_changes_nothing_and_order_does_not_matter():
+    grid = GRIDS[0]
+    cells, velocity, membership = scene(grid)
+    momentum, count = Affine().momentum(velocity, membership, cells, grid)
+    order = torch.randperm(cells.shape[1])
+    shuffled = Affine().momentum(velocity[:, order], membership[:, order], cells[:, order], grid)
+    torch.testing.assert_close(shuffled[0], momentum, rtol=1e-9, atol=1e-9)
+    more = [torch.cat([part, 7 * torch.ones_like(part[:, :3])], dim=1) for part in (velocity, cells)]
+    padded = torch.cat([membership, torch.zeros_like(membership[:, :3])], dim=1)
+    with_padding = Affine().momentum(more[0], padded, more[1], grid)
+    torch.testing.assert_close(with_padding[0], momentum, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(with_padding[1], count, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_few_particles_and_many_in_one_place_stay_finite(dtype):
+    grid = GRIDS[0]
+    for count, spread in ((0, 1.0), (1, 1.0), (2, 1e-9), (50, 0.0), (50, 1e-7)):
+        cells = 4.3 + spread * torch.rand(1, count, 2, dtype=dtype)
+        velocity = torch.randn(1, count, 2, dtype=dtype, requires_grad=True)
+        momentum, _ = Affine().momentum(velocity, torch.ones(1, count, 1, dtype=dtype), cells, grid)
+        momentum.sum().backward()
+        assert momentum.isfinite().all()
+        assert velocity.grad is not None
+        assert velocity.grad.isfinite().all()
+        assert count == 0 or momentum.abs().max() <= 10 * velocity.abs().sum()
+
+
+def test_gradients_are_right():
+    grid = Grid((4, 5), (0.0, 0.0), (1.0, 1.0), (False, True))
+    cells = 0.6 + 2.7 * torch.rand(1, 5, 2, dtype=torch.float64)
+    velocity = torch.randn(1, 5, 2, dtype=torch.float64, requires_grad=True)
+    cells.requires_grad_()
+    one = torch.ones(1, 5, 1, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda v, c: Affine().momentum(v, one, c, grid)[0], (velocity, cells))
+
+
+def test_negative_damping_is_refused():
+    with pytest.raises(ConfigError, match="damping"):
+        Affine(damping=-1.0)
