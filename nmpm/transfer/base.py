@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from nmpm.grid import Grid
+from nmpm.transfer.backends import add
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,7 @@ def scatter(stencil: Stencil, values: Tensor, size: int) -> Tensor:
     batch, count, channels = values.shape
     touches = stencil.node.shape[-1]
     source = (stencil.weight.unsqueeze(-1) * values.unsqueeze(2)).reshape(batch, count * touches, channels)
-    index = stencil.node.reshape(batch, count * touches, 1).expand(-1, -1, channels)
-    return values.new_zeros(batch, size, channels).scatter_add(1, index, source)
+    return add(source, stencil.node.reshape(batch, count * touches), size)
 
 
 def gather(stencil: Stencil, field: Tensor) -> Tensor:

@@ -1,0 +1,98 @@
+"""Ways to sum many values into few places: the one operation of p2g that hardware disagrees on how to do fast.
+
+All give the same sums to rounding. Which one runs is decided for each call: what `using` says, else `sorted` where
+torch is to be deterministic on a device whose own sum is not, else `native`. A backend is a function
+
+    add(source (B, L, C), index (B, L), size) -> (B, size, C)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+from nmpm.errors import ConfigError
+
+Add = Callable[[Tensor, Tensor, int], Tensor]
+
+
+def native(source: Tensor, index: Tensor, size: int) -> Tensor:
+    """Torch's own. On a CPU the same bits in every run and for any number of threads; on a GPU not."""
+    batch, _, channels = source.shape
+    everywhere = index.unsqueeze(-1).expand(-1, -1, channels)
+    return source.new_zeros(batch, size, channels).scatter_add(1, everywhere, source)
+
+
+def in_order(source: Tensor, index: Tensor, size: int) -> Tensor:
+    """Sorted by place, then summed one after the other: slower, and the same bits in every run on every device."""
+    batch, length, channels = source.shape
+    flat = (index + size * torch.arange(batch, device=index.device).unsqueeze(1)).flatten()
+    order = torch.sort(flat, stable=True).indices
+    counts = torch.bincount(flat, minlength=batch * size)
+    values = source.reshape(batch * length, channels)[order]
+    if not len(flat):
+        return source.new_zeros(batch, size, channels)
+    return torch.segment_reduce(values, "sum", lengths=counts, axis=0, initial=0.0).reshape(batch, size, channels)
+
+
+def by_torch_scatter(source: Tensor, index: Tensor, size: int) -> Tensor:
+    """The package torch-scatter's.
+
+    Raises:
+        ConfigError: if it is not installed, or made for another torch.
+    """
+    try:
+        import torch_scatter
+    except (ImportError, OSError) as error:
+        raise ConfigError(
+            "The backend torch-scatter needs the package, compiled for this torch: pip install setuptools && pip "
+            f"install --no-build-isolation torch-scatter==2.1.2 ({error})."
+        ) from error
+    summed: Tensor = torch_scatter.scatter(source, index, dim=1, dim_size=size, reduce="sum")
+    return summed
+
+
+BACKENDS: Mapping[str, Add] = MappingProxyType(
+    {"native": native, "sorted": in_order, "torch-scatter": by_torch_scatter}
+)
+
+_chosen: ContextVar[Add | None] = ContextVar("nmpm_transfer_backend", default=None)
+
+
+@contextmanager
+def using(name: str) -> Iterator[None]:
+    """Sums by one backend within a `with` block.
+
+    Args:
+        name: "native", "sorted" or "torch-scatter".
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    if name not in BACKENDS:
+        raise ConfigError(f"No transfer backend is called {name!r}; there are {', '.join(BACKENDS)}.")
+    token = _chosen.set(BACKENDS[name])
+    try:
+        yield
+    finally:
+        _chosen.reset(token)
+
+
+def add(source: Tensor, index: Tensor, size: int) -> Tensor:
+    """Sum values into places.
+
+    Args:
+        source: (B, L, C) values.
+        index: (B, L) int64 place of each, from 0 to size - 1.
+        size: Number of places.
+
+    Returns:
+        (B, size, C).
+    """
+    fallback = in_order if source.is_cuda and torch.are_deterministic_algorithms_enabled() else native
+    return (_chosen.get() or fallback)(source, index, size)
