@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from nmpm.decoders import Decoder, Residual
+from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.processors import GridLayout, Processor, UNet
@@ -90,6 +91,35 @@ class Emulator(nn.Module):
         lower, spacing = torch.tensor(self.grid.lower).double(), torch.tensor(self.grid.spacing).double()
         self.register_buffer("bounds", ((limits.T - lower) / spacing).float(), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
+
+    def over(self, scene: Scene) -> Emulator:
+        """The same emulator in another box: a copy of weights and statistics, on a grid with cells of the same size.
+
+        Args:
+            scene: Other bounds and domain, perhaps obstacles where there were walls already; all else must be the same.
+
+        Raises:
+            ConfigError: if channels, time step or the sizes of particles differ, the domain is not a whole number of
+                cells, or the processor cannot take the grid.
+        """
+        mine = self.scene
+        for name in ("input_channels", "dt", "particle_volume", "boundary", "gravity"):
+            if getattr(scene, name) != getattr(mine, name):
+                raise ConfigError(
+                    f"The emulator was made for {name} = {getattr(mine, name)}; the other scene has"
+                    f" {getattr(scene, name)}."
+                )
+        sides = [(high - low) / h for (low, high), h in zip(scene.domain, self.grid.spacing, strict=True)]
+        if any(abs(side - round(side)) > 1e-4 for side in sides):
+            raise ConfigError(
+                f"The domain {scene.domain} is {[round(side, 4) for side in sides]} cells of the emulator's grid"
+                f" {self.grid.spacing}; whole numbers are needed."
+            )
+        cells = [round(side) for side in sides]
+        other = Emulator(scene, cells, self.frames, self.transfer, self.recipe, self.decoder, self.grid_noise)
+        other.load_state_dict(self.state_dict())
+        other.to(self.calibrated.device)
+        return other.train(self.training)
 
     def solid(self, particles: Particles) -> Tensor:
         """What of each cell is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1. Once per scene, not per step."""

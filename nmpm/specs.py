@@ -1,7 +1,8 @@
 """Recipes as plain data, so that checkpoints and zoo entries can rebuild what they hold without unpickling anything.
 
 A spec is `{"class_path": ..., "init_args": {...}}`, as in the configuration files. Reading one never imports a module
-that the file names: a class is known if `nmpm` ships it or if the program has already imported it.
+that the file names: a class is known if `nmpm` ships it, if an installed package offers it as a plugin (see
+`nmpm.plugins`), or if the program has already imported it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any, TypeVar
 
 from nmpm.errors import ConfigError
 from nmpm.plain import listed, tupled
+from nmpm.plugins import load_plugins
 
 T = TypeVar("T")
 
@@ -42,8 +44,11 @@ def from_spec(spec: object, base: type[T]) -> T:
         return spec
     if not isinstance(spec, Mapping) or "class_path" not in spec:
         raise ConfigError(f"Expected a {base.__name__} or its class_path and init_args; got {spec!r}.")
-    known = {_path(kind): kind for kind in _subclasses(base)}
     name = str(spec["class_path"])
+    known = {_path(kind): kind for kind in _subclasses(base)}
+    if name not in known:
+        load_plugins()
+        known = {_path(kind): kind for kind in _subclasses(base)}
     if name not in known:
         raise ConfigError(
             f"{base.__name__} {name!r} is not known. Known are {', '.join(sorted(known))}. If it is yours, import its "

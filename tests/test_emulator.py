@@ -6,6 +6,7 @@ from scenes import box, cloud
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator
+from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
 from nmpm.processors import Pointwise, UNet
 from nmpm.rollouts import rollout, stream, unroll
@@ -233,3 +234,38 @@ def test_scenes_without_particles_are_fine():
     emulator = small(scene)
     assert rollout(emulator, cloud(scene, count=0), 3).shape == (1, 3, 0, 2)
     assert rollout(emulator, cloud(scene, count=1), 3).isfinite().all()
+
+
+WIDE = {"bounds": ((0.1, 1.74), (0.1, 0.9)), "domain": ((0.08, 1.76), (0.08, 0.92))}
+
+
+def test_over_the_same_scene_it_is_the_same():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    torch.testing.assert_close(rollout(emulator.over(scene), particles, 6), rollout(emulator, particles, 6))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_over_a_wider_box_what_is_far_from_the_walls_moves_as_before(dim):
+    scene = box(dim)
+    wide = box(dim, **{key: (*value, *value[1:] * (dim - 2)) for key, value in WIDE.items()})
+    emulator, particles = small(scene, processor=Pointwise(hidden=(4,))), cloud(scene)
+    other = emulator.over(wide)
+    assert other.grid.shape == (32,) + (16,) * (dim - 1)
+    torch.testing.assert_close(rollout(other, particles, 5), rollout(emulator, particles, 5), atol=1e-6, rtol=0)
+    shifted = particles.moved(particles.position + torch.tensor([0.84] + [0.0] * (dim - 1)), particles.velocity)
+    moved = rollout(other, shifted, 5) - torch.tensor([0.84] + [0.0] * (dim - 1))
+    torch.testing.assert_close(moved, rollout(emulator, particles, 5), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dt": 0.01}, "made for dt = 0.0025; the other scene has 0.01"),
+        ({"materials": ("sand",)}, "input_channels"),
+        ({"domain": ((0.08, 0.95), (0.08, 0.92))}, "whole numbers are needed"),
+    ],
+)
+def test_over_another_kind_of_scene_is_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        small(box()).over(box(**changes))

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
 from nmpm.export import PredictionWriter
+from nmpm.plugins import load_plugins
 from nmpm.report import Report
 from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule
@@ -96,6 +97,7 @@ class EmulatorCLI(LightningCLI):
 
 def run(words: list[str]) -> None:
     """Run a training command, e.g. ["fit", "--config", "goop.yaml"]."""
+    load_plugins()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
     sys.argv = [sys.argv[0], *_with_shipped_configs(words)]
