@@ -67,6 +67,20 @@ class ProcessorContract:
             for shape in self.shapes:
                 assert self.network(shape)(scale * torch.randn(1, 4, *shape)).isfinite().all()
 
+    def test_half_precision_stays_near_full_precision(self) -> None:
+        for shape in self.shapes:
+            network, grid = self.network(shape).eval(), torch.randn(2, 4, *shape)
+            full = network(grid)
+            with torch.autocast("cpu", torch.bfloat16):
+                half = network(grid).float()
+            assert (half - full).abs().max() < 0.05 * full.abs().max() + 1e-6
+
+    def test_exports_as_a_program_that_computes_the_same(self) -> None:
+        for shape in self.shapes:
+            network, grid = self.network(shape).eval(), torch.randn(1, 4, *shape)
+            program = torch.export.export(network, (grid,)).module()
+            torch.testing.assert_close(program(grid), network(grid), rtol=1e-5, atol=1e-6)
+
     def test_memory_format_does_not_matter(self) -> None:
         for shape in self.shapes:
             if len(shape) == 2:
