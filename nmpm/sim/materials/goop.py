@@ -17,18 +17,18 @@ Hencky elasticity with a return in principal strains: Klár et al., "Drucker-Pra
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from nmpm.errors import ConfigError
 from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array, Material
+from nmpm.sim.materials.base import Array
+from nmpm.sim.materials.elastic import PlaneStrainSolid
 
 
 @dataclass(frozen=True)
-class Goop(Material):
+class Goop(PlaneStrainSolid):
     """Elasto-viscoplastic goop.
 
     Args:
@@ -45,42 +45,15 @@ class Goop(Material):
     name: ClassVar[str] = "goop"
     particle_type: ClassVar[int] = 7
 
-    density: float
-    young: float
-    poisson: float
     yield_stress: float
     viscosity: float
 
     def __post_init__(self) -> None:
-        for key in ("density", "young", "viscosity"):
-            if not 0 < getattr(self, key) < math.inf:
-                raise ConfigError(f"goop.{key} = {getattr(self, key)} must be positive and finite.")
+        super().__post_init__()
+        if not 0 < self.viscosity < math.inf:
+            raise ConfigError(f"goop.viscosity = {self.viscosity} must be positive and finite.")
         if not 0 <= self.yield_stress < math.inf:
             raise ConfigError(f"goop.yield_stress = {self.yield_stress} must not be negative.")
-        if not 0 <= self.poisson < 0.5:
-            raise ConfigError(f"goop.poisson = {self.poisson} must be at least 0 and below 0.5.")
-
-    def to_dict(self) -> dict[str, float]:
-        return dataclasses.asdict(self)
-
-    @property
-    def shear_modulus(self) -> float:
-        """μ, in Pa."""
-        return self.young / (2 * (1 + self.poisson))
-
-    @property
-    def bulk_modulus(self) -> float:
-        """λ + μ, the stiffness against a change of area in plane strain, in Pa."""
-        return self.shear_modulus / (1 - 2 * self.poisson)
-
-    @property
-    def wave_speed(self) -> float:
-        return math.sqrt((self.bulk_modulus + self.shear_modulus) / self.density)
-
-    def rest(self, dim: int) -> tuple[float, ...]:
-        if dim != 2:
-            raise ConfigError(f"goop is known in two dimensions, not in {dim}.")
-        return 1.0, 0.0, 1.0
 
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         remaining = math.exp(-self.shear_modulus * dt / self.viscosity)

@@ -20,18 +20,18 @@ that volume in a number of its own, and match the cone to triaxial tests, which 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from nmpm.errors import ConfigError
 from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array, Material
+from nmpm.sim.materials.base import Array
+from nmpm.sim.materials.elastic import PlaneStrainSolid
 
 
 @dataclass(frozen=True)
-class Sand(Material):
+class Sand(PlaneStrainSolid):
     """Dry sand in two dimensions.
 
     Args:
@@ -47,41 +47,12 @@ class Sand(Material):
     name: ClassVar[str] = "sand"
     particle_type: ClassVar[int] = 6
 
-    density: float
-    young: float
-    poisson: float
     friction_angle: float
 
     def __post_init__(self) -> None:
-        for key in ("density", "young"):
-            if not 0 < getattr(self, key) < math.inf:
-                raise ConfigError(f"sand.{key} = {getattr(self, key)} must be positive and finite.")
-        if not 0 <= self.poisson < 0.5:
-            raise ConfigError(f"sand.poisson = {self.poisson} must be at least 0 and below 0.5.")
+        super().__post_init__()
         if not 0 <= self.friction_angle < 90:
             raise ConfigError(f"sand.friction_angle = {self.friction_angle} must be at least 0 and below 90 degrees.")
-
-    def to_dict(self) -> dict[str, float]:
-        return dataclasses.asdict(self)
-
-    @property
-    def shear_modulus(self) -> float:
-        """μ, in Pa."""
-        return self.young / (2 * (1 + self.poisson))
-
-    @property
-    def bulk_modulus(self) -> float:
-        """λ + μ, the stiffness against a change of area in plane strain, in Pa."""
-        return self.shear_modulus / (1 - 2 * self.poisson)
-
-    @property
-    def wave_speed(self) -> float:
-        return math.sqrt((self.bulk_modulus + self.shear_modulus) / self.density)
-
-    def rest(self, dim: int) -> tuple[float, ...]:
-        if dim != 2:
-            raise ConfigError(f"sand is known in two dimensions, not in {dim}.")
-        return 1.0, 0.0, 1.0
 
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         friction = math.sin(math.radians(self.friction_angle))
