@@ -15,6 +15,7 @@ from nmpm.sim.mls_mpm import REVISION, Walls
 from nmpm.sim.obstacles import Ramps
 from nmpm.sim.preset import BOUNDARY, Preset, built, checked, require
 from nmpm.sim.solid import THINNEST
+from nmpm.sim.thrown import Thrown
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
 CFL_LIMIT = 0.9
@@ -22,17 +23,10 @@ CFL_LIMIT = 0.9
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """How the initial state is drawn; lengths in metres.
+class Blocks(Thrown):
+    """How the initial state is drawn: `Thrown`, and where to.
 
     Args:
-        number: Least and most blocks in a scene.
-        particles: Least and most particles in a scene.
-        share: Least part of the particles in one block.
-        aspect: Least and largest height over width.
-        gap: Least distance between blocks, and from the box's sides.
-        speed: Largest initial velocity along each axis, in length per second.
-        jitter: Largest displacement of a particle off the lattice along each axis, in spacings.
         height: Least and largest height of a block above the box's bottom, where the gap leaves it; anywhere when
             left out.
 
@@ -40,24 +34,12 @@ class Blocks:
         ConfigError: if a range is empty or out of reach.
     """
 
-    number: tuple[int, int]
-    particles: tuple[int, int]
-    share: float
-    aspect: tuple[float, float]
-    gap: float
-    speed: float
-    jitter: float
     height: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        for key in ("number", "particles", "aspect"):
-            low, high = getattr(self, key)
-            require(0 < low <= high, f"blocks.{key} = {[low, high]} needs two positive numbers, the lower first.")
-        require(0 < self.share * self.number[1] <= 1, f"blocks.share = {self.share} is too large for the blocks.")
-        require(0 <= self.jitter < 0.5, f"blocks.jitter = {self.jitter} must be at least 0 and below 0.5.")
+        super().__post_init__()
         low, high = self.height or (0.0, 0.0)
         require(0 <= low <= high, f"blocks.height = {self.height} needs two numbers, the lower first.")
-        require(self.gap >= 0 and self.speed >= 0, "blocks.gap and blocks.speed must not be negative.")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from nmpm.sim.materials.base import Array
 from nmpm.sim.preset import require
 from nmpm.sim.sph.relaxation import relaxed
 from nmpm.sim.sph.walls import LAYERS, Obstacle
+from nmpm.sim.thrown import Thrown
 
 Box = tuple[Interval, Interval]
 
@@ -83,37 +84,8 @@ class Column(Start):
 
 
 @dataclass(frozen=True)
-class Throw(Start):
-    """Rectangular blocks of water, thrown; what of them would be inside of obstacles is left out.
-
-    Args:
-        number: Least and most blocks.
-        particles: Of all blocks together, before obstacles cut into them: least and most.
-        share: Least part of the particles in one block.
-        aspect: Least and largest height over width.
-        gap: Least distance between blocks, and from the box's sides, in length.
-        speed: Largest initial velocity along each axis, in length per second.
-        jitter: Largest displacement of a particle off the lattice along each axis, in spacings.
-
-    Raises:
-        ConfigError: if a range is empty or out of reach.
-    """
-
-    number: tuple[int, int]
-    particles: tuple[int, int]
-    share: float
-    aspect: tuple[float, float]
-    gap: float
-    speed: float
-    jitter: float
-
-    def __post_init__(self) -> None:
-        for key in ("number", "particles", "aspect"):
-            low, high = getattr(self, key)
-            require(0 < low <= high, f"blocks.{key} = {[low, high]} needs two positive numbers, the lower first.")
-        require(0 < self.share * self.number[1] <= 1, f"blocks.share = {self.share} is too large for the blocks.")
-        require(0 <= self.jitter < 0.5, f"blocks.jitter = {self.jitter} must be at least 0 and below 0.5.")
-        require(self.gap >= 0 and self.speed >= 0, "blocks.gap and blocks.speed must not be negative.")
+class Throw(Thrown, Start):
+    """Rectangular blocks of water, thrown; what of them would be inside of obstacles is left out."""
 
     def draw(
         self, box: Box, spacing: float, obstacles: tuple[Obstacle, ...], rng: np.random.Generator
