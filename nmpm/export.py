@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.callbacks import BasePredictionWriter
 from torch import Tensor
 
 from nmpm.data.families import FAMILIES
-from nmpm.data.format import Trajectory, write_split
-from nmpm.particles import Particles, Window
+from nmpm.data.format import Trajectory
+from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.version import __version__
 
@@ -46,34 +42,6 @@ def predicted_trajectory(scene: Scene, state: Particles, predicted: Tensor, mode
     }
     ids = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
     return Trajectory(np.concatenate([position, resting], axis=1), ids, attributes)
-
-
-class PredictionWriter(BasePredictionWriter):
-    """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder, a file per process if several."""
-
-    def __init__(self) -> None:
-        super().__init__(write_interval="batch")
-        self._made: list[Trajectory] = []
-
-    def write_on_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        prediction: Any,
-        batch_indices: Any,  # noqa: ARG002
-        batch: Window,
-        batch_idx: int,  # noqa: ARG002
-        dataloader_idx: int,  # noqa: ARG002
-    ) -> None:
-        scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]
-        source = f"{trainer.ckpt_path or 'the model'}"
-        for index in range(len(prediction)):
-            self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
-
-    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        rank = f"_{trainer.global_rank}" if trainer.world_size > 1 else ""
-        write_split(Path(trainer.default_root_dir) / f"predictions{rank}.h5", self._made)
-        self._made = []
 
 
 def _type_ids(scene: Scene) -> dict[int, str]:

@@ -15,8 +15,8 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
-from nmpm.export import PredictionWriter
 from nmpm.plugins import load_plugins
+from nmpm.prediction_writer import PredictionWriter
 from nmpm.report import Report
 from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule

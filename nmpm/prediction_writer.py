@@ -1,0 +1,42 @@
+"""The callback behind `nmpm predict`; apart from `nmpm.export`, as Lightning takes seconds to import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
+
+from nmpm.data.format import Trajectory, write_split
+from nmpm.export import predicted_trajectory
+from nmpm.particles import Window
+from nmpm.scene import Scene
+
+
+class PredictionWriter(BasePredictionWriter):
+    """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder, a file per process if several."""
+
+    def __init__(self) -> None:
+        super().__init__(write_interval="batch")
+        self._made: list[Trajectory] = []
+
+    def write_on_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        prediction: Any,
+        batch_indices: Any,  # noqa: ARG002
+        batch: Window,
+        batch_idx: int,  # noqa: ARG002
+        dataloader_idx: int,  # noqa: ARG002
+    ) -> None:
+        scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]
+        source = f"{trainer.ckpt_path or 'the model'}"
+        for index in range(len(prediction)):
+            self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        rank = f"_{trainer.global_rank}" if trainer.world_size > 1 else ""
+        write_split(Path(trainer.default_root_dir) / f"predictions{rank}.h5", self._made)
+        self._made = []
