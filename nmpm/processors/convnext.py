@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
 from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
+from nmpm.processors.ushape import UShape, doubled
 
 
 @dataclass(frozen=True)
@@ -57,23 +57,19 @@ class ConvNeXtNetwork(GridProcessor):
         def level() -> nn.Sequential:
             return nn.Sequential(*(Block(recipe, periodic) for _ in range(recipe.blocks)))
 
+        kind = CONVOLUTIONS[layout.dim]
         self.first = Convolution(layout.in_channels, width, 3, periodic)
-        self.down = nn.ModuleList(level() for _ in range(depth + 1))
-        self.coarsen = nn.ModuleList(Convolution(width, width, 4, periodic, stride=2) for _ in range(depth))
-        self.up = nn.ModuleList(level() for _ in range(depth))
-        self.refine = nn.ModuleList(CONVOLUTIONS[layout.dim](width, width, 1) for _ in range(depth))
-        self.last = CONVOLUTIONS[layout.dim](width, layout.frames * layout.out_channels, 1)
+        self.levels = UShape(
+            down=[level() for _ in range(depth + 1)],
+            coarsen=[Convolution(width, width, 4, periodic, stride=2) for _ in range(depth)],
+            up=[level() for _ in range(depth)],
+            refine=[nn.Sequential(kind(width, width, 1), doubled()) for _ in range(depth)],
+        )
+        self.last = kind(width, layout.frames * layout.out_channels, 1)
 
     def forward(self, grid: Tensor) -> Tensor:
-        shape = grid.shape[2:]
-        hidden = self.down[0](self.first(pad_to_multiple(grid, self.multiple)))
-        skips: list[Tensor] = []
-        for coarsen, level in zip(self.coarsen, list(self.down)[1:], strict=True):
-            skips.append(hidden)
-            hidden = level(coarsen(hidden))
-        for refine, level in zip(self.refine, self.up, strict=True):
-            hidden = level(skips.pop() + functional.interpolate(refine(hidden), scale_factor=2.0, mode="nearest"))
-        out: Tensor = cropped(self.last(hidden), shape).unflatten(1, (self.frames, -1))
+        hidden = self.levels(self.first(pad_to_multiple(grid, self.multiple)))
+        out: Tensor = cropped(self.last(hidden), grid.shape[2:]).unflatten(1, (self.frames, -1))
         return out
 
 

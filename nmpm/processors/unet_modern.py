@@ -18,6 +18,7 @@ from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
 from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
+from nmpm.processors.ushape import UShape, doubled
 
 
 @dataclass(frozen=True)
@@ -68,24 +69,20 @@ class UNetModernNetwork(GridProcessor):
             return nn.Sequential(*(ResidualBlock(width, kernel, periodic, recipe.groups) for _ in range(recipe.blocks)))
 
         self.first = Convolution(layout.in_channels, widths[0], kernel, periodic)
-        self.down = nn.ModuleList(level(width) for width in widths)
-        self.coarsen = nn.ModuleList(
-            Convolution(fine, coarse, 4, periodic, stride=2) for fine, coarse in pairwise(widths)
+        self.levels = UShape(
+            down=map(level, widths),
+            coarsen=[Convolution(fine, coarse, 4, periodic, stride=2) for fine, coarse in pairwise(widths)],
+            up=map(level, widths[:-1]),
+            refine=[
+                nn.Sequential(doubled(), Convolution(coarse, fine, kernel, periodic))
+                for fine, coarse in pairwise(widths)
+            ],
         )
-        self.up = nn.ModuleList(level(width) for width in widths[:-1])
-        self.refine = nn.ModuleList(Convolution(coarse, fine, kernel, periodic) for fine, coarse in pairwise(widths))
         self.last = CONVOLUTIONS[layout.dim](widths[0], layout.frames * layout.out_channels, 1)
 
     def forward(self, grid: Tensor) -> Tensor:
-        shape = grid.shape[2:]
-        hidden = self.down[0](self.first(pad_to_multiple(grid, self.multiple)))
-        skips: list[Tensor] = []
-        for coarsen, level in zip(self.coarsen, list(self.down)[1:], strict=True):
-            skips.append(hidden)
-            hidden = level(coarsen(hidden))
-        for refine, level in zip(reversed(self.refine), reversed(self.up), strict=True):
-            hidden = level(skips.pop() + refine(functional.interpolate(hidden, scale_factor=2.0, mode="nearest")))
-        out: Tensor = cropped(self.last(functional.gelu(hidden)), shape).unflatten(1, (self.frames, -1))
+        hidden = self.levels(self.first(pad_to_multiple(grid, self.multiple)))
+        out: Tensor = cropped(self.last(functional.gelu(hidden)), grid.shape[2:]).unflatten(1, (self.frames, -1))
         return out
 
 
