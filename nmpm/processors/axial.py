@@ -68,11 +68,11 @@ class AxialNetwork(GridProcessor):
 
     def forward(self, grid: Tensor) -> Tensor:
         shape = grid.shape[2:]
-        cells = functional.gelu(self.cells(pad_to_multiple(grid, self.patch)))
+        cells = functional.silu(self.cells(pad_to_multiple(grid, self.patch)))
         hidden = self.embed(cells)
         for layer in self.layers:
             hidden = layer(hidden)
-        joined = functional.gelu(self.join(torch.cat([cells, self.back(hidden)], dim=1)))
+        joined = functional.silu(self.join(torch.cat([cells, self.back(hidden)], dim=1)))
         out: Tensor = cropped(self.last(joined), shape).unflatten(1, (self.frames, -1))
         return out
 
@@ -88,7 +88,7 @@ class Layer(nn.Module):
             Attention(width, recipe.heads, axis, wraps) for axis, wraps in enumerate(periodic)
         )
         self.norms = nn.ModuleList(ChannelNorm(width, dim) for _ in range(dim + 1))
-        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.GELU(), kind(wide, width, 1))
+        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (B, C, *S) to the same shape."""

@@ -82,7 +82,7 @@ class Block(nn.Module):
         kind = CONVOLUTIONS[len(periodic)]
         self.spatial = Convolution(width, width, recipe.kernel, periodic, groups=width)
         self.norm = ChannelNorm(width, len(periodic))
-        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.GELU(), kind(wide, width, 1))
+        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (B, C, *S) to the same shape."""
@@ -103,6 +103,5 @@ class ChannelNorm(nn.Module):
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (B, C, *S) to the same shape."""
         # In float32, as squares of half precision overflow; the floor keeps empty cells at zero.
-        full = hidden.float()
-        inverse = (full.square().mean(dim=1, keepdim=True) + 1e-6).rsqrt()
-        return (full * inverse).to(hidden.dtype) * self.scale
+        inverse = (hidden.float().square().mean(dim=1, keepdim=True) + 1e-6).rsqrt()
+        return hidden * inverse.to(hidden.dtype) * self.scale

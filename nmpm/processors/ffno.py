@@ -62,7 +62,7 @@ class FFNONetwork(GridProcessor):
         self.layers = nn.ModuleList(Layer(recipe, layout.dim) for _ in range(recipe.layers))
         self.last = nn.Sequential(
             kind(recipe.width, 2 * recipe.width, 1),
-            nn.GELU(),
+            nn.SiLU(),
             kind(2 * recipe.width, layout.frames * layout.out_channels, 1),
         )
 
@@ -90,7 +90,7 @@ class Layer(nn.Module):
         self.weight = nn.Parameter(weights)
         kind = CONVOLUTIONS[dim]
         wide = recipe.expansion * width
-        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.GELU(), kind(wide, width, 1))
+        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (B, C, *S) to the same shape."""
