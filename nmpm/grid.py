@@ -15,8 +15,10 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
+
+_COARSEST = 1 / 16  # of a cell: positions known no better than that are useless
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,24 @@ class Grid:
         """Positions (..., D) in domain length → cells from the lower corner, float32.
 
         The origin is taken off in the positions' own precision, so that float64 input far from 0 keeps its digits.
+
+        Raises:
+            DataError: if that precision is too coarse so far from 0.
         """
+        self._check_precision(position.dtype)
         return ((position - position.new_tensor(self.lower)) / position.new_tensor(self.spacing)).float()
+
+    def _check_precision(self, dtype: torch.dtype) -> None:
+        """Refuse positions whose floating-point numbers lie further apart than a part of a cell."""
+        for axis, (low, n, h) in enumerate(zip(self.lower, self.shape, self.spacing, strict=True)):
+            reach = max(abs(low), abs(low + n * h))
+            step = torch.finfo(dtype).eps * 2.0 ** math.floor(math.log2(reach)) if reach > 0 else 0.0
+            if step > _COARSEST * h:
+                name = str(dtype).removeprefix("torch.")
+                raise DataError(
+                    f"{name} numbers have a spacing of {step:g} near {reach:g}, where axis {axis} of the domain ends,"
+                    f" and a cell is {h:g} wide: give positions in float64, or move the origin into the domain."
+                )
 
     def to_cell_displacement(self, displacement: Tensor) -> Tensor:
         """Displacements (..., D) in domain length → cells, float32."""
