@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator import Bundle, Emulator
+from nmpm.errors import DataError
 from nmpm.particles import Particles
+from nmpm.scene import Scene
 
 
 def unroll(emulator: Emulator, particles: Particles, bundles: int) -> Iterator[Bundle]:
@@ -26,6 +28,39 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int) -> Iterator[B
         particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
 
+def check_state(scene: Scene, particles: Particles) -> None:
+    """Refuse a state that a rollout could only spread or hide.
+
+    Args:
+        scene: What it should be a state of.
+        particles: The state.
+
+    Raises:
+        DataError: naming scene, particle and value, if a position or velocity is not finite, or a position beyond the
+            domain's walls.
+    """
+    real = particles.mask
+    for name in ("position", "velocity"):
+        values: Tensor = getattr(particles, name)
+        bad = ~values.isfinite().all(-1) & real
+        if bad.any():
+            scene_index, particle = map(int, bad.nonzero()[0])
+            raise DataError(
+                f"Scene {scene_index} of the batch, particle {particle}: its {name} is"
+                f" {values[scene_index, particle].tolist()}; it must be finite."
+            )
+    lower, upper = particles.position.new_tensor(scene.domain).T
+    walls = torch.tensor([not wraps for wraps in scene.periodic], device=lower.device)
+    beyond = (((particles.position < lower) | (particles.position > upper)) & walls).any(-1) & real
+    if beyond.any():
+        scene_index, particle = map(int, beyond.nonzero()[0])
+        raise DataError(
+            f"Scene {scene_index} of the batch, particle {particle}: it is at"
+            f" {particles.position[scene_index, particle].tolist()}, outside of the domain {list(scene.domain)}"
+            f" ({int(beyond.sum())} particles are)."
+        )
+
+
 def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Tensor]:
     """Predict `frames` frames without gradients, handing out each bundle as it is made.
 
@@ -34,9 +69,11 @@ def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Te
 
     Raises:
         ValueError: if `frames` is negative.
+        DataError: if the state holds what is not a finite number, or a particle outside of the domain.
     """
     if frames < 0:
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
+    check_state(emulator.scene, particles)
     bundles = unroll(emulator, particles, -(-frames // emulator.frames))
     made = 0
     while made < frames:
@@ -54,6 +91,7 @@ def rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
 
     Raises:
         ValueError: if `frames` is negative.
+        DataError: if the state holds what is not a finite number, or a particle outside of the domain.
     """
     bundles = list(stream(emulator, particles, frames))
     if not bundles:

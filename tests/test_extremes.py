@@ -71,8 +71,8 @@ def test_faces_corners_bounds_and_a_hair_beyond(transfer):
     scene = box()
     places = [0.1, 0.9, 0.08, 0.92, _near(0.1, 0), _near(0.9, 1), _near(0.08, 0), _near(0.92, 1), -5.0, 7.0, 0.5]
     position = torch.cartesian_prod(torch.tensor(places), torch.tensor(places))
-    emulator = emulator_of(scene, transfer)
-    predicted = rollout(emulator, at(scene, position, 1e-3), 3)
+    emulator, particles = emulator_of(scene, transfer), at(scene, position, 1e-3)
+    predicted = emulator(particles, emulator.solid(particles)).position
     assert predicted.isfinite().all()
     assert predicted.min() >= 0.1 - 1e-6  # held at the bounds from the first frame on
     assert predicted.max() <= 0.9 + 1e-6
@@ -180,3 +180,34 @@ def test_half_precision_around_leaves_transfers_alone(dtype):
     assert half.dtype == torch.float32
     assert (half - full).abs().max() < 1e-2
     assert summed.sum().item() == pytest.approx(409700.0, rel=1e-5)
+
+
+class TestPoison:
+    @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+    @pytest.mark.parametrize("what", ["position", "velocity"])
+    def test_what_is_no_number_is_named_and_not_spread(self, bad, what):
+        scene = box()
+        particles = cloud(scene, batch=2)
+        values = getattr(particles, what).clone()
+        values[1, 3, 0] = bad
+        poisoned = dataclasses.replace(particles, **{what: values})
+        with pytest.raises(DataError, match=f"Scene 1 of the batch, particle 3: its {what} is"):
+            rollout(emulator_of(scene), poisoned, 2)
+
+    def test_particles_outside_are_named_and_not_clamped(self):
+        scene = box()
+        particles = cloud(scene)
+        position = particles.position.clone()
+        position[0, 5, 1] = 1.5
+        with pytest.raises(DataError, match=r"particle 5: it is at .* outside of the domain .* \(1 particles are\)"):
+            rollout(emulator_of(scene), particles.moved(position, particles.velocity), 2)
+
+    def test_padding_may_hold_anything(self):
+        scene = box()
+        particles = cloud(scene)
+        mask = particles.mask.clone()
+        mask[0, 5] = False
+        position = particles.position.clone()
+        position[0, 5] = 9.0
+        padded = dataclasses.replace(particles, position=position, mask=mask)
+        assert rollout(emulator_of(scene), padded, 2).isfinite().all()
