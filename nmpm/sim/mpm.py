@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim.blocks import draw_start
+from nmpm.sim.blocks import Start, draw_start
 from nmpm.sim.gravity import turned
 from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
 from nmpm.sim.mls_mpm_3d import Stepper3d
@@ -20,6 +20,7 @@ from nmpm.sim.preset import BOUNDARY
 from nmpm.sim.solid import Solid
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
+_ARRANGEMENTS = 20
 STEPPERS: dict[int, type[Stepper]] = {2: Stepper, 3: Stepper3d}
 
 
@@ -32,8 +33,7 @@ def simulate(preset: MpmPreset, seed: int, progress: Progress | None = None) -> 
     rng = np.random.default_rng(seed)
     try:
         gravity = turned(preset.gravity, preset.gravity_turn, rng)
-        start = draw_start(preset, rng)
-        ramps = preset.ramps.draw(preset.box, start.extents, rng) if preset.ramps is not None else ()
+        start, ramps = draw_scene(preset, rng)
         made = simulate_from(
             preset, start.position, start.velocity, preset.frames, start.counts, progress, gravity, ramps
         )
@@ -43,6 +43,23 @@ def simulate(preset: MpmPreset, seed: int, progress: Progress | None = None) -> 
     if preset.gravity_turn:
         made.attributes["gravity"] = np.array(gravity)
     return made
+
+
+def draw_scene(preset: MpmPreset, rng: np.random.Generator) -> tuple[Start, tuple[Ramp, ...]]:
+    """An initial state, and the ramps beside it.
+
+    Raises:
+        ConfigError: if no arrangement is found, so crowded is the box.
+    """
+    for _ in range(_ARRANGEMENTS):
+        start = draw_start(preset, rng)
+        if preset.ramps is None:
+            return start, ()
+        try:
+            return start, preset.ramps.draw(preset.box, start.extents, rng)
+        except ConfigError as error:  # These blocks leave no room; others may.
+            reason = error
+    raise reason
 
 
 def simulate_from(

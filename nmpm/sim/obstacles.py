@@ -13,7 +13,8 @@ from nmpm.scene import Interval
 from nmpm.sim.materials.base import Array
 from nmpm.sim.preset import require
 
-_ATTEMPTS = 10_000
+_STARTS = 20
+_ATTEMPTS = 500
 _OUTLINE = 96  # points on a bar's outline by which its distance from others is judged
 
 
@@ -113,6 +114,20 @@ class Ramps:
             ConfigError: if no arrangement is found, so crowded is the box.
         """
         number = int(rng.integers(self.number[0], self.number[1] + 1))
+        for _ in range(_STARTS):
+            placed = self._placed(number, box, occupied, rng)
+            if placed is not None:
+                return placed
+        raise ConfigError(f"No room for {number} ramps of ramps.length = {list(self.length)} within {box}.")
+
+    def _placed(
+        self,
+        number: int,
+        box: tuple[Interval, ...],
+        occupied: Sequence[tuple[Array, Array]],
+        rng: np.random.Generator,
+    ) -> tuple[Ramp, ...] | None:
+        """Bars placed one after the other, or None if the first ones leave no room for the others."""
         low, high = np.array(box).T
         placed: list[Ramp] = []
         for _ in range(_ATTEMPTS):
@@ -126,7 +141,7 @@ class Ramps:
             clear = all(other.distance(outline).min() >= self.gap for other in placed)
             if inside and clear and not any(_meet(drawn, corners, self.gap) for corners in occupied):
                 placed.append(drawn)
-        raise ConfigError(f"No room for {number} ramps of ramps.length = {list(self.length)} within {box}.")
+        return None
 
 
 def _meet(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:

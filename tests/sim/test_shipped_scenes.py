@@ -7,6 +7,8 @@ import pytest
 
 from nmpm.errors import ConfigError
 from nmpm.sim import load_preset, preset_from_dict, preset_names
+from nmpm.sim.mpm import draw_scene
+from nmpm.sim.obstacles import distance
 from nmpm.sim.preset import BOUNDARY
 
 MPM = [name for name in preset_names() if load_preset(name).solver == "mls_mpm"]
@@ -61,11 +63,7 @@ def test_every_mpm_scene_begins_well(name, seed):
 def test_no_particle_gets_into_a_ramp_or_out_of_the_box(seed):
     preset = load_preset("waterramps").lasting(120)
     rng = np.random.default_rng(seed)
-    from nmpm.sim.blocks import draw_start
-    from nmpm.sim.obstacles import distance
-
-    start = draw_start(preset, rng)
-    ramps = preset.ramps.draw(preset.box, start.extents, rng)
+    start, ramps = draw_scene(preset, rng)
     made = preset.simulate(seed)
     moving = made.particle_type != BOUNDARY
     assert distance(ramps, start.position).min() >= preset.ramps.gap
@@ -75,6 +73,19 @@ def test_no_particle_gets_into_a_ramp_or_out_of_the_box(seed):
     nearest = min(distance(ramps, frame[moving].astype(float)).min() for frame in made.position)
     assert nearest > 0
     assert made.attributes["held_back"] == 0
+
+
+@pytest.mark.parametrize("name", ["waterramps", "sandramps", "variablegravity"])
+def test_no_seed_is_left_without_a_scene(name):
+    preset = load_preset(name)
+    drawn = [draw_scene(preset, np.random.default_rng(seed)) for seed in (*range(150), 679165439898320322)]
+    assert {len(ramps) for _, ramps in drawn} == set(range(preset.ramps.number[0], preset.ramps.number[1] + 1))
+
+
+def test_no_seed_is_left_without_obstacles():
+    preset = load_preset("wbcsph")
+    drawn = [preset.obstacles.draw(preset.box, np.random.default_rng(seed)) for seed in range(300)]
+    assert {len(obstacles) for obstacles in drawn} == {1, 2, 3, 4}
 
 
 def test_gravity_turns_from_trajectory_to_trajectory():

@@ -20,6 +20,8 @@ from nmpm.sim.thrown import Thrown
 Box = tuple[Interval, Interval]
 
 _ATTEMPTS = 10_000
+_STARTS = 50
+_PLACES = 500
 
 
 class Start(abc.ABC):
@@ -164,9 +166,17 @@ class Strewn:
             ConfigError: if no arrangement is found, so crowded is the box.
         """
         number = int(rng.integers(self.number[0], self.number[1] + 1))
+        for _ in range(_STARTS):
+            placed = self._placed(number, box, rng)
+            if placed is not None:
+                return placed
+        raise ConfigError(f"No room for {number} obstacles of obstacles.size = {list(self.size)} within {box}.")
+
+    def _placed(self, number: int, box: Box, rng: np.random.Generator) -> tuple[Obstacle, ...] | None:
+        """Obstacles placed one after the other, or None if the first ones leave no room for the others."""
         low, high = np.array(box).T
         placed: list[tuple[Array, float, Obstacle]] = []
-        for _ in range(_ATTEMPTS):
+        for _ in range(_PLACES):
             if len(placed) == number:
                 return tuple(obstacle for _, _, obstacle in placed)
             corners = _turned(rng.uniform(*self.size, 2), rng)
@@ -177,7 +187,7 @@ class Strewn:
             centre = rng.uniform(low + keep, high - keep)
             if all(np.linalg.norm(centre - other) >= keep + size for other, size, _ in placed):
                 placed.append((centre, radius, Obstacle(centre + corners)))
-        raise ConfigError(f"No room for {number} obstacles of obstacles.size = {list(self.size)} within {box}.")
+        return None
 
 
 def _turned(size: Array, rng: np.random.Generator) -> Array:
