@@ -117,7 +117,10 @@ def _metadata(path: Path, known: _Published | None, first: Trajectory, options: 
 def _notes(path: Path, known: _Published | None, first: Trajectory, metadata: Metadata) -> list[str]:
     notes = []
     if known is not None:
-        notes.append(f"Taken for the published {path.resolve().name}: dt {metadata.dt:g}, bounds {metadata.bounds}.")
+        notes.append(
+            f"Taken for the published {path.resolve().name}: dt {metadata.dt:g}, bounds {metadata.bounds}, gravity"
+            f" {metadata.gravity or 'as each file states'}."
+        )
     else:
         notes.append("Bounds are the extent of the first trajectory; give --bounds if you know them.")
     wall = first.particle_type == _BOUNDARY

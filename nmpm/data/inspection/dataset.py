@@ -69,6 +69,8 @@ def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
             except DataError as error:
                 findings.append(str(error))
             advance()
+    if not np.isfinite(survey.observed).all():
+        raise DataError(f"{origin.folder}: none of its trajectories could be looked at. {findings[0]}")
     findings += disagreements(survey.statistics.result(), metadata.extra)
     findings += _lengths(tally, metadata)
     occupied, each = survey.occupied()

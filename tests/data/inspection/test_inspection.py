@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.data.inspection import Inspection, inspect
 from nmpm.data.origins import Folder, Stated
+from nmpm.errors import DataError
 from tests.conftest import made_up_metadata, made_up_trajectory
 
 UNIT = {"bounds": ((0.0, 1.0),) * 2, "domain": ((0.0, 1.0),) * 2, "particle_volume": 1e-4}
@@ -113,6 +114,14 @@ class TestFindings:
         assert any("trajectory 00001: position of particle 2 in frame 3" in finding for finding in found.findings)
         assert found.splits["train"].trajectories == 2
         assert found.grids[0].per_cell > 0  # the other trajectory was looked at
+
+    def test_nothing_that_can_be_read(self, tmp_path, run):
+        write_split(tmp_path / "train.h5", [run])
+        write_metadata(tmp_path, made_up_metadata())
+        with h5py.File(tmp_path / "train.h5", "a") as file:
+            file["00000"]["position"][0] = np.nan
+        with pytest.raises(DataError, match="none of its trajectories could be looked at"):
+            inspect(Folder(tmp_path))
 
     def test_outside_of_the_stated_domain(self, tmp_path, run):
         found = look(tmp_path, run, domain=((0.45, 0.92), (0.08, 0.92)), bounds=((0.5, 0.9), (0.1, 0.9)))
