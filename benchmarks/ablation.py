@@ -31,6 +31,7 @@ from omegaconf import OmegaConf
 from torch.utils.flop_counter import FlopCounterMode
 
 from nmpm.atomic import replacing
+from nmpm.calibration import calibrate
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.particles import Particles, Window
 from nmpm.plain import tupled
@@ -82,7 +83,10 @@ class Sweep:
 def module_of(config: Mapping[str, Any], scene: Any) -> EmulatorModule:
     """The untrained model of a configuration."""
     model = {key: value for key, value in config["model"].items() if key not in ("optimizer", "schedule")}
-    parts = {key: _made(value) if isinstance(value, Mapping) else value for key, value in model.items()}
+    parts = {
+        key: _made(value) if isinstance(value, Mapping) and "class_path" in value else value
+        for key, value in model.items()
+    }
     torch.manual_seed(0)
     return EmulatorModule(scene, **parts)
 
@@ -103,7 +107,7 @@ class Probe:
         self.data.setup("fit")
         self.window: Window = next(iter(self.data.train_dataloader()))
         self.module = module_of(config, self.data.scene)
-        self.module.emulator.calibrate([self.window])
+        calibrate(self.module.emulator, [self.window])
         self.optimizer = torch.optim.Adam(self.module.parameters(), lr=1e-4)
 
     def step(self) -> float:

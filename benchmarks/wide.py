@@ -33,27 +33,6 @@ from nmpm.zoo import Zoo
 HORIZONS = (32, 100)
 
 
-def widened(preset: MpmPreset) -> MpmPreset:
-    """The preset's scenes in a box whose domain is twice as wide, to the right."""
-    (left, right), *others = preset.domain
-    cells = round(((2 * right - left) - preset.box[0][0]) / preset.cell_size) - 1
-    # As many whole cells of the simulator as leave at least the wall layer of the square's domain.
-    while preset.box[0][0] + cells * preset.cell_size > 2 * right - left - (right - preset.box[0][1]):
-        cells -= 1
-    box = ((preset.box[0][0], preset.box[0][0] + cells * preset.cell_size), *preset.box[1:])
-    low, high = preset.blocks.particles
-    least, most = preset.blocks.number
-    blocks = dataclasses.replace(
-        preset.blocks,
-        particles=(low, 2 * high),
-        number=(least, 2 * most),
-        share=preset.blocks.share / 2,
-    )
-    return dataclasses.replace(
-        preset, box=box, domain=((left, 2 * right - left), *others), cells=cells, blocks=blocks, name="wide"
-    )
-
-
 def error(emulator: Emulator, preset: MpmPreset, seeds: list[int], workers: int) -> dict[str, float]:
     """Errors of the emulator on scenes of a preset, in the box of that preset."""
     scene = preset.scene
@@ -90,7 +69,7 @@ def main() -> None:
     seeds = [derived_seed(chosen.seed, index) for index in range(chosen.scenes)]
     models = {run.name: trained(run) for run in chosen.runs} | {name: Zoo.load(name).emulator for name in chosen.zoo}
     for name, emulator in models.items():
-        for kind in (preset, widened(preset)):
+        for kind in (preset, dataclasses.replace(preset.widened(2), name="wide")):
             with torch.no_grad():
                 errors = error(emulator, kind, seeds, chosen.workers)
             figures = "  ".join(f"{key} {value:.4g}" for key, value in errors.items())

@@ -12,14 +12,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from nmpm.constraints import Constraints, at_rest, energy, within_budget
+from nmpm.contact import Contact
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles
 from nmpm.processors import GridLayout, Processor, UNet
 from nmpm.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.scene import Scene
 from nmpm.transfer import Linear, Transfer
+
+UNLIMITED = 1e30
+"""Stands for no limit, finite so that every statistic of a sound model is."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,18 @@ class Bundle:
     velocity: Tensor
 
 
+@dataclass(frozen=True)
+class _Flight:
+    """What the frames of a bundle are advanced with, in grid units."""
+
+    cells: Tensor
+    carried: Tensor
+    gravity: Tensor
+    material: Tensor
+    fields: Tensor
+    share: Tensor
+
+
 class Emulator(nn.Module):
     """A learned simulator of one family of scenes.
 
@@ -46,6 +63,7 @@ class Emulator(nn.Module):
         processor: Recipe of the network between.
         decoder: What the network's output means.
         grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training mode only.
+        constraints: What it is held to, in evaluation mode only.
 
     Raises:
         ConfigError: if grid and processor do not suit each other.
@@ -53,6 +71,8 @@ class Emulator(nn.Module):
 
     input_mean: Tensor
     input_std: Tensor
+    input_low: Tensor
+    input_high: Tensor
     output_scale: Tensor
     bounds: Tensor
     walls: Tensor
@@ -67,9 +87,15 @@ class Emulator(nn.Module):
         processor: Processor | None = None,
         decoder: Decoder | None = None,
         grid_noise: float = 0.0,
+        constraints: Constraints | None = None,
     ) -> None:
         super().__init__()
         self.scene = scene
+        self.constraints = constraints or Constraints()
+        if self.constraints.energy and scene.gravity is None and not scene.gravity_varies:
+            raise ConfigError(
+                "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
+            )
         self.frames = frames
         self.grid_noise = grid_noise
         self.grid = Grid.of(scene, cells)
@@ -85,6 +111,8 @@ class Emulator(nn.Module):
         column = (1,) * scene.dim
         self.register_buffer("input_mean", torch.zeros(inputs, *column))
         self.register_buffer("input_std", torch.ones(inputs, *column))
+        self.register_buffer("input_low", torch.full((inputs, *column), -UNLIMITED))
+        self.register_buffer("input_high", torch.full((inputs, *column), UNLIMITED))
         self.register_buffer("output_scale", torch.ones(frames, outputs, *column))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
         limits = torch.tensor(scene.bounds, dtype=torch.float64)
@@ -92,18 +120,24 @@ class Emulator(nn.Module):
         self.register_buffer("bounds", ((limits.T - lower) / spacing).float(), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
 
+    @property
+    def precision(self) -> torch.dtype:
+        """In which transfers and advection are computed: float32, or float64 after `double()`."""
+        return torch.promote_types(self.input_mean.dtype, torch.float32)
+
     def over(self, scene: Scene) -> Emulator:
         """The same emulator in another box: a copy of weights and statistics, on a grid with cells of the same size.
 
         Args:
-            scene: Other bounds and domain, perhaps obstacles where there were walls already; all else must be the same.
+            scene: Other bounds and domain, finer or coarser particles, perhaps obstacles where there were walls
+                already; all else must be the same.
 
         Raises:
-            ConfigError: if channels, time step or the sizes of particles differ, the domain is not a whole number of
-                cells, or the processor cannot take the grid.
+            ConfigError: if channels, time step or gravity differ, the domain is not a whole number of cells, or the
+                processor cannot take the grid.
         """
         mine = self.scene
-        for name in ("input_channels", "dt", "particle_volume", "boundary", "gravity"):
+        for name in ("input_channels", "dt", "boundary", "gravity"):
             if getattr(scene, name) != getattr(mine, name):
                 raise ConfigError(
                     f"The emulator was made for {name} = {getattr(mine, name)}; the other scene has"
@@ -116,7 +150,9 @@ class Emulator(nn.Module):
                 f" {self.grid.spacing}; whole numbers are needed."
             )
         cells = [round(side) for side in sides]
-        other = Emulator(scene, cells, self.frames, self.transfer, self.recipe, self.decoder, self.grid_noise)
+        other = Emulator(
+            scene, cells, self.frames, self.transfer, self.recipe, self.decoder, self.grid_noise, self.constraints
+        )
         other.load_state_dict(self.state_dict())
         other.to(self.calibrated.device)
         return other.train(self.training)
@@ -125,44 +161,90 @@ class Emulator(nn.Module):
         """What of each cell is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1. Once per scene, not per step."""
         return solid_fraction(self.scene, self.grid, self.transfer, particles, self.walls)
 
-    def forward(self, particles: Particles, solid: Tensor) -> Bundle:
+    def budget(self, particles: Particles) -> Tensor | None:
+        """The energy (B,) that a rollout from this state is held to; None where it is not."""
+        if not self.constraints.energy or self.training:
+            return None
+        cells, velocity, gravity = self._in_cells(particles)
+        return energy(cells, velocity, gravity, _share(particles, cells))
+
+    def forward(self, particles: Particles, solid: Tensor, budget: Tensor | None = None) -> Bundle:
         """Predict the next m frames.
 
         Args:
             particles: The state to start from.
             solid: (B, C_solid, *S), from `solid`.
+            budget: (B,) energy not to be exceeded, from `budget` of the rollout's first state.
         """
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
-            cells = self.grid.to_cells(particles.position)
-            velocity = self.grid.to_cell_displacement(particles.velocity)
+            cells, velocity, gravity = self._in_cells(particles)
             state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)
-            normalised = (state - self.input_mean) / self.input_std
+            # Beyond what training saw, a network's answers are arbitrary and may be huge.
+            seen = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
+            normalised = (seen - self.input_mean) / self.input_std
             if self.training and self.grid_noise > 0:
                 normalised = normalised + self.grid_noise * torch.randn_like(normalised)
         output = self.processor(normalised)
         with torch.autocast(device, enabled=False):
-            fields = output.float() * self.output_scale
-            return self._advect(particles, cells, velocity, state, fields)
+            fields = output.to(self.precision) * self.output_scale
+            smoothed = self._gather(state[:, : fields.shape[2]], cells, particles.material)
+            carried = self.decoder.carried(velocity, smoothed)
+            flight = _Flight(cells, carried, gravity, particles.material, fields, _share(particles, cells))
+            path = self._advect(flight)
+            if not self.training:
+                path = self._constrained(flight, path, solid, budget)
+            steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
+            precision = particles.position.dtype
+            return Bundle(
+                position=self.grid.to_length(path.to(precision)),
+                velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
+            )
 
-    def _advect(self, particles: Particles, cells: Tensor, velocity: Tensor, state: Tensor, fields: Tensor) -> Bundle:
-        material = particles.material
-        gravity = self.grid.to_cell_displacement(particles.gravity).unsqueeze(1)
-        smoothed = self._gather(state[:, : fields.shape[2]], cells, material)
-        carried = velocity = self.decoder.carried(velocity, smoothed)
-        path = []
-        for frame, field in enumerate(fields.unbind(1), start=1):  # indexing would cost a zero-fill each, backwards
-            known = self.decoder.known(carried, velocity, gravity, frame)
-            step = known + self._gather(field, cells, material)
+    def _in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
+        return (
+            self.grid.to_cells(particles.position, self.precision),
+            self.grid.to_cell_displacement(particles.velocity, self.precision),
+            self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
+        )
+
+    def _advect(self, flight: _Flight, budget: Tensor | None = None) -> Tensor:
+        """(B, m, N, D) positions in cells, within an energy (B,) if one is given."""
+        cells, velocity, path = flight.cells, flight.carried, []
+        for frame, field in enumerate(
+            flight.fields.unbind(1), start=1
+        ):  # indexing would cost a zero-fill each, backwards
+            known = self.decoder.known(flight.carried, velocity, flight.gravity, frame)
+            step = known + self._gather(field, cells, flight.material)
+            if budget is not None:
+                step = within_budget(step, cells, flight.gravity, flight.share, budget)
             arrived = self._confine(cells + step)
             velocity = arrived - cells
             cells = arrived
             path.append(cells)
-        precision = particles.position.dtype
-        return Bundle(
-            position=self.grid.to_length(torch.stack(path, dim=1).to(precision)),
-            velocity=self.grid.to_displacement(velocity.to(precision)),
-        )
+        return torch.stack(path, dim=1)
+
+    def _constrained(self, flight: _Flight, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
+        """The path (B, m, N, D) as the constraints let it be."""
+        path = self._clear(flight, path, solid)
+        if budget is not None:
+            steps = path.diff(dim=1, prepend=flight.cells.unsqueeze(1))
+            spent = energy(path, steps, flight.gravity, flight.share)
+            if (spent > budget.unsqueeze(1)).any():  # seldom: then all frames once more, each within it
+                path = self._clear(flight, self._advect(flight, budget), solid)
+        if self.constraints.rest_speed:
+            still = at_rest(flight.cells, path, self.constraints.rest_speed)
+            path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
+        return path
+
+    def _clear(self, flight: _Flight, path: Tensor, solid: Tensor) -> Tensor:
+        """The path (B, m, N, D), clear of obstacles."""
+        if not (self.constraints.solids and self.scene.obstacles):
+            return path
+        room = 1 - self.walls
+        share = torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
+        return self._confine(Contact(share, self.grid).hold(flight.cells, path))
 
     def _gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
@@ -182,51 +264,8 @@ class Emulator(nn.Module):
         wraps = torch.tensor(self.scene.periodic, device=cells.device)
         return torch.where(wraps, cells, held) if any(self.scene.periodic) else held
 
-    @torch.no_grad()
-    def calibrate(self, windows: Sequence[Window]) -> None:
-        """Set the normalisation statistics from a sample of training windows of at least m + 2 frames.
 
-        Inputs get mean and standard deviation per channel over all cells; outputs the root mean square of what is
-        left of the true velocities once the decoder's known part is taken out, per frame of the bundle and component.
-
-        Raises:
-            ValueError: if there is no window or one is too short.
-        """
-        if not windows or min(window.target.shape[1] for window in windows) < self.frames:
-            raise ValueError(f"Calibration needs windows of at least {self.frames + 2} frames.")
-        state = torch.cat([self._state(window.initial) for window in windows])
-        axes = (0, *range(2, state.dim()))
-        self.input_mean.copy_(state.mean(axes).reshape_as(self.input_mean))
-        self.input_std.copy_(_nonzero(state.std(axes)).reshape_as(self.input_std))
-        self.output_scale.copy_(self._unknown_scale(windows).reshape_as(self.output_scale))
-        self.calibrated.fill_(True)
-
-    def _state(self, particles: Particles) -> Tensor:
-        cells = self.grid.to_cells(particles.position)
-        velocity = self.grid.to_cell_displacement(particles.velocity)
-        return grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, self.solid(particles))
-
-    def _unknown_scale(self, windows: Sequence[Window]) -> Tensor:
-        """(m, C_out): root mean square of the part of the velocity that the network has to give."""
-        unknown = [self._unknown(window) for window in windows]
-        scales = []
-        for index in range(len(self.scene.materials)):
-            chosen = [window.mask & (window.material == index) for window in windows]
-            values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(unknown, chosen, strict=True)])
-            scales.append(values.square().mean(0).sqrt().nan_to_num(1.0))
-        return _nonzero(torch.cat(scales, dim=-1))
-
-    def _unknown(self, window: Window) -> Tensor:
-        """(B, m, N, D) true velocities less what the decoder knows, in cells per frame."""
-        steps = self.grid.to_cell_displacement(window.frames[:, 1:].diff(dim=1))[:, : self.frames]
-        velocity = self.grid.to_cell_displacement(window.initial.velocity)
-        gravity = self.grid.to_cell_displacement(window.gravity).unsqueeze(1)
-        carried = self.decoder.carried(velocity, velocity)
-        before = [carried, *steps.unbind(1)]
-        known = [self.decoder.known(carried, before[frame - 1], gravity, frame) for frame in range(1, self.frames + 1)]
-        return steps - torch.stack(known, dim=1)
-
-
-def _nonzero(scale: Tensor) -> Tensor:
-    """Scales that can be divided by: a channel that never varies is left as it is."""
-    return torch.where(scale > 1e-12, scale, torch.ones_like(scale))
+def _share(particles: Particles, cells: Tensor) -> Tensor:
+    """(B, N, 1): each real particle's part of a scene's mean."""
+    real = particles.mask.to(cells.dtype)
+    return (real / real.sum(-1, keepdim=True).clamp(min=1)).unsqueeze(-1)

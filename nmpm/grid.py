@@ -72,8 +72,8 @@ class Grid:
         """Volume of a cell, in length ** dim."""
         return math.prod(self.spacing)
 
-    def to_cells(self, position: Tensor) -> Tensor:
-        """Positions (..., D) in domain length → cells from the lower corner, float32.
+    def to_cells(self, position: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Positions (..., D) in domain length → cells from the lower corner, of the type asked for.
 
         The origin is taken off in the positions' own precision, so that float64 input far from 0 keeps its digits.
 
@@ -81,7 +81,7 @@ class Grid:
             DataError: if that precision is too coarse so far from 0.
         """
         self._check_precision(position.dtype)
-        return ((position - position.new_tensor(self.lower)) / position.new_tensor(self.spacing)).float()
+        return ((position - position.new_tensor(self.lower)) / position.new_tensor(self.spacing)).to(dtype)
 
     def _check_precision(self, dtype: torch.dtype) -> None:
         """Refuse positions whose floating-point numbers lie further apart than a part of a cell."""
@@ -95,9 +95,9 @@ class Grid:
                     f" and a cell is {h:g} wide: give positions in float64, or move the origin into the domain."
                 )
 
-    def to_cell_displacement(self, displacement: Tensor) -> Tensor:
-        """Displacements (..., D) in domain length → cells, float32."""
-        return (displacement / displacement.new_tensor(self.spacing)).float()
+    def to_cell_displacement(self, displacement: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Displacements (..., D) in domain length → cells, of the type asked for."""
+        return (displacement / displacement.new_tensor(self.spacing)).to(dtype)
 
     def to_length(self, cells: Tensor) -> Tensor:
         """Positions (..., D) in cells → domain length."""

@@ -107,6 +107,7 @@ class Report(Callback):
             "per_trajectory": dict(per_trajectory),
             "training": {
                 "steps": self.trained_steps,
+                "horizon": module.emulator.frames * module.unroll,
                 "seconds": round(self.trained_seconds, 1),
                 "precision": str(trainer.precision),
                 "devices": trainer.world_size,

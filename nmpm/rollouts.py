@@ -21,9 +21,9 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int) -> Iterator[B
         particles: The state to start from.
         bundles: How many calls to make.
     """
-    solid = emulator.solid(particles)
+    solid, budget = emulator.solid(particles), emulator.budget(particles)
     for _ in range(bundles):
-        bundle = emulator(particles, solid)
+        bundle = emulator(particles, solid, budget)
         yield bundle
         particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
@@ -61,6 +61,17 @@ def check_state(scene: Scene, particles: Particles) -> None:
         )
 
 
+def check_weights(emulator: Emulator) -> None:
+    """Refuse an emulator that can only predict nonsense.
+
+    Raises:
+        DataError: naming the weight or statistic that holds what is not a finite number.
+    """
+    for name, values in emulator.state_dict().items():
+        if not values.isfinite().all():
+            raise DataError(f"The emulator's {name} holds numbers that are not finite: load a sound checkpoint.")
+
+
 def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Tensor]:
     """Predict `frames` frames without gradients, handing out each bundle as it is made.
 
@@ -69,10 +80,11 @@ def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Te
 
     Raises:
         ValueError: if `frames` is negative.
-        DataError: if the state holds what is not a finite number, or a particle outside of the domain.
+        DataError: if the state or a weight holds what is not a finite number, or a particle is outside of the domain.
     """
     if frames < 0:
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
+    check_weights(emulator)
     check_state(emulator.scene, particles)
     bundles = unroll(emulator, particles, -(-frames // emulator.frames))
     made = 0
@@ -91,7 +103,7 @@ def rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
 
     Raises:
         ValueError: if `frames` is negative.
-        DataError: if the state holds what is not a finite number, or a particle outside of the domain.
+        DataError: if the state or a weight holds what is not a finite number, or a particle is outside of the domain.
     """
     bundles = list(stream(emulator, particles, frames))
     if not bundles:

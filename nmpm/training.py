@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
 from typing import Any
@@ -15,7 +16,9 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nmpm.augmentation import check_mirrors, mirrored
+from nmpm.calibration import calibrate
 from nmpm.comparison import Comparison
+from nmpm.constraints import Constraints
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator import Emulator
 from nmpm.losses import position_error
@@ -49,6 +52,7 @@ class EmulatorModule(LightningModule):
         transfer: How particles and grid see each other.
         processor: The network on the grid.
         decoder: What the network's output means.
+        constraints: Facts that rollouts are held to; they do not act in training.
         optimizer: Makes the optimizer from the parameters.
         schedule: The learning rate's course over the training.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
@@ -68,6 +72,7 @@ class EmulatorModule(LightningModule):
         transfer: Transfer = Linear(),  # noqa: B008 (frozen)
         processor: Processor = UNet(),  # noqa: B008
         decoder: Decoder = Residual(),  # noqa: B008
+        constraints: Constraints = Constraints(),  # noqa: B008
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008
         position_noise: float = 0.0,
@@ -81,7 +86,8 @@ class EmulatorModule(LightningModule):
         scene = scene if isinstance(scene, Scene) else Scene.from_dict(scene)
         transfer, decoder = from_spec(transfer, Transfer), from_spec(decoder, Decoder)
         processor = from_spec(processor, Processor)
-        self.emulator = Emulator(scene, cells, frames, transfer, processor, decoder, grid_noise)
+        constraints = constraints if isinstance(constraints, Constraints) else Constraints(**constraints)
+        self.emulator = Emulator(scene, cells, frames, transfer, processor, decoder, grid_noise, constraints)
         self.unroll = unroll
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
@@ -97,6 +103,7 @@ class EmulatorModule(LightningModule):
                 "transfer": to_spec(transfer),
                 "processor": to_spec(processor),
                 "decoder": to_spec(decoder),
+                "constraints": dataclasses.asdict(constraints),
                 "schedule": to_spec(self.schedule)["init_args"],
                 "position_noise": position_noise,
                 "grid_noise": grid_noise,
@@ -127,6 +134,7 @@ class EmulatorModule(LightningModule):
             transfer=emulator.transfer,
             processor=emulator.recipe,
             decoder=emulator.decoder,
+            constraints=emulator.constraints,
             **options,
         )
         module.emulator.load_state_dict(emulator.state_dict())
@@ -135,7 +143,7 @@ class EmulatorModule(LightningModule):
     def setup(self, stage: str) -> None:
         if stage == "fit" and not self.emulator.calibrated:
             loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]
-            self.emulator.calibrate(list(islice(loader, CALIBRATION_BATCHES)))
+            calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Make the step's randomness a function of the step, so that a resumed run repeats it."""

@@ -12,6 +12,7 @@ Loading reads text and tensors only: nothing is unpickled, imported or fetched.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import re
 from collections.abc import Mapping
@@ -24,6 +25,7 @@ import yaml
 from safetensors.torch import load
 from torch import Tensor
 
+from nmpm.constraints import Constraints
 from nmpm.decoders import Decoder
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError, ZooError
@@ -114,6 +116,7 @@ def emulator_config(emulator: Emulator) -> dict[str, Any]:
         "transfer": to_spec(emulator.transfer),
         "processor": to_spec(emulator.recipe),
         "decoder": to_spec(emulator.decoder),
+        "constraints": dataclasses.asdict(emulator.constraints),
     }
 
 
@@ -131,6 +134,7 @@ def emulator_from_config(config: Mapping[str, Any]) -> Emulator:
         transfer=from_spec(config["transfer"], Transfer),
         processor=from_spec(config["processor"], Processor),
         decoder=from_spec(config["decoder"], Decoder),
+        constraints=Constraints(**config.get("constraints", {})),
     )
 
 

@@ -4,11 +4,13 @@ import pytest
 import torch
 from scenes import box, cloud
 
+from nmpm.calibration import calibrate
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
 from nmpm.processors import Pointwise, UNet
+from nmpm.rasterise import grid_state
 from nmpm.rollouts import rollout, stream, unroll
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic
 
@@ -202,14 +204,19 @@ def test_calibration_measures_what_the_network_has_to_give():
     rest = (particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
     window = Window(frames, *rest)
     emulator = small(scene, decoder=Absolute())
-    emulator.calibrate([window])
+    calibrate(emulator, [window])
     expected = emulator.grid.to_cell_displacement(steps[:, 2:]).square().mean((0, 1, 2)).sqrt()
     torch.testing.assert_close(emulator.output_scale.squeeze().mean(0), expected, rtol=0.05, atol=0)
     assert emulator.calibrated
-    normalised = (emulator._state(window.initial) - emulator.input_mean) / emulator.input_std
+    start = window.initial
+    cells, velocity, _ = emulator._in_cells(start)
+    state = grid_state(scene, emulator.grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
+    assert (state > emulator.input_low).all()
+    assert (state < emulator.input_high).all()
+    normalised = (state - emulator.input_mean) / emulator.input_std
     assert normalised.mean((0, 2, 3)).abs().max() < 1e-4
     with pytest.raises(ValueError, match="at least 5 frames"):
-        emulator.calibrate([dataclasses.replace(window, frames=frames[:, :4])])
+        calibrate(emulator, [dataclasses.replace(window, frames=frames[:, :4])])
 
 
 def test_rollouts_are_cut_to_the_frames_asked_for():
@@ -256,6 +263,16 @@ def test_over_a_wider_box_what_is_far_from_the_walls_moves_as_before(dim):
     shifted = particles.moved(particles.position + torch.tensor([0.84] + [0.0] * (dim - 1)), particles.velocity)
     moved = rollout(other, shifted, 5) - torch.tensor([0.84] + [0.0] * (dim - 1))
     torch.testing.assert_close(moved, rollout(emulator, particles, 5), atol=1e-5, rtol=0)
+
+
+def test_over_finer_particles_of_the_same_material_it_moves_as_before():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    finer = emulator.over(box(particle_volume=scene.particle_volume / 2))
+    names = ("position", "velocity", "material", "mask")
+    doubled = dataclasses.replace(particles, **{n: torch.cat([getattr(particles, n)] * 2, dim=1) for n in names})
+    expected = torch.cat([rollout(emulator, particles, 6)] * 2, dim=2)
+    torch.testing.assert_close(rollout(finer, doubled, 6), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ COMMANDS = {
     "inspect": ("nmpm.cli.inspect", "Say on one screen what a dataset holds, and what is odd about it."),
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
+    "stress": ("nmpm.cli.stress", "Put a model through the extremes: pass or fail, with measured margins."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
 }
 
@@ -37,6 +38,7 @@ first steps:
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
   nmpm render out.h5                           draw what came out
+  nmpm stress goop                             see what breaks it
 
 Add --help to any command for its options; fit --print_config prints a whole configuration.
 A --config that is not a file in the working directory is looked up among the shipped ones: {configs}.

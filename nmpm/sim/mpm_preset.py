@@ -175,6 +175,29 @@ class MpmPreset(Preset):
         longest = dataclasses.replace(self, cells=self.cells // factor, substeps=2**31)
         return dataclasses.replace(longest, substeps=longest.least_substeps)
 
+    def widened(self, times: int) -> MpmPreset:
+        """Scenes in a box whose domain is so many times as wide, with up to as many times as many particles and blocks.
+
+        The box is as wide as whole cells of the simulator allow, its wall layer on the right at least what it was.
+        """
+        (left, right), *others = self.domain
+        low, high = self.box[0]
+        edge = left + times * (right - left)
+        cells = math.floor((edge - (right - high) - low) / self.cell_size + 1e-9)
+        blocks = dataclasses.replace(
+            self.blocks,
+            particles=(self.blocks.particles[0], times * self.blocks.particles[1]),
+            number=(self.blocks.number[0], times * self.blocks.number[1]),
+            share=self.blocks.share / times,
+        )
+        return dataclasses.replace(
+            self,
+            box=((low, low + cells * self.cell_size), *self.box[1:]),
+            domain=((left, edge), *others),
+            cells=cells,
+            blocks=blocks,
+        )
+
     def simulate(self, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
         from nmpm.sim.mpm import simulate
 

@@ -93,3 +93,18 @@ def test_coarsening_takes_the_longest_stable_substep(factor):
 def test_coarsening_needs_whole_cells():
     with pytest.raises(ConfigError, match="3 times"):
         GOOP.coarsened(3)
+
+
+@pytest.mark.parametrize("times", [2, 4])
+@pytest.mark.parametrize("name", ["goop", "waterramps"])
+def test_a_wider_box_holds_whole_cells_and_as_many_more_particles(name, times):
+    preset = load_preset(name)
+    wide = preset.widened(times)
+    (left, right), (outer_left, outer_right) = wide.box[0], wide.domain[0]
+    assert outer_right - outer_left == pytest.approx(times * (preset.domain[0][1] - preset.domain[0][0]))
+    assert wide.cell_size == pytest.approx(preset.cell_size)
+    assert outer_right - right >= preset.domain[0][1] - preset.box[0][1] - 1e-9
+    assert right - left > (times - 0.1) * (preset.box[0][1] - preset.box[0][0])
+    assert wide.blocks.particles[1] == times * preset.blocks.particles[1]
+    made = wide.lasting(2).simulate(0)
+    assert made.position[..., 0].max() <= wide.reach[0][1]

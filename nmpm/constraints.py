@@ -1,0 +1,98 @@
+"""What a rollout may not do, whatever the network says.
+
+Each rule is a fact about the scenes, to be switched on where it holds. None acts in training, which has to see the
+network's own mistakes.
+
+All quantities are in grid units: cells, cells per frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nmpm.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Facts that rollouts are held to.
+
+    Args:
+        energy: Kinetic and potential energy never exceed those of the rollout's first state: nothing feeds the scene,
+            neither moving walls nor inlets, and its gravity is known.
+        rest_speed: What moves less than so many cells per frame, on average over a bundle, stays where it is. To be set
+            to the speed that the model sees in material that is at rest.
+        solids: Nobody gets into obstacles.
+
+    Raises:
+        ConfigError: if the speed is negative.
+    """
+
+    energy: bool = False
+    rest_speed: float = 0.0
+    solids: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.rest_speed >= 0:
+            raise ConfigError(f"constraints.rest_speed = {self.rest_speed} must not be negative.")
+
+
+def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> Tensor:
+    """Mean kinetic and potential energy per mass of each scene, up to a constant.
+
+    Args:
+        cells: (B, ..., N, D).
+        velocity: (B, ..., N, D).
+        gravity: (B, 1, D).
+        share: (B, N, 1), each particle's part of the mean.
+
+    Returns:
+        (B, ...).
+    """
+    extra = (1,) * (cells.dim() - 3)
+    batch, count, dim = len(cells), cells.shape[-2], cells.shape[-1]
+    fall = gravity.reshape(batch, *extra, 1, dim)
+    each = velocity.square() / 2 - cells * fall
+    return (each * share.reshape(batch, *extra, count, 1)).sum((-2, -1))
+
+
+def within_budget(step: Tensor, cells: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
+    """A frame's steps, all of a scene's shortened by one factor where they would exceed its energy.
+
+    With the factor s the energy after the frame is a parabola in s; the largest s in [0, 1] within the budget is taken.
+
+    Args:
+        step: (B, N, D) steps proposed.
+        cells: (B, N, D) where from.
+        gravity: (B, 1, D).
+        share: (B, N, 1).
+        budget: (B,) energy that is allowed.
+
+    Returns:
+        (B, N, D).
+    """
+    square = (step.square() * share).sum((-2, -1)) / 2
+    slope = -(step * gravity * share).sum((-2, -1))
+    excess = -(cells * gravity * share).sum((-2, -1)) - budget
+    root = (slope.square() - 4 * square * excess).clamp(min=0).sqrt()
+    tiny = torch.finfo(step.dtype).tiny
+    factor = ((root - slope) / (2 * square).clamp(min=tiny)).clamp(0, 1)
+    return step * factor[:, None, None]
+
+
+def at_rest(start: Tensor, path: Tensor, speed: float) -> Tensor:
+    """Which particles move too little in a bundle to be more than the model's error.
+
+    Args:
+        start: (B, N, D) where the bundle starts.
+        path: (B, m, N, D) its frames.
+        speed: In cells per frame.
+
+    Returns:
+        (B, N) bool.
+    """
+    still: Tensor = (path[:, -1] - start).norm(dim=-1) < speed * path.shape[1]
+    return still

@@ -1,0 +1,89 @@
+"""Many and few: from no particle to millions, thin and dense, an empty box and a full one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import torch
+
+from nmpm.particles import Particles
+from nmpm.rollouts import rollout, stream
+from nmpm.scene import Scene
+from nmpm.starts import lattice, resting, thrown_blocks
+from nmpm.stress.course import MOST_GAIN, Course, follow
+from nmpm.stress.lines import Line, Size
+from nmpm.stress.subject import Subject
+
+_GROUP = "many and few"
+_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
+_SHARE = 0.1
+"""Of the box: the volume that the counts share."""
+
+
+def counts(subject: Subject, size: Size) -> Iterator[Line]:
+    """The same block of material in fewer and in more particles, and other densities."""
+    yield from _finer(subject, size)
+    for factor in (0.5, 2.0):
+        yield _denser(subject, factor, size)
+    yield _nothing(subject)
+    yield _full(subject)
+
+
+def _finer(subject: Subject, size: Size) -> Iterator[Line]:
+    """The last, finest one is what the centre of mass of the others is compared with."""
+    volume, places = _SHARE * _volume(subject.emulator.scene), {}
+    numbers = [10**power for power in range(8) if 10**power <= size.particles]
+    for number in reversed(numbers):
+        scene = dataclasses.replace(subject.emulator.scene, particle_volume=volume / number)
+        state = thrown_blocks(scene, count=number, seed=subject.seed)
+        course = _run(subject, scene, state, 2 * subject.horizon)
+        places[number] = course.last.mean(1)
+        apart = (places[number] - places[numbers[-1]]) / places[number].new_tensor(subject.emulator.grid.spacing)
+        figures = course.figures() | {"centre_apart_cells": float(apart.norm())}
+        yield Line(_GROUP, f"{state.position.shape[1]:,} particles of the same volume", course.sound, figures, _NEEDS)
+
+
+def _denser(subject: Subject, factor: float, size: Size) -> Line:
+    """Each scene's particles drawn together, or apart, around their centre of mass: other densities than were seen."""
+    scene, state = subject.emulator.scene, subject.starts(size.scenes)
+    real = state.mask.unsqueeze(-1)
+    centre = (state.position * real).sum(1, keepdim=True) / real.sum(1, keepdim=True)
+    low, high = state.position.new_tensor(scene.bounds).T
+    position = (centre + (state.position - centre) * factor ** (-1 / scene.dim)).clamp(low, high)
+    course = _run(subject, scene, state.moved(position, state.velocity), subject.horizon)
+    return Line(_GROUP, f"density × {factor:g}", course.sound, course.figures(), _NEEDS)
+
+
+def _nothing(subject: Subject) -> Line:
+    """Obstacles, if the scene has any, and no particle."""
+    state = subject.starts(1)
+    empty = dataclasses.replace(
+        state,
+        position=state.position[:, :0],
+        velocity=state.velocity[:, :0],
+        material=state.material[:, :0],
+        mask=state.mask[:, :0],
+    )
+    predicted = rollout(subject.emulator, empty, subject.horizon)
+    return Line(_GROUP, "no particle", predicted.shape == (1, subject.horizon, 0, predicted.shape[-1]), {}, "no error")
+
+
+def _full(subject: Subject) -> Line:
+    """Nowhere to go: what fills the box hardly moves."""
+    scene = subject.emulator.scene
+    state = resting(scene, lattice(scene.bounds, scene.particle_volume ** (1 / scene.dim)))
+    course = _run(subject, scene, state, 4 * subject.horizon)
+    cells = (course.last - state.position) / state.position.new_tensor(subject.emulator.grid.spacing)
+    figures = course.figures() | {"moved_cells": float(cells.square().sum(-1).mean().sqrt())}
+    return Line(_GROUP, f"a full box ({state.position.shape[1]:,} particles)", course.sound, figures, _NEEDS)
+
+
+def _run(subject: Subject, scene: Scene, state: Particles, frames: int) -> Course:
+    emulator = subject.emulator.over(scene)
+    return follow(emulator, state, stream(emulator, state, frames))
+
+
+def _volume(scene: Scene) -> float:
+    sides = [high - low for low, high in scene.bounds]
+    return float(torch.tensor(sides).prod())

@@ -1,0 +1,150 @@
+"""What happens along a rollout: energy, speed, escapes and volume, frame by frame, kept without the positions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator import Emulator
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+
+MOST_GAIN = 0.01
+"""Share of the initial energy by which it may grow where nothing is fed in."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """The measures of a rollout of B scenes over T frames.
+
+    Args:
+        gain: (B, T) kinetic and potential energy above the start's, over the start's.
+        speed: (B, T) of the fastest particle, in cells per frame.
+        lost: (B, T) particles that are outside of the domain or nowhere.
+        filled: (B, V) volume that the particles fill over their own, at frames `every`, 2 `every`, …
+        every: Frames between two measures of the volume.
+        last: (B, N, D) positions at the end.
+        velocity: (B, N, D) of the last frame.
+    """
+
+    gain: Tensor
+    speed: Tensor
+    lost: Tensor
+    filled: Tensor
+    every: int
+    last: Tensor
+    velocity: Tensor
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.gain.shape[1]
+
+    @property
+    def failures(self) -> Tensor:
+        """(B, T): whether an invariant is broken: a particle lost, or more energy gained than `MOST_GAIN`."""
+        return (self.lost > 0) | (self.gain > MOST_GAIN) | self.gain.isnan()
+
+    @property
+    def sound(self) -> bool:
+        """Whether no invariant is ever broken."""
+        return not bool(self.failures.any())
+
+    def steps_to_failure(self) -> list[int]:
+        """For each scene the first frame, from 1, at which an invariant is broken; T + 1 where none is."""
+        first = self.failures.int().argmax(1) + 1
+        return torch.where(self.failures.any(1), first, self.frames + 1).tolist()
+
+    def figures(self) -> dict[str, float]:
+        """What a line of the battery reports."""
+        return {
+            "energy_gain_percent": 100 * float(self.gain.max()),
+            "lost": float(self.lost.max()),
+            "cfl": float(self.speed.max()),
+        }
+
+
+def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], every: int = 0) -> Course:
+    """Measure a rollout as it is made.
+
+    Args:
+        emulator: Gives scene and grid.
+        start: The state it started from.
+        bundles: (B, m, N, D) positions, one after the other.
+        every: Frames between two measures of the volume, rounded up to bundles; 0 for none.
+    """
+    scene, real = emulator.scene, start.mask
+    begun = energy(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
+    spacing = start.position.new_tensor(emulator.grid.spacing)
+    gains, speeds, losses, volumes = [], [], [], []
+    last, velocity, frame = start.position, start.velocity, 0
+    for bundle in bundles:
+        path = torch.cat([last.unsqueeze(1), bundle], dim=1)
+        steps = path.diff(dim=1)
+        gains.append((energy(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
+        speeds.append(_largest((steps / spacing).norm(dim=-1), real))
+        losses.append((outside(scene, bundle) & real.unsqueeze(1)).sum(-1))
+        last, velocity = bundle[:, -1], steps[:, -1]
+        if every and (frame + bundle.shape[1]) // every > frame // every:
+            volumes.append(filled(emulator, start, last))
+        frame += bundle.shape[1]
+    none = start.position.new_zeros(len(real), 0)
+    gain, speed, lost = (torch.cat(parts, dim=1) if parts else none for parts in (gains, speeds, losses))
+    volume = torch.stack(volumes, dim=1) if volumes else none
+    return Course(gain, speed, lost, volume, every, last, velocity)
+
+
+def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
+    """Kinetic and potential energy per mass, all particles of a mass, the potential from the bounds' lowest corner.
+
+    Args:
+        scene: Gives the bounds.
+        start: Gives gravity and which particles are real.
+        position: (B, T, N, D).
+        velocity: (B, T, N, D) in length per frame.
+
+    Returns:
+        (B, T) in length² per frame².
+    """
+    gravity = start.gravity[:, None, None]
+    corners = torch.cartesian_prod(*(position.new_tensor(bound) for bound in scene.bounds)).reshape(-1, scene.dim)
+    lowest = (corners @ start.gravity.T).max(dim=0).values[:, None, None]
+    each = velocity.square().sum(-1) / 2 + lowest - (position * gravity).sum(-1)
+    real = start.mask.unsqueeze(1)
+    return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)
+
+
+def outside(scene: Scene, position: Tensor) -> Tensor:
+    """Whether positions (..., D) are beyond the domain's walls, or not finite."""
+    lower, upper = position.new_tensor(scene.domain).T
+    walls = torch.tensor([not wraps for wraps in scene.periodic], device=position.device)
+    beyond: Tensor = (((position < lower) | (position > upper)) & walls).any(-1)
+    return beyond | ~position.isfinite().all(-1)
+
+
+def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
+    """(B,) volume of what the particles fill over their own volume: less than at the start where they clump.
+
+    A cell counts with the share of it that particles fill, and a crowded one as full.
+    """
+    grid, scene = emulator.grid, emulator.scene
+    cells = grid.to_cells(torch.where(start.mask.unsqueeze(-1), position, position.new_tensor(scene.domain).mean(1)))
+    count = emulator.transfer.p2g(start.mask.unsqueeze(-1).float(), cells, grid)
+    fraction = count * (scene.particle_volume / grid.cell_volume)
+    own = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
+    return fraction.clamp(max=1.0).flatten(1).sum(1) / own
+
+
+def _largest(values: Tensor, real: Tensor) -> Tensor:
+    """(B, T): largest of (B, T, N) over real particles, 0 where there are none."""
+    if not values.shape[-1]:
+        return values.new_zeros(values.shape[:2])
+    return torch.where(real.unsqueeze(1), values, 0.0).amax(-1)
+
+
+def _tiny(scene: Scene) -> float:
+    """An energy that nobody would see: of a speed of a millionth of the domain per frame."""
+    return 0.5 * (1e-6 * max(high - low for low, high in scene.domain)) ** 2

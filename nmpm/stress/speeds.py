@@ -1,0 +1,76 @@
+"""Fast and slow: other initial speeds, other gravity."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import torch
+
+from nmpm.particles import Particles, Window
+from nmpm.rollouts import rollout
+from nmpm.sim import MpmPreset
+from nmpm.stress.course import MOST_GAIN, follow
+from nmpm.stress.lines import Line, Size
+from nmpm.stress.subject import Subject, simulated
+
+SPEEDS = (0.0, 1e-3, 1.0, 3.0, 10.0)
+GRAVITIES = (0.0, 0.5, 2.0, -1.0)
+
+_GROUP = "fast and slow"
+_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
+
+
+def speeds(subject: Subject, size: Size) -> Iterator[Line]:
+    """Initial speeds and gravity times a factor, beside the simulator where there is one."""
+    for factor in SPEEDS:
+        yield _line(subject, f"initial speed × {factor:g}", _faster(subject, factor, size))
+    for factor in GRAVITIES:
+        yield _line(subject, f"gravity × {factor:g}", _heavier(subject, factor, size))
+
+
+def compared(subject: Subject, window: Window) -> dict[str, float]:
+    """MSE against the simulator, in length², beside that of nothing moving; empty where there are no frames for it."""
+    frames = window.target.shape[1]
+    if not frames:
+        return {}
+    squared = (rollout(subject.emulator, window.initial, frames) - window.target).square().mean(-1)
+    still = (window.initial.position.unsqueeze(1) - window.target).square().mean(-1)
+    real = window.mask.unsqueeze(1).expand_as(squared)
+    return {"mse": float(squared[real].mean()), "mse_nothing_moves": float(still[real].mean())}
+
+
+def _line(subject: Subject, name: str, window: Window) -> Line:
+    frames = max(window.target.shape[1], subject.horizon)
+    predicted = rollout(subject.emulator, window.initial, frames)
+    course = follow(subject.emulator, window.initial, [predicted])
+    return Line(_GROUP, name, course.sound, course.figures() | compared(subject, window), _NEEDS)
+
+
+def _faster(subject: Subject, factor: float, size: Size) -> Window:
+    preset = subject.simulator
+    if preset is not None:
+        blocks = dataclasses.replace(preset.blocks, speed=factor * preset.blocks.speed)
+        return simulated(dataclasses.replace(preset, blocks=blocks), subject.seeds(size.scenes), size.compared)
+    state = subject.starts(size.scenes)
+    return alone(state.moved(state.position, factor * state.velocity))
+
+
+def _heavier(subject: Subject, factor: float, size: Size) -> Window:
+    preset = subject.simulator
+    if preset is not None:
+        return simulated(_weighed(preset, factor), subject.seeds(size.scenes), size.compared)
+    state = subject.starts(size.scenes)
+    return alone(dataclasses.replace(state, gravity=factor * state.gravity))
+
+
+def _weighed(preset: MpmPreset, factor: float) -> MpmPreset:
+    return dataclasses.replace(preset, gravity=tuple(factor * g for g in preset.gravity))
+
+
+def alone(state: Particles) -> Window:
+    """A window that holds nothing but a state: its two frames, and none to compare with."""
+    others = {
+        f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in ("position", "velocity")
+    }
+    return Window(frames=torch.stack([state.position - state.velocity, state.position], dim=1), **others)

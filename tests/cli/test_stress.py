@@ -1,0 +1,45 @@
+import json
+
+import pytest
+
+from nmpm.cli import main
+
+
+def test_one_group_of_a_zoo_model_as_json(capsys, tmp_path):
+    assert main(["stress", "goop", "--groups", "poison", "--json", "--report", str(tmp_path)]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert plain["model"] == "goop"
+    assert [line["passed"] for line in plain["lines"]] == [True] * 5
+    assert json.loads((tmp_path / "stress.json").read_text()) == plain
+
+
+def test_a_table_for_people(capsys):
+    assert main(["stress", "waterdrop", "--groups", "poison"]) == 0
+    out = capsys.readouterr().out
+    assert "a weight that is no number" in out
+    assert "5 passed, 0 failed." in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["stress", "goop", "--groups", "speed"], "--groups speed: the groups are long, speeds"),
+        (["stress", "nothing"], "holds no model 'nothing'"),
+        (["stress", "nothing.ckpt"], "there is no such checkpoint"),
+        (["stress", "goop", "--preset", "nothing"], "no preset or file nothing"),
+    ],
+)
+def test_what_cannot_be_is_said(words, message, capsys):
+    assert main(words) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_failing_line_is_an_exit_status(monkeypatch, capsys):
+    from nmpm.cli import stress
+    from nmpm.stress import Line
+
+    monkeypatch.setattr(stress, "_measured", lambda *_, **__: [Line("long", "one", False, {}, "nothing")])
+    with pytest.raises(SystemExit) as exit_:
+        main(["stress", "goop"])
+    assert exit_.value.code == 1
+    assert "0 passed, 1 failed: one." in capsys.readouterr().out
