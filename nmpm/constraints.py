@@ -1,19 +1,54 @@
 """What a rollout may not do, whatever the network says.
 
-Each rule is a fact about the scenes, to be switched on where it holds. None acts in training, which has to see the
-network's own mistakes.
+Each rule is a fact about the scenes, to be switched on where it holds. But for the bounds, none acts in training, which
+has to see the network's own mistakes.
 
 All quantities are in grid units: cells, cells per frame.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
+
+
+def stop(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """What gets beyond the bounds is stopped there."""
+    return torch.maximum(torch.minimum(cells, high), low)
+
+
+def reflect(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """What gets beyond the bounds is mirrored back, as by an elastic wall; stopped if that is beyond the other side."""
+    mirrored = torch.where(cells < low, 2 * low - cells, torch.where(cells > high, 2 * high - cells, cells))
+    return stop(mirrored, low, high)
+
+
+def refuse(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """What gets beyond the bounds by less than a cell is stopped there, as rounding errors are; more is an error.
+
+    Raises:
+        DataError: naming the first particle.
+    """
+    beyond = ((cells < low - 1) | (cells > high + 1)).any(-1)
+    if beyond.any():
+        scene, particle = map(int, beyond.nonzero()[0])
+        raise DataError(
+            f"Scene {scene} of the batch, particle {particle}: predicted at {cells[scene, particle].tolist()} cells,"
+            f" more than one beyond {low.tolist()} … {high.tolist()}; constraints.bounds = stop would hold it there."
+        )
+    return stop(cells, low, high)
+
+
+BOUNDS: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = MappingProxyType(
+    {"stop": stop, "reflect": reflect, "error": refuse}
+)
+"""What happens to positions (B, N, D) beyond the bounds (D,), by name."""
 
 
 @dataclass(frozen=True)
@@ -26,16 +61,20 @@ class Constraints:
         rest_speed: What moves less than so many cells per frame, on average over a bundle, stays where it is. To be set
             to the speed that the model sees in material that is at rest.
         solids: Nobody gets into obstacles.
+        bounds: What happens to what would leave the scene's bounds, one of `BOUNDS`; in training too.
 
     Raises:
-        ConfigError: if the speed is negative.
+        ConfigError: if the speed is negative, or the bounds' rule unknown.
     """
 
     energy: bool = False
     rest_speed: float = 0.0
     solids: bool = True
+    bounds: str = "stop"
 
     def __post_init__(self) -> None:
+        if self.bounds not in BOUNDS:
+            raise ConfigError(f"constraints.bounds = {self.bounds!r} is not one of {', '.join(BOUNDS)}.")
         if not self.rest_speed >= 0:
             raise ConfigError(f"constraints.rest_speed = {self.rest_speed} must not be negative.")
 

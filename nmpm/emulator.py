@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from nmpm.constraints import Constraints, at_rest, energy, within_budget
+from nmpm.constraints import BOUNDS, Constraints, at_rest, energy, within_budget
 from nmpm.contact import Contact
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
@@ -63,7 +63,7 @@ class Emulator(nn.Module):
         processor: Recipe of the network between.
         decoder: What the network's output means.
         grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training mode only.
-        constraints: What it is held to, in evaluation mode only.
+        constraints: What it is held to.
 
     Raises:
         ConfigError: if grid and processor do not suit each other.
@@ -257,11 +257,12 @@ class Emulator(nn.Module):
         return own
 
     def _confine(self, cells: Tensor) -> Tensor:
-        """Stop particles at the walls; periodic axes go on (positions there are unwrapped, transfers wrap)."""
+        """Keep particles within the walls; periodic axes go on (positions there are unwrapped, transfers wrap)."""
         if all(self.scene.periodic):
             return cells
-        held = torch.maximum(torch.minimum(cells, self.bounds[1]), self.bounds[0])
         wraps = torch.tensor(self.scene.periodic, device=cells.device)
+        inner = torch.where(wraps, self.bounds.mean(0), cells) if any(self.scene.periodic) else cells
+        held = BOUNDS[self.constraints.bounds](inner, self.bounds[0], self.bounds[1])
         return torch.where(wraps, cells, held) if any(self.scene.periodic) else held
 
 

@@ -9,21 +9,27 @@ from torch import Tensor
 
 from nmpm.emulator import Bundle, Emulator
 from nmpm.errors import DataError
+from nmpm.monitor import Monitor
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 
 
-def unroll(emulator: Emulator, particles: Particles, bundles: int) -> Iterator[Bundle]:
+def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
     Args:
         emulator: Predicts m frames a call.
         particles: The state to start from.
         bundles: How many calls to make.
+        monitor: Looks at each bundle before it is handed out.
     """
+    if monitor is not None:
+        monitor.start(emulator, particles)
     solid, budget = emulator.solid(particles), emulator.budget(particles)
     for _ in range(bundles):
         bundle = emulator(particles, solid, budget)
+        if monitor is not None:
+            monitor.see(emulator, particles, bundle)
         yield bundle
         particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
@@ -72,7 +78,7 @@ def check_weights(emulator: Emulator) -> None:
             raise DataError(f"The emulator's {name} holds numbers that are not finite: load a sound checkpoint.")
 
 
-def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Tensor]:
+def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Iterator[Tensor]:
     """Predict `frames` frames without gradients, handing out each bundle as it is made.
 
     Yields:
@@ -81,12 +87,13 @@ def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Te
     Raises:
         ValueError: if `frames` is negative.
         DataError: if the state or a weight holds what is not a finite number, or a particle is outside of the domain.
+        RolloutStoppedError: if the monitor says so.
     """
     if frames < 0:
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
     check_weights(emulator)
     check_state(emulator.scene, particles)
-    bundles = unroll(emulator, particles, -(-frames // emulator.frames))
+    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor)
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode
@@ -95,7 +102,7 @@ def stream(emulator: Emulator, particles: Particles, frames: int) -> Iterator[Te
         yield position
 
 
-def rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
+def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Tensor:
     """Predict `frames` frames without gradients.
 
     Returns:
@@ -104,8 +111,9 @@ def rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
     Raises:
         ValueError: if `frames` is negative.
         DataError: if the state or a weight holds what is not a finite number, or a particle is outside of the domain.
+        RolloutStoppedError: if the monitor says so.
     """
-    bundles = list(stream(emulator, particles, frames))
+    bundles = list(stream(emulator, particles, frames, monitor))
     if not bundles:
         return particles.position.new_zeros(particles.position.shape[0], 0, *particles.position.shape[1:])
     return torch.cat(bundles, dim=1)

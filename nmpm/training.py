@@ -52,7 +52,7 @@ class EmulatorModule(LightningModule):
         transfer: How particles and grid see each other.
         processor: The network on the grid.
         decoder: What the network's output means.
-        constraints: Facts that rollouts are held to; they do not act in training.
+        constraints: Facts that rollouts are held to; but for the bounds they do not act in training.
         optimizer: Makes the optimizer from the parameters.
         schedule: The learning rate's course over the training.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.

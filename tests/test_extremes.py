@@ -1,6 +1,8 @@
 """The building blocks at the extremes: counts, places, shapes, scales, precision, poison."""
 
 import dataclasses
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -211,3 +213,18 @@ class TestPoison:
         position[0, 5] = 9.0
         padded = dataclasses.replace(particles, position=position, mask=mask)
         assert rollout(emulator_of(scene), padded, 2).isfinite().all()
+
+
+def test_gradients_at_places_that_are_no_numbers_do_not_end_the_process():
+    """Torch's sampler crashes there on a CPU, so another process tries it."""
+    program = """
+import torch
+from nmpm.grid import Grid
+from nmpm.transfer import Linear
+field = torch.randn(2, 2, 64, 64).to(memory_format=torch.channels_last).requires_grad_()
+cells = 64 * torch.rand(2, 1800, 2)
+cells[0, ::3], cells[1, ::5] = float("nan"), float("inf")
+Linear().g2p(field, cells.requires_grad_(), Grid((64, 64), (0.0, 0.0), (1.0, 1.0), (False, False))).sum().backward()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

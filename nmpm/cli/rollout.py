@@ -28,6 +28,12 @@ def run(words: list[str]) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
     parser.add_argument("--particles", type=int, default=1000, help="about how many to throw (default: 1000)")
     parser.add_argument("--blocks", type=int, default=1, help="into how many blocks (default: 1)")
+    parser.add_argument(
+        "--watch",
+        choices=["warn", "stop", "record"],
+        default="warn",
+        help="where speed, energy or crowding leave what the model is known for: warn (default), stop, or only record",
+    )
     chosen = parser.parse_args(words[1:])
     if chosen.frames < 1:
         raise ConfigError(f"--frames {chosen.frames}: ask for at least 1 frame.")
@@ -43,7 +49,7 @@ def run(words: list[str]) -> None:
             raise ConfigError(f"{error} Use fewer --particles or more --blocks.") from error
     else:
         state = _recorded(model, chosen.data, chosen.trajectory)
-    _write(model, chosen.name, state, chosen.frames, chosen.out)
+    _write(model, state, chosen)
     sys.stdout.write(f"wrote {chosen.frames + 2} frames of {state.position.shape[1]} particles to {chosen.out}\n")
 
 
@@ -67,15 +73,19 @@ def _family(model: Pretrained) -> str | None:
     return "deepmind" if set(model.scene.materials) <= known else None
 
 
-def _write(model: Pretrained, name: str, state: Particles, frames: int, path: Path) -> None:
+def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
     """The two frames of the start, then the prediction, with what is needed to draw it."""
     import torch
     from rich.progress import track
 
     from nmpm.data.format import write_split
     from nmpm.export import predicted_trajectory
+    from nmpm.monitor import Monitor, Policy
     from nmpm.rollouts import stream
 
-    bundles = -(-frames // model.emulator.frames)
-    parts = list(track(stream(model.emulator, state, frames), "rollout", total=bundles, transient=True))
-    write_split(path, [predicted_trajectory(model.scene, state, torch.cat(parts, dim=1), f"the zoo model {name}")])
+    bundles, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
+    made = stream(model.emulator, state, chosen.frames, monitor)
+    parts = list(track(made, "rollout", total=bundles, transient=True))
+    origin = f"the zoo model {chosen.name}"
+    write_split(chosen.out, [predicted_trajectory(model.scene, state, torch.cat(parts, dim=1), origin)])
+    sys.stdout.write(monitor.report() + "\n")

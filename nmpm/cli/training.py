@@ -14,6 +14,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.divergence import DivergenceGuard
 from nmpm.errors import ConfigError
 from nmpm.plugins import load_plugins
 from nmpm.prediction_writer import PredictionWriter
@@ -54,7 +55,7 @@ class EmulatorCLI(LightningCLI):
             table = CSVLogger(config["default_root_dir"], name="logs")
             kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
             kwargs.setdefault("callbacks", []).append(LearningRateMonitor("step"))
-        kwargs.setdefault("callbacks", []).extend([Report(), PredictionWriter()])
+        kwargs.setdefault("callbacks", []).extend([DivergenceGuard(), Report(), PredictionWriter()])
         return super().instantiate_trainer(**kwargs)
 
     def _parse_ckpt_path(self) -> None:

@@ -176,3 +176,16 @@ def test_help_answers_at_once_and_knows_every_command():
 @pytest.mark.parametrize("words", [[], ["fly"]])
 def test_wrong_calls_exit_with_2(words):
     assert main(words) == 2
+
+
+def test_a_diverged_run_stops_with_the_reason_and_keeps_the_last_good_checkpoint(make_dataset, capsys):
+    data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
+    words = ["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]
+    wild = ["--model.optimizer.lr", "1e30", "--trainer.max_steps", "50", "--model.schedule.warmup", "3"]
+    assert main([*words, *wild, "--trainer.val_check_interval", "50", "--trainer.log_every_n_steps", "1"]) == 1
+    told = capsys.readouterr().err
+    assert "The training has diverged: at step" in told
+    for path in Path("run/checkpoints").glob("*.ckpt"):
+        saved = torch.load(path, weights_only=True)
+        assert all(value.isfinite().all() for value in saved["state_dict"].values())
+        assert str(path) in told

@@ -1,0 +1,66 @@
+"""A training that has diverged is stopped before it writes a checkpoint of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch import Tensor
+
+from nmpm.errors import NmpmError
+
+
+class DivergedError(NmpmError):
+    """A training has come to weights or a loss that are not finite."""
+
+
+class DivergenceGuard(Callback):
+    """Looks at the loss every `log_every_n_steps` steps, and at the weights before each checkpoint and at the end.
+
+    Raises:
+        DivergedError: naming what is not finite, and the last good checkpoint.
+    """
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,
+        batch: Any,  # noqa: ARG002
+        batch_idx: int,  # noqa: ARG002
+    ) -> None:
+        if trainer.global_step % max(1, trainer.log_every_n_steps):  # type: ignore[attr-defined]  # (Lightning sets it)
+            return
+        loss = outputs["loss"] if isinstance(outputs, dict) else outputs
+        if isinstance(loss, Tensor) and not torch.isfinite(loss).all():
+            raise self._diverged(trainer, f"the loss is {float(loss)}")
+
+    def on_save_checkpoint(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,  # noqa: ARG002
+        checkpoint: dict[str, Any],
+    ) -> None:
+        for name, values in checkpoint["state_dict"].items():
+            if not torch.isfinite(values).all():
+                raise self._diverged(trainer, f"the weights {name} are not finite")
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        for name, values in pl_module.named_parameters():
+            if not torch.isfinite(values).all():
+                raise self._diverged(trainer, f"the weights {name} are not finite")
+
+    def _diverged(self, trainer: Trainer, what: str) -> DivergedError:
+        good = [
+            Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}"
+            for saver in trainer.checkpoint_callbacks
+            if isinstance(saver, ModelCheckpoint)
+        ]
+        kept = [str(path) for path in good if path.is_file()]
+        return DivergedError(
+            f"The training has diverged: at step {trainer.global_step} {what}. Lower the learning rate, clip gradients"
+            f" harder, or unroll fewer bundles. Good checkpoints: {', '.join(kept) or 'none was written yet'}."
+        )
