@@ -14,9 +14,9 @@ from typing import Any
 import yaml
 from safetensors.torch import save
 
+from nmpm.checkpoints import load_module
 from nmpm.comparison import PREDICTORS, figure_names, table_row
 from nmpm.errors import ZooError
-from nmpm.training import EmulatorModule
 from nmpm.zoo import check_name, emulator_config
 
 
@@ -42,7 +42,7 @@ def add(run: Path, name: str, root: Path, about: str = "") -> Path:
     target = root / check_name(name)
     if (target / "card.yaml").exists():
         raise ZooError(f"{target} exists: choose another name, or remove it first.")
-    module = EmulatorModule.load_from_checkpoint(checkpoint, map_location="cpu", weights_only=True)
+    module = load_module(checkpoint)
     weights = save({key: value.contiguous() for key, value in module.emulator.state_dict().items()})
     figures = json.loads(report.read_text())
     card = _card(name, about, figures, hashlib.sha256(weights).hexdigest())

@@ -22,6 +22,7 @@ from typing import Any
 
 import torch
 import yaml
+from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
@@ -177,7 +178,10 @@ def _weights(path: Path, card: Mapping[str, Any]) -> dict[str, Tensor]:
         raise ZooError(f"{path} cannot be read: {error}") from error
     if hashlib.sha256(content).hexdigest() != card.get("sha256"):
         raise ZooError(f"{path} is not the file that card.yaml was written for (its SHA-256 differs): fetch it again.")
-    weights = load(content)
+    try:
+        weights = load(content)
+    except SafetensorError as error:
+        raise ZooError(f"{path} is not a file of tensors: {error}") from error
     for name, tensor in weights.items():
         if not torch.isfinite(tensor).all():
             raise ZooError(f"{path}: {name} holds numbers that are not finite.")

@@ -49,11 +49,9 @@ def _subject(model: str, preset: str | None, seed: int) -> Subject:
 
     path = Path(model)
     if path.suffix == ".ckpt" or path.is_file():
-        from nmpm.training import EmulatorModule
+        from nmpm.checkpoints import load_module
 
-        if not path.is_file():
-            raise ConfigError(f"{path}: there is no such checkpoint.")
-        module = EmulatorModule.load_from_checkpoint(path, map_location="cpu", weights_only=True)
+        module = load_module(path)
         emulator, horizon = module.emulator, module.emulator.frames * module.unroll
         known = _preset(preset)
     else:

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
+from nmpm.checkpoints import check_checkpoint
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.divergence import DivergenceGuard
 from nmpm.errors import ConfigError
@@ -62,17 +63,39 @@ class EmulatorCLI(LightningCLI):
         """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""
 
     def before_fit(self) -> None:
-        """Refuse to write a new run over an old one.
+        """Refuse to write a new run over an old one, or to go on from a damaged checkpoint.
 
         Raises:
             ConfigError: if the folder holds a run and no checkpoint is to be continued.
+            DataError: if the checkpoint cannot be read.
         """
+        self._check_checkpoint()
         folder = Path(self.trainer.default_root_dir)
         if not self.config_init[self.subcommand].get("ckpt_path") and (folder / "checkpoints" / "last.ckpt").exists():
             raise ConfigError(
                 f"{folder} already holds a run. Go on with it by adding --ckpt_path last, or choose another folder "
                 "with --trainer.default_root_dir."
             )
+
+    def before_validate(self) -> None:
+        self._check_checkpoint()
+
+    def before_test(self) -> None:
+        self._check_checkpoint()
+
+    def before_predict(self) -> None:
+        self._check_checkpoint()
+
+    def _check_checkpoint(self) -> None:
+        given = self.config_init[self.subcommand].get("ckpt_path")
+        if not given:
+            return
+        names = {
+            name: Path(self.trainer.default_root_dir) / "checkpoints" / f"{name}.ckpt" for name in ("last", "best")
+        }
+        path = names.get(str(given), Path(given))
+        if given not in names or path.is_file():  # (Lightning says where it looked for those)
+            check_checkpoint(path)
 
     def after_fit(self) -> None:
         """Judge the last weights too, if no validation has, and test the best ones, once."""
