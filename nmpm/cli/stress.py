@@ -26,17 +26,21 @@ def run(words: list[str]) -> None:
     parser.add_argument("model", help="a model of the zoo, or a checkpoint: runs/goop/checkpoints/best.ckpt")
     parser.add_argument("--full", action="store_true", help="all of it, as zoo cards quote (default: reduced, minutes)")
     parser.add_argument("--preset", help="simulator of its scenes (default: of the zoo model's name; none if recorded)")
+    parser.add_argument("--free", action="store_true", help="without the model's constraints: the network's own doing")
     parser.add_argument("--groups", nargs="+", metavar="GROUP", help="only these groups of tests")
     parser.add_argument("--seed", type=int, default=0, help="of the scenes (default: 0)")
     parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write stress.json, stress.md and stress.png there")
     chosen = parser.parse_args(words[1:])
+    from nmpm.constraints import Constraints
     from nmpm.stress import FULL, GROUPS, QUICK
 
     unknown = sorted(set(chosen.groups or ()) - set(GROUPS))
     if unknown:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
     subject = _subject(chosen.model, chosen.preset, chosen.seed)
+    if chosen.free:
+        subject.emulator.constraints = Constraints(solids=False)
     start = time.monotonic()
     lines = _measured(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS), quiet=chosen.json)
     _hand_out(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)
