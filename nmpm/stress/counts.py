@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
-
-import torch
 
 from nmpm.particles import Particles
 from nmpm.rollouts import rollout, stream
@@ -27,7 +26,7 @@ def counts(subject: Subject, size: Size) -> Iterator[Line]:
     for factor in (0.5, 2.0):
         yield _denser(subject, factor, size)
     yield _nothing(subject)
-    yield _full(subject)
+    yield _full(subject, size)
 
 
 def _finer(subject: Subject, size: Size) -> Iterator[Line]:
@@ -69,10 +68,12 @@ def _nothing(subject: Subject) -> Line:
     return Line(_GROUP, "no particle", predicted.shape == (1, subject.horizon, 0, predicted.shape[-1]), {}, "no error")
 
 
-def _full(subject: Subject) -> Line:
-    """Nowhere to go: what fills the box hardly moves."""
+def _full(subject: Subject, size: Size) -> Line:
+    """Nowhere to go: what fills the box hardly moves. The particles are coarser where too many would be needed."""
     scene = subject.emulator.scene
-    state = resting(scene, lattice(scene.bounds, scene.particle_volume ** (1 / scene.dim)))
+    volume = max(scene.particle_volume, _volume(scene) / size.particles)
+    scene = dataclasses.replace(scene, particle_volume=volume)
+    state = resting(scene, lattice(scene.bounds, volume ** (1 / scene.dim)))
     course = _run(subject, scene, state, 4 * subject.horizon)
     cells = (course.last - state.position) / state.position.new_tensor(subject.emulator.grid.spacing)
     figures = course.figures() | {"moved_cells": float(cells.square().sum(-1).mean().sqrt())}
@@ -85,5 +86,4 @@ def _run(subject: Subject, scene: Scene, state: Particles, frames: int) -> Cours
 
 
 def _volume(scene: Scene) -> float:
-    sides = [high - low for low, high in scene.bounds]
-    return float(torch.tensor(sides).prod())
+    return math.prod(high - low for low, high in scene.bounds)
