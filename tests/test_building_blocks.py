@@ -39,7 +39,7 @@ def test_masses_over_twelve_orders_of_magnitude_keep_the_light_ones(transfer):
 
 @pytest.mark.slow
 def test_ten_million_terms_in_float32_are_right_to_a_thousandth():
-    """1250 to a cell of 8000, as many as a scene of ten million has; the error is that of adding one after the other."""
+    """1250 to a cell, as a scene of ten million has; the error is that of adding one after the other."""
     grid, count = grid_of(100, 80), 10_000_000
     cells = torch.rand(1, count, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([100.0, 80.0])
     values = torch.full((1, count, 1), 0.1)

@@ -32,7 +32,7 @@ def duration(subject: Subject, size: Size) -> Iterator[Line]:
     frames = size.horizons * subject.horizon
     long = run(subject, state, frames)
     needs = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
-    curves = {"energy, % above the start": _thinned(100 * long.gain.amax(0))}
+    curves = {"energy, % above the start": (_thinned(100 * long.gain.amax(0)), frames)}
     yield Line(
         _GROUP, f"{size.horizons} training horizons ({frames} frames)", long.sound, long.figures(), needs, curves
     )  # fmt: skip
@@ -69,7 +69,7 @@ def settled(subject: Subject, course: Course, state: Particles, size: Size) -> I
     yield Line(
         _GROUP, f"volume of settled material, {size.settled:,} frames", change <= MOST_LOST,
         {"change_percent": 100 * change} | before, f"filled volume within {MOST_LOST:.0%}",
-        {"filled volume, % change": _thinned(100 * ratio.mean(0))},
+        {"filled volume, % change": (_thinned(100 * ratio.mean(0)), size.settled)},
     )  # fmt: skip
     drift = _drift(subject, rest, rest.position, long.last, size.settled)
     yield Line(

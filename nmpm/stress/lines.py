@@ -16,7 +16,7 @@ class Line:
         passed: Whether the invariant holds; None for figures that are reported without a verdict.
         figures: What was measured, by name; names end with their unit where there is one.
         needs: The invariant in words; empty for mere reports.
-        curves: What may be drawn against frames, by name.
+        curves: What may be drawn, by name: values evenly spaced over the rollout, and its number of frames.
     """
 
     group: str
@@ -24,7 +24,7 @@ class Line:
     passed: bool | None
     figures: Mapping[str, float]
     needs: str = ""
-    curves: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    curves: Mapping[str, tuple[Sequence[float], int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -76,15 +76,15 @@ def _markdown(lines: Sequence[Line]) -> str:
 
 
 def _draw(path: Path, lines: Sequence[Line]) -> None:
-    """The curves, one panel each, and all verdicts beside them."""
+    """The curves, one panel each."""
     from matplotlib.figure import Figure
 
-    curves = [(line.name, name, values) for line in lines for name, values in line.curves.items()]
-    figure = Figure(figsize=(11, 2.6 * max(1, len(curves)) + 0.4), layout="constrained")
+    curves = [(line.name, name, *curve) for line in lines for name, curve in line.curves.items()]
+    figure = Figure(figsize=(9, 2.6 * max(1, len(curves))), layout="constrained")
     panels = figure.subplots(max(1, len(curves)), 1, squeeze=False)[:, 0]
-    for panel, (title, name, values) in zip(panels, curves, strict=False):
-        panel.plot([index / max(1, len(values) - 1) for index in range(len(values))], values, lw=1.2)
+    for panel, (title, name, values, frames) in zip(panels, curves, strict=False):
+        panel.plot([frames * (index + 1) / len(values) for index in range(len(values))], values, lw=1.2)
         panel.axhline(0, color="0.7", lw=0.8)
-        panel.set(title=title, ylabel=name, xlabel="share of the rollout")
+        panel.set(title=title, ylabel=name, xlabel="frame")
     with replacing(path) as part:
         figure.savefig(part, dpi=110, format="png")

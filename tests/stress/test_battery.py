@@ -145,7 +145,7 @@ def test_a_wider_scene_has_the_same_wall_layers():
 
 def test_report_files(tmp_path):
     lines = [
-        Line("long", "one", True, {"drift": 0.1}, "small", {"drift": [0.0, 0.1]}),
+        Line("long", "one", True, {"drift": 0.1}, "small", {"drift": ([0.0, 0.1], 2)}),
         Line("long", "two", False, {}, "none"),
         Line("size", "three", None, {"mse": 1e-4}),
     ]
