@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -14,13 +14,14 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.optim import Optimizer
+from torch.utils.checkpoint import checkpoint
 
 from nmpm.augmentation import check_mirrors, mirrored
 from nmpm.calibration import calibrate
 from nmpm.comparison import Comparison
 from nmpm.constraints import Constraints
 from nmpm.decoders import Decoder, Residual
-from nmpm.emulator import Emulator
+from nmpm.emulator import Bundle, Emulator
 from nmpm.losses import position_error
 from nmpm.metrics import EarthMover
 from nmpm.particles import Particles, Window
@@ -60,6 +61,8 @@ class EmulatorModule(LightningModule):
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         horizons: Frames at which rollout errors are reported, beside the full rollout.
         emd: Every how many frames to compute the exact earth mover's distance in tests; 0 for never (it is slow).
+        recompute: Whether gradients recompute each bundle instead of keeping what they need of it: the memory of one
+            bundle instead of K, for the time of one more forward pass.
         seed: Of the noise.
     """
 
@@ -80,6 +83,7 @@ class EmulatorModule(LightningModule):
         mirror: Sequence[int] = (),
         horizons: Sequence[int] = (1, 8, 32, 100),
         emd: int = 0,
+        recompute: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -93,6 +97,7 @@ class EmulatorModule(LightningModule):
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
         self.position_noise, self.mirror = position_noise, tuple(mirror)
+        self.recompute = recompute
         self.seed = seed
         self.save_hyperparameters(
             {
@@ -110,6 +115,7 @@ class EmulatorModule(LightningModule):
                 "mirror": list(mirror),
                 "horizons": list(horizons),
                 "emd": emd,
+                "recompute": recompute,
                 "seed": seed,
             },
             logger=False,
@@ -153,7 +159,7 @@ class EmulatorModule(LightningModule):
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
         for axis in self.mirror:
             batch = mirrored(batch, self.emulator.scene, axis, torch.rand(len(batch.frames), device=self.device) < 0.5)
-        bundles = unroll(self.emulator, self._perturbed(batch.initial), self.unroll)
+        bundles = self._unrolled(self._perturbed(batch.initial))
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
         loss = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
         self.log("train/loss", loss, prog_bar=True)
@@ -198,6 +204,16 @@ class EmulatorModule(LightningModule):
             optimizer, lambda step: self.schedule.factor(max(step, self._clock() * total), total)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def _unrolled(self, particles: Particles) -> Iterator[Bundle]:
+        if not self.recompute:
+            yield from unroll(self.emulator, particles, self.unroll)
+            return
+        solid = self.emulator.solid(particles)
+        for _ in range(self.unroll):
+            bundle: Bundle = checkpoint(self.emulator, particles, solid, use_reentrant=False)
+            yield bundle
+            particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
     def _clock(self) -> float:
         """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine."""

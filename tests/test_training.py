@@ -191,3 +191,30 @@ def test_kill_9_in_mid_training_loses_nothing_but_time(make_dataset, tmp_path):
     assert states[0]["global_step"] == states[1]["global_step"] == 30
     for name, value in states[1]["state_dict"].items():
         assert torch.equal(value, states[0]["state_dict"][name]), name
+
+
+def test_recomputed_gradients_are_the_same_to_the_bit_for_less_memory(make_dataset):
+    data = data_of(make_dataset())
+    data.setup("fit")
+    window = next(iter(data.train_dataloader()))
+
+    def gradients(recompute: bool) -> tuple[list[torch.Tensor], int]:
+        module = module_of(data, recompute=recompute)
+        module.log = lambda *_, **__: None
+        kept = 0
+
+        def count(tensor: torch.Tensor) -> torch.Tensor:
+            nonlocal kept
+            kept += tensor.numel()
+            return tensor
+
+        torch.manual_seed(1)  # the same noise
+        with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+            loss = module.training_step(window, 0)
+        loss.backward()
+        return [p.grad for p in module.parameters()], kept
+
+    (plain, held), (recomputed, less) = gradients(False), gradients(True)
+    assert less < held / 4
+    for one, other in zip(plain, recomputed, strict=True):
+        assert torch.equal(one, other)
