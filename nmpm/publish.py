@@ -24,7 +24,8 @@ def add(run: Path, name: str, root: Path, about: str = "") -> Path:
     """Turn a run's best checkpoint and report into the zoo entry `root/name`.
 
     Args:
-        run: The run's folder, as `nmpm fit` left it.
+        run: The run's folder, as `nmpm fit` left it; with a `stress.json` in it, from `nmpm stress --report`, the card
+            says how the model fares at the extremes.
         name: What the model is to be called.
         root: The zoo's folder.
         about: What the data are and where they come from, in words, for the card.
@@ -46,6 +47,8 @@ def add(run: Path, name: str, root: Path, about: str = "") -> Path:
     weights = save({key: value.contiguous() for key, value in module.emulator.state_dict().items()})
     figures = json.loads(report.read_text())
     card = _card(name, about, figures, hashlib.sha256(weights).hexdigest())
+    if (run / "stress.json").is_file():
+        card["stress"] = stress_digest(json.loads((run / "stress.json").read_text()))
     target.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(prefix=".adding-", dir=target.parent))
     try:
@@ -60,6 +63,16 @@ def add(run: Path, name: str, root: Path, about: str = "") -> Path:
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return target
+
+
+def stress_digest(report: Mapping[str, Any]) -> dict[str, Any]:
+    """What a card says of `nmpm stress`: how much was run, how many lines passed, and which failed."""
+    lines = report["lines"]
+    return {
+        "size": report["size"],
+        "passed": sum(line["passed"] is True for line in lines),
+        "failed": [f"{line['group']}: {line['name']}" for line in lines if line["passed"] is False],
+    }
 
 
 def _card(name: str, about: str, figures: Mapping[str, Any], digest: str) -> dict[str, Any]:
@@ -95,6 +108,7 @@ def _readme(card: Mapping[str, Any], pictured: bool) -> str:
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
         f"{training['precision']}; {training['parameters']:,} parameters.",
         "",
+        *_stressed(card),
         "```python",
         "from nmpm import Zoo",
         "",
@@ -104,6 +118,14 @@ def _readme(card: Mapping[str, Any], pictured: bool) -> str:
     ]
     lines += ["", "![rollout](rollout.png)"] if pictured else []
     return "\n".join(lines) + "\n"
+
+
+def _stressed(card: Mapping[str, Any]) -> list[str]:
+    if "stress" not in card:
+        return []
+    found = card["stress"]
+    failed = "; ".join(found["failed"]) or "none"
+    return [f"`nmpm stress`, {found['size']}: {found['passed']} lines passed; failed: {failed}.", ""]
 
 
 def _yaml(content: Mapping[str, Any]) -> str:

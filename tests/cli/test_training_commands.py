@@ -111,7 +111,11 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert len(predictions) == 1
     assert predictions.read(0).position.shape == (40, 9, 2)
     assert main(["render", "run/predictions.h5"]) == 0
+    assert main(["stress", "run/checkpoints/best.ckpt", "--groups", "poison", "--report", "run"]) == 0
     assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 0
+    stress = {"size": "quick", "passed": 5, "failed": []}
+    assert Zoo.card("drop/tiny", root=tmp_path / "zoo")["stress"] == stress
+    assert "quick: 5 lines passed; failed: none." in Path("zoo/drop/tiny/README.md").read_text()
     assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 1
     assert "exists" in capsys.readouterr().err
     model = Zoo.load("drop/tiny", root=tmp_path / "zoo")
