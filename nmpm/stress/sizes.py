@@ -13,9 +13,9 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.rollouts import rollout
 from nmpm.scene import Scene
-from nmpm.stress.course import MOST_GAIN, follow
+from nmpm.stress.course import MOST_GAIN
 from nmpm.stress.lines import Line, Size
-from nmpm.stress.speeds import alone, compared
+from nmpm.stress.speeds import alone, judged
 from nmpm.stress.subject import Subject, simulated
 
 _GROUP = "size and symmetry"
@@ -43,9 +43,8 @@ def _wide(subject: Subject, times: int, size: Size) -> Line:
         wide = subject.over(subject.emulator.over(scene))
     except ConfigError as error:
         return Line(_GROUP, f"{name}: {error}", None, {})
-    frames = max(window.target.shape[1], subject.horizon)
-    course = follow(wide.emulator, window.initial, [rollout(wide.emulator, window.initial, frames)])
-    return Line(_GROUP, name, course.sound, course.figures() | compared(wide, window), _NEEDS)
+    course, figures = judged(wide, window)
+    return Line(_GROUP, name, course.sound, figures, _NEEDS)
 
 
 def widened(scene: Scene, times: int) -> Scene:
@@ -71,10 +70,8 @@ def _regridded(subject: Subject, name: str, factor: float, size: Size) -> Line:
     other.load_state_dict(mine.state_dict())
     window = simulated(subject.preset, subject.seeds(size.scenes), size.compared) if subject.preset else None
     window = window or alone(subject.starts(1))
-    regridded = subject.over(other.eval())
-    frames = max(window.target.shape[1], subject.horizon)
-    course = follow(other, window.initial, [rollout(other, window.initial, frames)])
-    return Line(_GROUP, f"grid {name}", None, course.figures() | compared(regridded, window))
+    _, figures = judged(subject.over(other.eval()), window)
+    return Line(_GROUP, f"grid {name}", None, figures)
 
 
 def _symmetries(subject: Subject, size: Size) -> Iterator[Line]:

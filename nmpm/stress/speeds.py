@@ -10,7 +10,7 @@ import torch
 from nmpm.particles import Particles, Window
 from nmpm.rollouts import rollout
 from nmpm.sim import MpmPreset
-from nmpm.stress.course import MOST_GAIN, follow
+from nmpm.stress.course import MOST_GAIN, Course, follow
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject, simulated
 
@@ -29,22 +29,26 @@ def speeds(subject: Subject, size: Size) -> Iterator[Line]:
         yield _line(subject, f"gravity × {factor:g}", _heavier(subject, factor, size))
 
 
-def compared(subject: Subject, window: Window) -> dict[str, float]:
-    """MSE against the simulator, in length², beside that of nothing moving; empty where there are no frames for it."""
+def judged(subject: Subject, window: Window) -> tuple[Course, dict[str, float]]:
+    """A rollout of a window's scenes, and its figures: MSE against the simulator where the window holds its frames.
+
+    The MSE, in length², stands beside that of nothing moving.
+    """
     frames = window.target.shape[1]
+    predicted = rollout(subject.emulator, window.initial, max(frames, subject.horizon))
+    course = follow(subject.emulator, window.initial, [predicted])
     if not frames:
-        return {}
-    squared = (rollout(subject.emulator, window.initial, frames) - window.target).square().mean(-1)
+        return course, course.figures()
+    squared = (predicted[:, :frames] - window.target).square().mean(-1)
     still = (window.initial.position.unsqueeze(1) - window.target).square().mean(-1)
     real = window.mask.unsqueeze(1).expand_as(squared)
-    return {"mse": float(squared[real].mean()), "mse_nothing_moves": float(still[real].mean())}
+    errors = {"mse": float(squared[real].mean()), "mse_nothing_moves": float(still[real].mean())}
+    return course, course.figures() | errors
 
 
 def _line(subject: Subject, name: str, window: Window) -> Line:
-    frames = max(window.target.shape[1], subject.horizon)
-    predicted = rollout(subject.emulator, window.initial, frames)
-    course = follow(subject.emulator, window.initial, [predicted])
-    return Line(_GROUP, name, course.sound, course.figures() | compared(subject, window), _NEEDS)
+    course, figures = judged(subject, window)
+    return Line(_GROUP, name, course.sound, figures, _NEEDS)
 
 
 def _faster(subject: Subject, factor: float, size: Size) -> Window:

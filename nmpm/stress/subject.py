@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -41,10 +42,16 @@ class Subject:
         return self.preset if isinstance(self.preset, MpmPreset) else None
 
     def starts(self, count: int) -> Particles:
-        """Initial states of the scenes that the model was trained for: the simulator's, else thrown blocks."""
+        """Initial states of the scenes that the model was trained for: the simulator's, else one thrown block.
+
+        Args:
+            count: Scenes; without a simulator there is one.
+        """
         if self.preset is not None:
             return simulated(self.preset, self.seeds(count), 0).initial
-        return thrown_blocks(self.emulator.scene, count=1000, seed=self.seed)
+        scene = self.emulator.scene
+        room = math.prod(high - low for low, high in scene.bounds)
+        return thrown_blocks(scene, count=max(1, min(1000, int(0.1 * room / scene.particle_volume))), seed=self.seed)
 
     def seeds(self, count: int) -> list[int]:
         """Seeds of scenes that no dataset holds."""
