@@ -1,0 +1,81 @@
+"""What constraints and the monitor cost a rollout, each beside the free one, in turns within one run.
+
+python benchmarks/constraints.py --zoo goop waterramps --frames 400 --repeats 9
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+import torch
+
+from nmpm.constraints import Constraints
+from nmpm.monitor import Monitor, Policy
+from nmpm.rollouts import rollout
+from nmpm.sim import load_preset
+from nmpm.stress.subject import Subject
+from nmpm.zoo import Zoo
+
+FREE = Constraints(solids=False)
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Seconds of the processor: what else runs on the machine counts less than in those of the clock."""
+    start = time.process_time()
+    action()
+    return time.process_time() - start
+
+
+def measure(name: str, frames: int, repeats: int) -> None:
+    """Print ratios for a zoo model, on one scene of its simulator."""
+    emulator = Zoo.load(name).emulator
+    state = Subject(name, emulator, 32, load_preset(name)).starts(1)
+    forms: dict[str, Callable[[], object]] = {}
+
+    def form(constraints: Constraints, monitor: Monitor | None = None) -> Callable[[], object]:
+        def action() -> object:
+            emulator.constraints = constraints
+            return rollout(emulator, state, frames, monitor)
+
+        return action
+
+    held = dataclasses.replace(FREE, energy=True, rest_speed=0.01, solids=True)
+    forms["free"] = form(FREE)
+    forms["energy"] = form(dataclasses.replace(FREE, energy=True))
+    forms["rest"] = form(dataclasses.replace(FREE, rest_speed=0.01))
+    forms["solids"] = form(dataclasses.replace(FREE, solids=True))
+    forms["all"] = form(held)
+    forms["free, watched"] = form(FREE, Monitor(Policy.RECORD))
+    seconds: dict[str, list[float]] = {key: [] for key in forms}
+    for _ in range(repeats + 1):
+        for key, action in forms.items():
+            seconds[key].append(timed(action))
+    bundles = -(-frames // emulator.frames)
+    for key, values in seconds.items():
+        ratios = [value / free for value, free in zip(values[1:], seconds["free"][1:], strict=True)]
+        call = 1e3 * statistics.median(values[1:]) / bundles
+        sys.stdout.write(
+            f"{name:<12}{key:<16}{call:6.2f} ms/call   {statistics.median(ratios):.3f} of free"
+            f" ({min(ratios):.3f}-{max(ratios):.3f})\n"
+        )
+
+
+def main() -> None:
+    """Measure each model."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--zoo", nargs="+", default=["goop", "waterramps"])
+    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--repeats", type=int, default=9)
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    for name in chosen.zoo:
+        measure(name, chosen.frames, chosen.repeats)
+
+
+if __name__ == "__main__":
+    main()
