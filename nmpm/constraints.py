@@ -3,7 +3,7 @@
 Each rule is a fact about the scenes, to be switched on where it holds. But for the bounds, none acts in training, which
 has to see the network's own mistakes.
 
-All quantities are in grid units: cells, cells per frame.
+All quantities are in grid units: cells, cells per frame; energies need cells that are as wide along each axis.
 """
 
 from __future__ import annotations
@@ -98,20 +98,20 @@ def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> T
     return (each * share.reshape(batch, *extra, count, 1)).sum((-2, -1))
 
 
-def within_budget(step: Tensor, cells: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
-    """A frame's steps, all of a scene's shortened by one factor where they would exceed its energy.
+def affordable(cells: Tensor, step: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
+    """By what factor a scene's steps of a frame may be taken without exceeding its energy.
 
     With the factor s the energy after the frame is a parabola in s; the largest s in [0, 1] within the budget is taken.
 
     Args:
-        step: (B, N, D) steps proposed.
         cells: (B, N, D) where from.
+        step: (B, N, D) steps proposed.
         gravity: (B, 1, D).
         share: (B, N, 1).
         budget: (B,) energy that is allowed.
 
     Returns:
-        (B, N, D).
+        (B, 1, 1).
     """
     square = (step.square() * share).sum((-2, -1)) / 2
     slope = -(step * gravity * share).sum((-2, -1))
@@ -119,7 +119,7 @@ def within_budget(step: Tensor, cells: Tensor, gravity: Tensor, share: Tensor, b
     root = (slope.square() - 4 * square * excess).clamp(min=0).sqrt()
     tiny = torch.finfo(step.dtype).tiny
     factor = ((root - slope) / (2 * square).clamp(min=tiny)).clamp(0, 1)
-    return step * factor[:, None, None]
+    return factor[:, None, None]
 
 
 def at_rest(start: Tensor, path: Tensor, speed: float) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from nmpm.constraints import BOUNDS, Constraints, at_rest, energy, within_budget
+from nmpm.constraints import BOUNDS, Constraints, affordable, at_rest, energy
 from nmpm.contact import Contact
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
@@ -166,7 +166,7 @@ class Emulator(nn.Module):
         if not self.constraints.energy or self.training:
             return None
         cells, velocity, gravity = self._in_cells(particles)
-        return energy(cells, velocity, gravity, _share(particles, cells))
+        return energy(*self._lengths(cells, velocity, gravity), _share(particles, cells))
 
     def forward(self, particles: Particles, solid: Tensor, budget: Tensor | None = None) -> Bundle:
         """Predict the next m frames.
@@ -209,16 +209,23 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
 
+    def _lengths(self, cells: Tensor, velocity: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same in units of the first axis' cells: cells need not be square, energies need one unit."""
+        first, *others = self.grid.spacing
+        if all(abs(other / first - 1) < 1e-6 for other in others):
+            return cells, velocity, gravity
+        ratio = cells.new_tensor(self.grid.spacing) / first
+        return cells * ratio, velocity * ratio, gravity * ratio
+
     def _advect(self, flight: _Flight, budget: Tensor | None = None) -> Tensor:
         """(B, m, N, D) positions in cells, within an energy (B,) if one is given."""
         cells, velocity, path = flight.cells, flight.carried, []
-        for frame, field in enumerate(
-            flight.fields.unbind(1), start=1
-        ):  # indexing would cost a zero-fill each, backwards
+        fields = flight.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
+        for frame, field in enumerate(fields, start=1):
             known = self.decoder.known(flight.carried, velocity, flight.gravity, frame)
             step = known + self._gather(field, cells, flight.material)
             if budget is not None:
-                step = within_budget(step, cells, flight.gravity, flight.share, budget)
+                step = step * affordable(*self._lengths(cells, step, flight.gravity), flight.share, budget)
             arrived = self._confine(cells + step)
             velocity = arrived - cells
             cells = arrived
@@ -230,7 +237,7 @@ class Emulator(nn.Module):
         path = self._clear(flight, path, solid)
         if budget is not None:
             steps = path.diff(dim=1, prepend=flight.cells.unsqueeze(1))
-            spent = energy(path, steps, flight.gravity, flight.share)
+            spent = energy(*self._lengths(path, steps, flight.gravity), flight.share)
             if (spent > budget.unsqueeze(1)).any():  # seldom: then all frames once more, each within it
                 path = self._clear(flight, self._advect(flight, budget), solid)
         if self.constraints.rest_speed:
@@ -260,10 +267,12 @@ class Emulator(nn.Module):
         """Keep particles within the walls; periodic axes go on (positions there are unwrapped, transfers wrap)."""
         if all(self.scene.periodic):
             return cells
+        low, high = self.bounds
+        rule = BOUNDS[self.constraints.bounds]
+        if not any(self.scene.periodic):
+            return rule(cells, low, high)
         wraps = torch.tensor(self.scene.periodic, device=cells.device)
-        inner = torch.where(wraps, self.bounds.mean(0), cells) if any(self.scene.periodic) else cells
-        held = BOUNDS[self.constraints.bounds](inner, self.bounds[0], self.bounds[1])
-        return torch.where(wraps, cells, held) if any(self.scene.periodic) else held
+        return torch.where(wraps, cells, rule(torch.where(wraps, (low + high) / 2, cells), low, high))
 
 
 def _share(particles: Particles, cells: Tensor) -> Tensor:
