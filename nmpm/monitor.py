@@ -73,11 +73,13 @@ class Monitor:
     at_walls: int = 0
     _frames: int = 0
     _bundles: int = 0
+    _padded: bool = False
     _reference: tuple[Tensor, Tensor, Tensor] | None = None
 
     def start(self, emulator: Emulator, particles: Particles) -> None:
         """Forget what was seen, and take a state as the one that a rollout starts from."""
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
+        self._padded = not bool(particles.mask.all())
         if emulator.scene.gravity is None and not emulator.scene.gravity_varies:
             self._reference = None
             return
@@ -104,11 +106,13 @@ class Monitor:
         self._bundles += 1
         if not particles.position.shape[1]:
             return
-        last = bundle.position[:, -1]
-        spacing = min(emulator.grid.spacing)
-        way = bundle.velocity.abs().amax(-1).masked_fill(~particles.mask, 0.0).amax(-1) / spacing
-        # What is no number in a position is none in the velocity, the last step.
-        self._note("not finite", (~way.isfinite()).float(), 0.0)
+        last, moving = bundle.position[:, -1], bundle.velocity
+        if self._padded:
+            moving = moving.masked_fill(~particles.mask.unsqueeze(-1), 0.0)
+        way = moving.abs().amax((1, 2)) / min(emulator.grid.spacing)
+        # What is no number in a position is none in the velocity, the last step, and none in its largest.
+        if not math.isfinite(float(way.max())):
+            self._note("not finite", (~way.isfinite()).float(), 0.0)
         self._note("speed", way, self.speed)
         if self._reference is not None:
             begun, scale, share = self._reference
