@@ -227,7 +227,7 @@ def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Traj
             with np.load(part, allow_pickle=False) as arrays:
                 attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
                 yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
-        except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, KeyError, EOFError) as error:
             raise DataError(f"{part}: damaged ({error}); delete it, and the same call makes it again.") from error
         advance()
 

@@ -8,6 +8,7 @@ per trajectory. NumPy stores objects as a pickle, which is read by the restricte
 from __future__ import annotations
 
 import re
+import struct
 import zipfile
 from collections.abc import Iterator
 from functools import partial
@@ -60,7 +61,7 @@ def _members(path: Path) -> tuple[str, ...]:
     try:
         with zipfile.ZipFile(path) as file:
             names = [name.removesuffix(".npy") for name in file.namelist() if name.endswith(".npy")]
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, struct.error, zipfile.BadZipFile, NotImplementedError) as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
     if not names:
         raise DataError(f"{path}: the file holds no array.")

@@ -95,7 +95,7 @@ def _unpack(fetched: Path, archives: list[Path], target: Path) -> None:
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, place)
         part.rename(target)
-    except (zipfile.BadZipFile, OSError) as error:
+    except (zipfile.BadZipFile, NotImplementedError, OSError) as error:
         raise DataError(f"{target}: cannot be unpacked ({error}).") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.convert import GnsNpz, Options, convert
@@ -77,6 +77,7 @@ def test_what_does_not_fit_is_named(tmp_path, content, message):
 
 
 @given(place=st.integers(0, 3000), value=st.integers(0, 255), cut=st.integers(0, 300))
+@example(place=645, value=64, cut=0)  # says it is of a later version of the format
 @settings(deadline=None, max_examples=120)
 def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, place, value, cut):
     folder = write(tmp_path_factory.mktemp("npz"), simulation_0=pair(positions(0), 5))
