@@ -40,9 +40,10 @@ class Dmcf(Format):
         if not files:
             raise DataError(f"{path}: no *{_SUFFIX} file there.")
         family = options.family or "lagrangebench"
-        first = next(_frames(next(iter(files.values()))[0]))
+        sample = next(iter(files.values()))[0]
+        first = next(_frames(sample), {})
         return Source(
-            metadata=options.applied(_metadata(first, find_family(family).types, options)),
+            metadata=options.applied(_metadata(first, find_family(family).types, options, sample)),
             splits={split: Reread(partial(_trajectories, found)) for split, found in files.items()},
             notes=(
                 f"The fluid becomes particle type {_FLUID}, the solid around it type {_WALL} ({family} family).",
@@ -99,10 +100,10 @@ def _value(value: Any, where: str) -> Any:
         raise DataError(f"{where}: not an array as msgpack-numpy writes it ({str(error)[:100]}).") from error
 
 
-def _metadata(first: dict[str, Any], types: Any, options: Options) -> Metadata:
-    position = _array(first, "pos", "the first frame")
+def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -> Metadata:
+    position = _array(first, "pos", f"{path}, frame 0")
     dim = position.shape[1]
-    everything = np.concatenate([position, *([first["box"]] if "box" in first else [])])
+    everything = np.concatenate([position, _wall(first, dim, path)])
     bounds = tuple((float(low), float(high)) for low, high in zip(everything.min(0), everything.max(0), strict=True))
     return Metadata(
         bounds=bounds,
@@ -122,6 +123,16 @@ def _array(frame: dict[str, Any], name: str, where: str) -> np.ndarray:
     return found
 
 
+def _wall(first: dict[str, Any], dim: int, path: Path) -> np.ndarray:
+    """The solid around, (M, D); M = 0 where the first frame has none."""
+    if "box" not in first:
+        return np.empty((0, dim), np.float32)
+    wall = _array(first, "box", f"{path}, frame 0")
+    if wall.shape[1] != dim:
+        raise DataError(f"{path}: 'box' has {wall.shape[1]} axes, 'pos' has {dim}.")
+    return wall
+
+
 def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
     for path in files:
         frames = list(_frames(path))
@@ -139,9 +150,7 @@ def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
             " Particles that appear or vanish cannot be represented; cut the trajectory where their number changes."
         )
     fluid, first = np.stack(positions), frames[0]
-    wall = _array(first, "box", f"{path}, frame 0") if "box" in first else np.empty((0, fluid.shape[2]), np.float32)
-    if wall.shape[1] != fluid.shape[2]:
-        raise DataError(f"{path}: box {wall.shape} and pos {positions[0].shape} have different axes.")
+    wall = _wall(first, fluid.shape[2], path)
     kinds = np.repeat([_FLUID, _WALL], [fluid.shape[1], len(wall)]).astype(np.int64)
     still = np.broadcast_to(wall, (len(fluid), *wall.shape))
     try:

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.convert import Dmcf, Options, convert
@@ -70,6 +70,7 @@ def test_without_the_packages_it_says_how_to_get_them(tmp_path, monkeypatch):
 
 
 @given(place=st.integers(0, 3000), value=st.integers(0, 255), cut=st.integers(0, 400), deep=st.booleans())
+@example(place=241, value=0, cut=0, deep=True)  # a box that is a single number
 @settings(deadline=None, max_examples=150)
 def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, place, value, cut, deep):
     folder = tmp_path_factory.mktemp("dmcf")
