@@ -6,6 +6,8 @@ Source: Rochman-Sharabi, Lewin & Louppe, A Neural Material Point Method for Part
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +24,7 @@ from nmpm.processors import GridLayout, Processor, UNet
 from nmpm.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.scene import Scene
 from nmpm.transfer import Linear, Transfer
+from nmpm.transfer.pieces import pieces
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a sound model is."""
@@ -50,6 +53,11 @@ class _Flight:
     material: Tensor
     fields: Tensor
     share: Tensor
+
+    def part(self, piece: slice) -> _Flight:
+        """The same for a piece of the particles."""
+        own = {name: getattr(self, name)[:, piece] for name in ("cells", "carried", "material", "share")}
+        return dataclasses.replace(self, **own)
 
 
 class Emulator(nn.Module):
@@ -125,6 +133,25 @@ class Emulator(nn.Module):
         """In which transfers and advection are computed: float32, or float64 after `double()`."""
         return torch.promote_types(self.input_mean.dtype, torch.float32)
 
+    @property
+    def network_precision(self) -> torch.dtype:
+        """Of the network's weights; in which it computes, too, unless autocast says otherwise."""
+        return next((weight.dtype for weight in self.processor.parameters()), self.precision)
+
+    def with_network(self, precision: torch.dtype) -> Emulator:
+        """A copy whose network has weights of another type; transfers and advection stay as they are.
+
+        Raises:
+            ConfigError: if the network has complex weights, as FNOs do, which have no such type.
+        """
+        if any(weight.is_complex() for weight in self.processor.parameters()):
+            raise ConfigError(
+                f"{type(self.recipe).__name__} has complex weights, which cannot be {precision}: use torch.autocast."
+            )
+        other = copy.deepcopy(self)
+        other.processor.to(precision)
+        return other
+
     def over(self, scene: Scene) -> Emulator:
         """The same emulator in another box: a copy of weights and statistics, on a grid with cells of the same size.
 
@@ -185,13 +212,14 @@ class Emulator(nn.Module):
             normalised = (seen - self.input_mean) / self.input_std
             if self.training and self.grid_noise > 0:
                 normalised = normalised + self.grid_noise * torch.randn_like(normalised)
-        output = self.processor(normalised)
+        output = self.processor(normalised.to(self.network_precision))
         with torch.autocast(device, enabled=False):
             fields = output.to(self.precision) * self.output_scale
             smoothed = self._gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried(velocity, smoothed)
             flight = _Flight(cells, carried, gravity, particles.material, fields, _share(particles, cells))
-            path = self._advect(flight)
+            parts = [self._advect(flight.part(piece)) for piece in pieces(cells.shape[1], cells.device)]
+            path = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
             if not self.training:
                 path = self._constrained(flight, path, solid, budget)
             steps = path.diff(dim=1, prepend=cells.unsqueeze(1))

@@ -8,7 +8,8 @@ neither the origin nor the unit of length matters.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -81,7 +82,8 @@ class Grid:
             DataError: if that precision is too coarse so far from 0.
         """
         self._check_precision(position.dtype)
-        return ((position - position.new_tensor(self.lower)) / position.new_tensor(self.spacing)).to(dtype)
+        offset = per_axis(operator.sub, position, self.lower)
+        return per_axis(operator.truediv, offset, self.spacing).to(dtype)
 
     def _check_precision(self, dtype: torch.dtype) -> None:
         """Refuse positions whose floating-point numbers lie further apart than a part of a cell."""
@@ -97,19 +99,31 @@ class Grid:
 
     def to_cell_displacement(self, displacement: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Displacements (..., D) in domain length → cells, of the type asked for."""
-        return (displacement / displacement.new_tensor(self.spacing)).to(dtype)
+        return per_axis(operator.truediv, displacement, self.spacing).to(dtype)
 
     def to_length(self, cells: Tensor) -> Tensor:
         """Positions (..., D) in cells → domain length."""
-        return cells * cells.new_tensor(self.spacing) + cells.new_tensor(self.lower)
+        return per_axis(operator.add, self.to_displacement(cells), self.lower)
 
     def to_displacement(self, cells: Tensor) -> Tensor:
         """Displacements (..., D) in cells → domain length."""
-        return cells * cells.new_tensor(self.spacing)
+        return per_axis(operator.mul, cells, self.spacing)
 
     def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """Cell centres along an axis, (n,), in domain length."""
         return self.lower[axis] + (torch.arange(self.shape[axis], dtype=dtype) + 0.5) * self.spacing[axis]
+
+
+def per_axis(operation: Callable[[Tensor, float], Tensor], values: Tensor, numbers: Sequence[float]) -> Tensor:
+    """Apply an operation to (..., D) values with a number of its own for each axis.
+
+    As a tensor, the numbers would be sent to the device anew each time.
+    """
+    first, *others = numbers
+    if all(number == first for number in others):
+        return operation(values, first)
+    columns = zip(values.unbind(-1), numbers, strict=True)
+    return torch.stack([operation(column, number) for column, number in columns], dim=-1)
 
 
 def _shape(cells: int | Sequence[int], extents: Sequence[float]) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
-from nmpm.processors import Pointwise, UNet
+from nmpm.processors import FNO, Pointwise, UNet
 from nmpm.rasterise import grid_state
 from nmpm.rollouts import rollout, stream, unroll
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic
@@ -286,3 +286,38 @@ def test_over_finer_particles_of_the_same_material_it_moves_as_before():
 def test_over_another_kind_of_scene_is_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         small(box()).over(box(**changes))
+
+
+def in_sevens(count, device):
+    return [slice(first, first + 7) for first in range(0, count, 7)]
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_particles_a_piece_at_a_time_move_as_all_at_once(transfer, monkeypatch):
+    scene = box(materials=("water", "sand"))
+    emulator, particles = small(scene, transfer), cloud(scene)
+    with torch.no_grad():
+        whole = emulator(particles, emulator.solid(particles))
+        for module in ("nmpm.transfer.base", "nmpm.emulator"):
+            monkeypatch.setattr(f"{module}.pieces", in_sevens)
+        cut = emulator(particles, emulator.solid(particles))
+    torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)
+    torch.testing.assert_close(cut.velocity, whole.velocity, rtol=0, atol=1e-6)
+
+
+def test_a_network_in_bfloat16_moves_particles_in_float32():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    quick = emulator.with_network(torch.bfloat16)
+    solid = emulator.solid(particles)
+    with torch.no_grad():
+        exact, rough = emulator(particles, solid), quick(particles, solid)
+    assert quick.network_precision == torch.bfloat16
+    assert emulator.network_precision == rough.position.dtype == torch.float32
+    assert 0 < (exact.position - rough.position).abs().max() < 1e-3
+
+
+def test_complex_weights_have_no_other_precision():
+    emulator = small(box(), processor=FNO(modes=4, width=4, layers=1))
+    with pytest.raises(ConfigError, match=r"FNO has complex weights.*autocast"):
+        emulator.with_network(torch.bfloat16)

@@ -10,6 +10,7 @@ import lightning
 import pytest
 import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
@@ -218,3 +219,33 @@ def test_recomputed_gradients_are_the_same_to_the_bit_for_less_memory(make_datas
     assert less < held / 4
     for one, other in zip(plain, recomputed, strict=True):
         assert torch.equal(one, other)
+
+
+class Questions(TorchDispatchMode):
+    """Keeps what would make a GPU wait, or be waited for: values asked from it, numbers sent to it."""
+
+    ASKING = ("_local_scalar_dense", "nonzero", "equal", "masked_select", "lift_fresh", "is_nonzero")
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.overloadpacket.__name__ in self.ASKING:
+            self.asked.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("statics", [0, 3])
+def test_a_training_step_runs_on_the_device_alone(make_dataset, statics):
+    data = data_of(make_dataset(statics=statics))
+    data.setup("fit")
+    window = next(iter(data.train_dataloader()))
+    module = module_of(data)
+    module.log = lambda *_, **__: None
+    with Questions() as questions:
+        module.training_step(window, 0).backward()
+    assert questions.asked == []
+    with Questions() as questions:
+        assert bool(window.mask.any())
+    assert questions.asked  # it does see such questions

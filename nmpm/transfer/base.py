@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nmpm.grid import Grid
 from nmpm.transfer.backends import add
+from nmpm.transfer.pieces import pieces
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,11 @@ class Transfer(ABC):
 
     def p2g(self, values: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Sum particle values (B, N, C) at `cells` (B, N, D) onto the nodes, (B, C, *S)."""
-        summed = scatter(self.scatter_stencil(cells, grid), values, grid.size)
+        first, *others = (
+            scatter(self.scatter_stencil(cells[:, piece], grid), values[:, piece], grid.size)
+            for piece in pieces(cells.shape[1], cells.device)
+        )
+        summed = sum(others, start=first)
         return summed.transpose(1, 2).reshape(len(summed), -1, *grid.shape)
 
     def momentum(self, velocity: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nmpm.grid import Grid
+from nmpm.grid import Grid, per_axis
 from nmpm.transfer.base import Stencil, Transfer, gather, inside, tensor_product
 
 
@@ -29,8 +30,7 @@ def linear_g2p(field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
     loose = cells.is_cuda and torch.are_deterministic_algorithms_enabled()
     if grid.dim == 1 or any(grid.periodic) or loose:
         return gather(linear_stencil(cells, grid), field.flatten(2).transpose(1, 2))
-    extent = torch.tensor(grid.shape, dtype=cells.dtype, device=cells.device)
-    unit = (2 * cells / extent - 1).flip(-1)  # the sampler wants the last axis first
+    unit = (per_axis(operator.truediv, 2 * cells, grid.shape) - 1).flip(-1)  # the sampler wants the last axis first
     if not cells.is_cuda:
         unit = unit.nan_to_num()  # its gradient on a CPU takes what is no number for an address, and crashes
     points = unit.reshape(unit.shape[0], *(1,) * (grid.dim - 1), *unit.shape[1:])

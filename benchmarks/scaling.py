@@ -1,0 +1,134 @@
+"""Cost against the number of particles and the size of the grid, one scene: time of a call and its parts, and memory.
+
+python benchmarks/scaling.py                                      on the CPU, up to 10⁷ particles, 1024² and 96³ cells
+python benchmarks/scaling.py --device cuda --particles 1e3 1e4 1e5 1e6 1e7 4e7 --grids 64x64 1024x1024 128x128x128
+python benchmarks/scaling.py --json scaling.json
+
+Each size runs in a process of its own, so that its memory is its own. Bytes are the least that a transfer has to move:
+positions and values of the particles once; how often grid nodes are touched is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import multiprocessing
+import resource
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from forms import FORMS, FRAMES, emulator
+from turns import Spread, ceilings, machine, timed, write
+
+from nmpm.emulator import Emulator
+from nmpm.particles import Particles
+from nmpm.rasterise import grid_state
+from nmpm.sim import load_preset
+from nmpm.starts import thrown_blocks
+
+PRESETS = {2: "waterramps", 3: "waterdrop3d"}
+WIDTH = 32
+FORM = "ours"
+FLOAT = 4  # bytes
+
+
+def in_a_box(count: int, shape: tuple[int, ...]) -> tuple[Emulator, Particles]:
+    """An emulator on a grid, and a block that fills a fifth of its box with so many particles."""
+    preset = load_preset(PRESETS[len(shape)]).scene
+    volume = 1.0
+    for low, high in preset.bounds:
+        volume *= high - low
+    scene = dataclasses.replace(preset, particle_volume=0.2 * volume / count)
+    made = emulator(FORMS[FORM], scene, WIDTH, shape).eval().requires_grad_(False)
+    made.processor.to(FORMS[FORM].precision)
+    return made, thrown_blocks(scene, count=count)
+
+
+def sized(count: int, shape: tuple[int, ...], device: str, threads: int, rounds: int) -> dict[str, Any]:
+    """Seconds of a call, of p2g and of m times g2p and advection, and bytes per particle beyond the state's own."""
+    torch.set_num_threads(threads)
+    made, state = in_a_box(count, shape)
+    made, state = made.to(device), state.to(device)
+    solid = made.solid(state)
+    before = _memory(device)
+    parts = {name: _repeated(action, rounds) for name, action in _parts(made, state, solid).items()}
+    used = _memory(device) - before
+    n, dim = state.position.shape[1:]
+    least = {"p2g": FLOAT * n * (2 * dim + 1), "g2p": FLOAT * n * dim * 2 * FRAMES}
+    rates = {f"{name}_gb_per_s": 1e-9 * moved / parts[name].median for name, moved in least.items()}
+    return {"particles": n, "grid": shape, "bytes_per_particle": used / n, **parts, **rates}
+
+
+def _parts(made: Emulator, state: Particles, solid: torch.Tensor) -> dict[str, Callable[[], object]]:
+    cells, velocity, _ = made._in_cells(state)
+    fields = torch.randn(1, FRAMES, state.position.shape[2], *made.grid.shape, device=cells.device)
+
+    def carry() -> None:
+        moving = cells
+        for field in fields.unbind(1):
+            moving = moving + 0.01 * made.transfer.g2p(field, moving, made.grid)
+
+    return {
+        "call": lambda: made(state, solid),
+        "p2g": lambda: grid_state(made.scene, made.grid, made.transfer, state, cells, velocity, solid),
+        "g2p": carry,
+    }
+
+
+@torch.inference_mode()
+def _repeated(action: Callable[[], object], rounds: int) -> Spread:
+    action()
+    return Spread.of([timed(action) for _ in range(rounds)])
+
+
+def _memory(device: str) -> float:
+    """The most bytes that this process has held so far."""
+    if device == "cuda":
+        return float(torch.cuda.max_memory_allocated())
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def alone(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What an action returns, run in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(action)
+
+
+def main() -> None:
+    """Measure, print a table, and write JSON if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--particles", type=float, nargs="+", default=[1e3, 1e4, 1e5, 1e6, 1e7])
+    parser.add_argument(
+        "--grids", nargs="+", default=["32x32", "64x64", "256x256", "1024x1024", "32x32x32", "64x64x64"]
+    )
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    chosen = parser.parse_args()
+    shapes = [tuple(int(side) for side in text.split("x")) for text in chosen.grids]
+    sizes = [(round(count), (64, 64)) for count in chosen.particles]
+    sizes += [(10_000 if len(shape) == 2 else 100_000, shape) for shape in shapes]
+    limits = ceilings(chosen.device, chosen.threads)
+    sys.stdout.write(f"{machine(chosen.device, chosen.threads)}; U-Net {WIDTH} wide; reached at most: {limits}\n")
+    sys.stdout.write(f"{'particles':>10}{'grid':>14}{'call, ms':>26}{'p2g, ms':>10}{'GB/s':>7}{'m x g2p, ms':>13}{'GB/s':>7}"
+                     f"{'bytes/particle':>16}\n")  # fmt: skip
+    rows = []
+    for count, shape in sizes:
+        row = alone(partial(sized, count, shape, chosen.device, chosen.threads, chosen.rounds))
+        sys.stdout.write(
+            f"{row['particles']:>10}{'x'.join(map(str, shape)):>14}{row['call'].shown():>26}{1e3 * row['p2g'].median:>10.4g}"
+            f"{row['p2g_gb_per_s']:>7.3g}{1e3 * row['g2p'].median:>13.4g}{row['g2p_gb_per_s']:>7.3g}"
+            f"{row['bytes_per_particle']:>16.0f}\n"
+        )
+        sys.stdout.flush()
+        rows.append(row)
+    write(chosen.json, {"machine": machine(chosen.device, chosen.threads), "limits": limits, "sizes": rows})
+
+
+if __name__ == "__main__":
+    main()

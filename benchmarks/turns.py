@@ -1,0 +1,120 @@
+"""Fair timing: every form in a process of its own, one run at a time, in turns; medians with spread; what the machine can.
+
+Comparisons hold within one run only. A process of its own, so that no form profits from another's warm memory.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nmpm.atomic import replacing
+
+Action = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Seconds of repeated runs.
+
+    Args:
+        median, least, most: Of the runs.
+    """
+
+    median: float
+    least: float
+    most: float
+
+    @classmethod
+    def of(cls, seconds: list[float]) -> Spread:
+        """Of at least one run."""
+        return cls(statistics.median(seconds), min(seconds), max(seconds))
+
+    def shown(self, unit: float = 1e-3) -> str:
+        """In units of so many seconds, as "median (least-most)"."""
+        return f"{self.median / unit:.4g} ({self.least / unit:.4g}-{self.most / unit:.4g})"
+
+
+def in_turns(makers: Mapping[str, Callable[[], Action]], rounds: int, threads: int) -> dict[str, list[float]]:
+    """Seconds of each action's runs, one run of each per round; the first two rounds warm up and are not counted.
+
+    Args:
+        makers: Make the actions, each in its own process; they must be picklable.
+        rounds: How many to count.
+        threads: Of torch, in each process; only one process works at a time.
+    """
+    context = multiprocessing.get_context("spawn")
+    pipes: dict[str, Connection] = {}
+    for name, maker in makers.items():
+        pipes[name], theirs = context.Pipe()
+        context.Process(target=_serve, args=(theirs, maker, threads), daemon=True).start()
+        pipes[name].recv()  # made: from here on it only waits
+    seconds: dict[str, list[float]] = {name: [] for name in makers}
+    for turn in range(rounds + 2):
+        for name, pipe in pipes.items():
+            pipe.send("run")
+            spent = pipe.recv()
+            if turn >= 2:
+                seconds[name].append(spent)
+    for pipe in pipes.values():
+        pipe.send("end")
+    return seconds
+
+
+def _serve(pipe: Connection, maker: Callable[[], Action], threads: int) -> None:
+    torch.set_num_threads(threads)
+    action = maker()
+    pipe.send("made")
+    while pipe.recv() == "run":
+        pipe.send(timed(action))
+
+
+def timed(action: Action) -> float:
+    """Seconds that an action takes, on a GPU until all of it is done."""
+    start = time.perf_counter()
+    action()
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def ceilings(device: str, threads: int) -> dict[str, float]:
+    """What the machine reaches on work made for it: GFLOP/s of matrix products, GB/s of copies (read and written)."""
+    torch.set_num_threads(threads)
+    figures = {}
+    for dtype in (torch.float32, torch.bfloat16):
+        side = 8192 if device == "cuda" else 2048
+        matrix = torch.randn(side, side, device=device, dtype=dtype)
+        best = min(timed(lambda m=matrix: m @ m) for _ in range(8))  # type: ignore[misc]
+        figures[f"gflops_{str(dtype).removeprefix('torch.')}"] = 2e-9 * side**3 / best
+    source = torch.randn(2**28 if device == "cuda" else 2**26, device=device)
+    target = torch.empty_like(source)
+    best = min(timed(lambda: target.copy_(source)) for _ in range(8))
+    return figures | {"copy_gb_per_s": 2e-9 * source.numel() * source.element_size() / best}
+
+
+def machine(device: str, threads: int) -> str:
+    """What this ran on, in words."""
+    if device == "cuda":
+        return f"{torch.cuda.get_device_name()}, torch {torch.__version__}"
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor()}, {threads} threads, torch {torch.__version__}"
+
+
+def write(path: Path | None, figures: Mapping[str, Any]) -> None:
+    """Figures as JSON, if a path is given."""
+    if path is not None:
+        with replacing(path) as part:
+            part.write_text(json.dumps(figures, indent=1, default=asdict) + "\n", encoding="utf-8")
