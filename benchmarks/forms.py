@@ -1,8 +1,8 @@
 """The paper's form of the emulator and this project's, made to step and to roll for the benchmarks.
 
-*The paper's form*: nearest transfers, absolute decoder, float32, channels first, walls rasterised for each bundle, three
-hidden layers in the perceptrons (Rochman-Sharabi, Lewin & Louppe, arXiv 2408.15753). Width, depth, grid, batch, bundles and
-optimizer are the same for all.
+*The paper's form*: nearest transfers, absolute decoder, float32, channels first, walls rasterised for each bundle,
+three hidden layers in the perceptrons (Rochman-Sharabi, Lewin & Louppe, arXiv 2408.15753). Width, depth, grid, batch,
+bundles and optimizer are the same for all, unless a form's name says otherwise.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import dataclasses
 import multiprocessing
 import resource
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ PRESETS = {2: "waterramps", 3: "waterdrop3d"}
 WIDTH = 32
 FORM = "ours"
 FLOAT = 4  # bytes
+WIDTHS = (10, 14, 28, 10, 8, 13, 8, 16)
 
 
 def in_a_box(count: int, shape: tuple[int, ...]) -> tuple[Emulator, Particles]:
@@ -98,6 +99,21 @@ def alone(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return pool.apply(action)
 
 
+def line(row: Mapping[str, Any]) -> str:
+    """A row of the table."""
+    figures = (
+        f"{row['particles']}",
+        "x".join(map(str, row["grid"])),
+        row["call"].shown(),
+        f"{1e3 * row['p2g'].median:.4g}",
+        f"{row['p2g_gb_per_s']:.3g}",
+        f"{1e3 * row['g2p'].median:.4g}",
+        f"{row['g2p_gb_per_s']:.3g}",
+        f"{row['bytes_per_particle']:.0f}",
+    )
+    return "".join(f"{figure:>{width}}" for figure, width in zip(figures, WIDTHS, strict=True)) + "\n"
+
+
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -115,16 +131,12 @@ def main() -> None:
     sizes += [(10_000 if len(shape) == 2 else 100_000, shape) for shape in shapes]
     limits = ceilings(chosen.device, chosen.threads)
     sys.stdout.write(f"{machine(chosen.device, chosen.threads)}; U-Net {WIDTH} wide; reached at most: {limits}\n")
-    sys.stdout.write(f"{'particles':>10}{'grid':>14}{'call, ms':>26}{'p2g, ms':>10}{'GB/s':>7}{'m x g2p, ms':>13}{'GB/s':>7}"
-                     f"{'bytes/particle':>16}\n")  # fmt: skip
+    columns = ("particles", "grid", "call, ms", "p2g, ms", "GB/s", "m x g2p, ms", "GB/s", "bytes/particle")
+    sys.stdout.write("".join(f"{column:>{width}}" for column, width in zip(columns, WIDTHS, strict=True)) + "\n")
     rows = []
     for count, shape in sizes:
         row = alone(partial(sized, count, shape, chosen.device, chosen.threads, chosen.rounds))
-        sys.stdout.write(
-            f"{row['particles']:>10}{'x'.join(map(str, shape)):>14}{row['call'].shown():>26}{1e3 * row['p2g'].median:>10.4g}"
-            f"{row['p2g_gb_per_s']:>7.3g}{1e3 * row['g2p'].median:>13.4g}{row['g2p_gb_per_s']:>7.3g}"
-            f"{row['bytes_per_particle']:>16.0f}\n"
-        )
+        sys.stdout.write(line(row))
         sys.stdout.flush()
         rows.append(row)
     write(chosen.json, {"machine": machine(chosen.device, chosen.threads), "limits": limits, "sizes": rows})

@@ -1,7 +1,7 @@
 """A training step of the paper's form and of ours, in turns: iterations per second, and what of the machine they use.
 
-python benchmarks/training_step.py                                         on the CPU: batch 16, 64 channels, K = 4, m = 8
-python benchmarks/training_step.py --device cuda --batch 128 --rounds 50   the paper's recipe on a GPU
+python benchmarks/training_step.py                              on the CPU: batch 16, 64 channels, K = 4, m = 8
+python benchmarks/training_step.py --device cuda --batch 128 --rounds 50          the paper's recipe on a GPU
 python benchmarks/training_step.py --json step.json
 """
 
