@@ -93,9 +93,14 @@ def module_of(config: Mapping[str, Any], scene: Any) -> EmulatorModule:
 
 def _made(spec: Mapping[str, Any]) -> Any:
     """The object of a class path and arguments, as the command line makes it."""
-    module, _, name = spec["class_path"].rpartition(".")
     arguments = {key: tupled(value) for key, value in (spec.get("init_args") or {}).items()}
-    return getattr(import_module(module), name)(**arguments)
+    return _named(spec["class_path"])(**arguments)
+
+
+def _named(path: str) -> Any:
+    """What is called so, e.g. "torch.optim.Adam"."""
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name)
 
 
 class Probe:
@@ -108,7 +113,8 @@ class Probe:
         self.window: Window = next(iter(self.data.train_dataloader()))
         self.module = module_of(config, self.data.scene)
         calibrate(self.module.emulator, [self.window])
-        self.optimizer = torch.optim.Adam(self.module.parameters(), lr=1e-4)
+        optimizer = config["model"]["optimizer"]
+        self.optimizer = _named(optimizer["class_path"])(self.module.parameters(), **optimizer.get("init_args", {}))
 
     def step(self) -> float:
         """Seconds of a training step."""

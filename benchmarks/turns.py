@@ -1,4 +1,4 @@
-"""Fair timing: every form in a process of its own, one run at a time, in turns; medians with spread; the machine's best.
+"""Fair timing: every form in a process of its own, one at a time, in turns; medians with spread; the machine's limits.
 
 Comparisons hold within one run only. A process of its own, so that no form profits from another's warm memory.
 """

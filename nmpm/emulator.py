@@ -136,14 +136,17 @@ class Emulator(nn.Module):
     @property
     def network_precision(self) -> torch.dtype:
         """Of the network's weights; in which it computes, too, unless autocast says otherwise."""
-        return next((weight.dtype for weight in self.processor.parameters()), self.precision)
+        real = (weight.dtype for weight in self.processor.parameters() if weight.is_floating_point())
+        return next(real, self.precision)
 
     def with_network(self, precision: torch.dtype) -> Emulator:
-        """A copy whose network has weights of another type; transfers and advection stay as they are.
+        """A copy whose network has weights of this type; transfers and advection stay as they are.
 
         Raises:
             ConfigError: if the network has complex weights, as FNOs do, which have no such type.
         """
+        if precision == self.network_precision:
+            return self
         if any(weight.is_complex() for weight in self.processor.parameters()):
             raise ConfigError(
                 f"{type(self.recipe).__name__} has complex weights, which cannot be {precision}: use torch.autocast."

@@ -22,6 +22,7 @@ from nmpm.comparison import Comparison
 from nmpm.constraints import Constraints
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator import Bundle, Emulator
+from nmpm.errors import ConfigError
 from nmpm.losses import position_error
 from nmpm.metrics import EarthMover
 from nmpm.particles import Particles, Window
@@ -50,6 +51,7 @@ class EmulatorModule(LightningModule):
         cells: Grid cells along the longest axis, or along each.
         frames: m, frames predicted by one call of the processor (time bundling).
         unroll: K, calls that a training step backpropagates through; the training horizon is m K frames.
+        unroll_growth: Share of the training over which the calls grow from 1 to K, in [0, 1]: early steps are then cheap.
         transfer: How particles and grid see each other.
         processor: The network on the grid.
         decoder: What the network's output means.
@@ -72,6 +74,7 @@ class EmulatorModule(LightningModule):
         cells: int | list[int] = 64,
         frames: int = 8,
         unroll: int = 2,
+        unroll_growth: float = 0.0,
         transfer: Transfer = Linear(),  # noqa: B008 (frozen)
         processor: Processor = UNet(),  # noqa: B008
         decoder: Decoder = Residual(),  # noqa: B008
@@ -92,7 +95,9 @@ class EmulatorModule(LightningModule):
         processor = from_spec(processor, Processor)
         constraints = constraints if isinstance(constraints, Constraints) else Constraints(**constraints)
         self.emulator = Emulator(scene, cells, frames, transfer, processor, decoder, grid_noise, constraints)
-        self.unroll = unroll
+        if not 0 <= unroll_growth <= 1:
+            raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
+        self.unroll, self.unroll_growth = unroll, unroll_growth
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
@@ -105,6 +110,7 @@ class EmulatorModule(LightningModule):
                 "cells": list(self.emulator.grid.shape),
                 "frames": frames,
                 "unroll": unroll,
+                "unroll_growth": unroll_growth,
                 "transfer": to_spec(transfer),
                 "processor": to_spec(processor),
                 "decoder": to_spec(decoder),
@@ -159,7 +165,7 @@ class EmulatorModule(LightningModule):
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
         for axis in self.mirror:
             batch = mirrored(batch, self.emulator.scene, axis, torch.rand(len(batch.frames), device=self.device) < 0.5)
-        bundles = self._unrolled(self._perturbed(batch.initial))
+        bundles = self._unrolled(self._perturbed(batch.initial), self.bundles(self._progress()))
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
         loss = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
         self.log("train/loss", loss, prog_bar=True)
@@ -205,12 +211,24 @@ class EmulatorModule(LightningModule):
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    def _unrolled(self, particles: Particles) -> Iterator[Bundle]:
+    def bundles(self, progress: float) -> int:
+        """How many bundles a step unrolls when this share of the training is over."""
+        if progress >= self.unroll_growth:
+            return self.unroll
+        return 1 + int((self.unroll - 1) * progress / self.unroll_growth)
+
+    def _progress(self) -> float:
+        """Share of the training that is over, by steps or by the clock, whichever is further."""
+        if not self.unroll_growth:
+            return 1.0
+        return max(self.global_step / self.trainer.estimated_stepping_batches, self._clock())
+
+    def _unrolled(self, particles: Particles, count: int) -> Iterator[Bundle]:
         if not self.recompute:
-            yield from unroll(self.emulator, particles, self.unroll)
+            yield from unroll(self.emulator, particles, count)
             return
         solid = self.emulator.solid(particles)
-        for _ in range(self.unroll):
+        for _ in range(count):
             bundle: Bundle = checkpoint(self.emulator, particles, solid, use_reentrant=False)
             yield bundle
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)

@@ -63,6 +63,15 @@ class Pretrained:
         """A state to start from: blocks of particles thrown into the scene's box."""
         return thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
 
+    def with_network(self, precision: str) -> Pretrained:
+        """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16".
+
+        Raises:
+            ConfigError: if the network cannot be that.
+        """
+        wanted: torch.dtype = getattr(torch, precision)
+        return dataclasses.replace(self, emulator=self.emulator.with_network(wanted))
+
     def rollout(self, state: Particles, frames: int) -> Tensor:
         """Predict from a state: (B, frames, N, D) positions in domain length, the state's own frame not included."""
         return rollout(self.emulator, state, frames)

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
-from nmpm.errors import NmpmError
+from nmpm.errors import ConfigError, NmpmError
 from nmpm.processors import UNet
 from nmpm.rollouts import rollout
 from nmpm.schedules import Schedule
@@ -124,6 +124,20 @@ def test_fine_tuning_starts_from_the_same_predictions(make_dataset, tmp_path):
     trainer_of(tmp_path, 2).fit(tuned, data)
     assert not torch.equal(rollout(tuned.emulator.eval(), window.initial, 6), before)
     assert torch.equal(rollout(pretrained, window.initial, 6), before)
+
+
+def test_bundles_grow_over_the_share_of_the_training_asked_for(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    module = module_of(data, unroll=4, unroll_growth=0.5)
+    assert [module.bundles(share / 8) for share in range(9)] == [1, 1, 2, 3, 4, 4, 4, 4, 4]
+    assert module_of(data, unroll=4).bundles(0.0) == 4
+    data = TrajectoryDataModule(path=str(tmp_path / "dataset"), horizon=8, batch_size=2)
+    unrolled = []
+    module.bundles = lambda progress: unrolled.append(progress) or 1
+    trainer_of(tmp_path, 4).fit(module, data)
+    assert unrolled == [0.0, 0.25, 0.5, 0.75]
+    with pytest.raises(ConfigError, match=r"unroll_growth = 2.*share"):
+        module_of(data, unroll_growth=2.0)
 
 
 def test_bf16_trains(make_dataset, tmp_path):

@@ -1,5 +1,6 @@
 import hashlib
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -113,6 +114,10 @@ def test_a_shipped_model_rolls_out_and_renders_from_the_shell(tmp_path, monkeypa
     assert main(["rollout", names[0], "--frames", "12", "--out", "out.h5", "--particles", "200", "--blocks", "2"]) == 0
     trajectory = Split(tmp_path / "out.h5").read(0)
     assert trajectory.position.shape[0] == 14
+    rough = ["--particles", "200", "--blocks", "2", "--precision", "bfloat16", "--out", "rough.h5"]
+    assert main(["rollout", names[0], "--frames", "12", *rough]) == 0
+    apart = np.abs(Split(tmp_path / "rough.h5").read(0).position - trajectory.position).max()
+    assert 0 < apart < 0.01
     assert main(["render", "out.h5"]) == 0
     assert (tmp_path / "out.png").stat().st_size > 1000
     assert (tmp_path / "out.gif").stat().st_size > 1000

@@ -29,6 +29,12 @@ def run(words: list[str]) -> None:
     parser.add_argument("--particles", type=int, default=1000, help="about how many to throw (default: 1000)")
     parser.add_argument("--blocks", type=int, default=1, help="into how many blocks (default: 1)")
     parser.add_argument(
+        "--precision",
+        choices=["float32", "bfloat16"],
+        default="float32",
+        help="of the network: float32 (default), or bfloat16, faster where the processor has it, and rougher",
+    )
+    parser.add_argument(
         "--watch",
         choices=["warn", "stop", "record"],
         default="warn",
@@ -41,7 +47,7 @@ def run(words: list[str]) -> None:
         raise ConfigError(f"--out {chosen.out}: the folder {chosen.out.parent} does not exist.")
     from nmpm.zoo import Zoo
 
-    model = Zoo.load(chosen.name)
+    model = Zoo.load(chosen.name).with_network(chosen.precision)
     if chosen.data is None:
         try:
             state = model.example(chosen.seed, chosen.particles, chosen.blocks)
