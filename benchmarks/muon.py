@@ -1,7 +1,7 @@
 """Muon as a configuration can name it: orthogonalised steps for the convolutions, AdamW for all else.
 
-Needs `pip install pytorch-optimizer`; run with this folder on PYTHONPATH. Source: K. Jordan et al., Muon, 2024, by way of
-that package, which flattens a convolution's weight to a matrix of its output channels.
+Needs `pip install pytorch-optimizer`; run with this folder on PYTHONPATH. Source: K. Jordan et al., Muon, 2024, by way
+of that package, which flattens a convolution's weight to a matrix of its output channels.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class EmulatorModule(LightningModule):
         cells: Grid cells along the longest axis, or along each.
         frames: m, frames predicted by one call of the processor (time bundling).
         unroll: K, calls that a training step backpropagates through; the training horizon is m K frames.
-        unroll_growth: Share of the training over which the calls grow from 1 to K, in [0, 1]: early steps are then cheap.
+        unroll_growth: Share of the training, in [0, 1], over which the calls grow from 1 to K: early steps are cheap.
         transfer: How particles and grid see each other.
         processor: The network on the grid.
         decoder: What the network's output means.
