@@ -7,18 +7,21 @@ bundles and optimizer are the same for all, unless a form's name says otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from nmpm.calibration import calibrate
 from nmpm.constraints import Constraints
 from nmpm.decoders import Absolute, Decoder, Residual
-from nmpm.emulator import Emulator
+from nmpm.emulator import Bundle, Emulator
 from nmpm.losses import position_error
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
@@ -75,20 +78,22 @@ class ChannelsFirst(nn.Module):
         return fields
 
 
-def emulator(form: Form, scene: Scene, width: int, cells: int = CELLS, frames: int = FRAMES) -> Emulator:
+def emulator(form: Form, scene: Scene, width: int, cells: int | Sequence[int] = CELLS) -> Emulator:
     """An untrained emulator of a form, without constraints."""
     torch.manual_seed(0)
     width = round(width * form.share)
     processor = UNet(width=width, depth=DEPTH, perceptron=(width,) * form.perceptron)
-    made = Emulator(scene, cells, frames, form.transfer, processor, form.decoder, constraints=FREE)
+    made = Emulator(scene, cells, FRAMES, form.transfer, processor, form.decoder, constraints=FREE)
     if form.paper:
         made.processor = ChannelsFirst(made.processor)  # type: ignore[assignment]
     return made
 
 
 def scenes(preset: str, count: int, batch: int) -> tuple[Scene, Particles]:
-    """Thrown blocks among the walls of a preset's box, (batch, count) particles; simulated by nobody."""
+    """Thrown blocks in a preset's box, (batch, count) particles; so fine that they fill a fifth of it, if need be."""
     scene = load_preset(preset).scene
+    room = math.prod(high - low for low, high in scene.bounds)
+    scene = dataclasses.replace(scene, particle_volume=min(scene.particle_volume, 0.2 * room / count))
     states = [thrown_blocks(scene, count=count, blocks=2, seed=seed) for seed in range(batch)]
     joined = {name: torch.cat([getattr(s, name) for s in states]) for name in vars(states[0])}
     return scene, Particles(**joined)
@@ -99,17 +104,17 @@ class Training:
 
     Args:
         form: What to train.
-        options: `preset`, `particles`, `batch`, `width`, `unroll`, `device`.
+        options: `preset`, `particles`, `batch`, `width`, `unroll`, `device`, perhaps `cells` and `recompute`.
     """
 
     def __init__(self, form: Form, **options: Any) -> None:
         scene, state = scenes(options["preset"], options["particles"], options["batch"])
-        self.form, self.unroll = form, options["unroll"]
+        self.form, self.unroll, self.recompute = form, options["unroll"], options.get("recompute", False)
         steps = torch.arange(2 + FRAMES * self.unroll).sub(1).view(1, -1, 1, 1)
         frames = state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)
         others = {name: value for name, value in vars(state).items() if name not in ("position", "velocity")}
         window = Window(frames=frames, **others)
-        made = emulator(form, scene, options["width"])
+        made = emulator(form, scene, options["width"], options.get("cells", CELLS))
         calibrate(made, [window])
         self.window, self.emulator = window.to(options["device"]), made.to(options["device"])
         self.optimizer = torch.optim.Adam(made.parameters(), lr=1e-6, fused=options["device"] == "cuda")
@@ -131,10 +136,15 @@ class Training:
         for _ in range(self.unroll):
             if self.form.paper:
                 solid = self.emulator.solid(particles)
-            bundle = self.emulator(particles, solid)
+            bundle = self._bundle(particles, solid)
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)
             bundles.append(bundle.position)
         return torch.cat(bundles, dim=1)
+
+    def _bundle(self, particles: Particles, solid: Tensor) -> Bundle:
+        if not self.recompute:
+            return self.emulator(particles, solid)
+        return checkpoint(self.emulator, particles, solid, use_reentrant=False)
 
 
 class Rolling:
@@ -142,13 +152,12 @@ class Rolling:
 
     Args:
         form: What to roll out.
-        options: `preset`, `particles`, `batch`, `width`, `device`, perhaps `calls` per run, `cells` and `frames`.
+        options: `preset`, `particles`, `batch`, `width`, `device`, perhaps `calls` per run.
     """
 
     def __init__(self, form: Form, **options: Any) -> None:
         scene, state = scenes(options["preset"], options["particles"], options["batch"])
-        shape = {name: options[name] for name in ("cells", "frames") if name in options}
-        made = emulator(form, scene, options["width"], **shape).eval().requires_grad_(False)
+        made = emulator(form, scene, options["width"]).eval().requires_grad_(False)
         if form.precision != torch.float32:
             made.processor.to(form.precision)
         self.form, self.calls = form, options.get("calls", 10)

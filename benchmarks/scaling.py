@@ -11,9 +11,6 @@ positions and values of the particles once; how often grid nodes are touched is 
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import multiprocessing
-import resource
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -21,14 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from forms import FORMS, FRAMES, emulator
-from turns import Spread, ceilings, machine, timed, write
+from forms import FORMS, FRAMES, emulator, scenes
+from turns import Spread, alone, ceilings, machine, most_held, timed, write
 
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles
 from nmpm.rasterise import grid_state
-from nmpm.sim import load_preset
-from nmpm.starts import thrown_blocks
 
 PRESETS = {2: "waterramps", 3: "waterdrop3d"}
 WIDTH = 32
@@ -38,15 +33,11 @@ WIDTHS = (10, 14, 28, 10, 8, 13, 8, 16)
 
 
 def in_a_box(count: int, shape: tuple[int, ...]) -> tuple[Emulator, Particles]:
-    """An emulator on a grid, and a block that fills a fifth of its box with so many particles."""
-    preset = load_preset(PRESETS[len(shape)]).scene
-    volume = 1.0
-    for low, high in preset.bounds:
-        volume *= high - low
-    scene = dataclasses.replace(preset, particle_volume=0.2 * volume / count)
+    """An emulator on a grid, and blocks of so many particles."""
+    scene, state = scenes(PRESETS[len(shape)], count, 1)
     made = emulator(FORMS[FORM], scene, WIDTH, shape).eval().requires_grad_(False)
     made.processor.to(FORMS[FORM].precision)
-    return made, thrown_blocks(scene, count=count)
+    return made, state
 
 
 def sized(count: int, shape: tuple[int, ...], device: str, threads: int, rounds: int) -> dict[str, Any]:
@@ -55,9 +46,10 @@ def sized(count: int, shape: tuple[int, ...], device: str, threads: int, rounds:
     made, state = in_a_box(count, shape)
     made, state = made.to(device), state.to(device)
     solid = made.solid(state)
-    before = _memory(device)
-    parts = {name: _repeated(action, rounds) for name, action in _parts(made, state, solid).items()}
-    used = _memory(device) - before
+    actions = _parts(made, state, solid)
+    with torch.inference_mode():
+        used = most_held(actions["call"], device)
+    parts = {name: _repeated(action, rounds) for name, action in actions.items()}
     n, dim = state.position.shape[1:]
     least = {"p2g": FLOAT * n * (2 * dim + 1), "g2p": FLOAT * n * dim * 2 * FRAMES}
     rates = {f"{name}_gb_per_s": 1e-9 * moved / parts[name].median for name, moved in least.items()}
@@ -84,19 +76,6 @@ def _parts(made: Emulator, state: Particles, solid: torch.Tensor) -> dict[str, C
 def _repeated(action: Callable[[], object], rounds: int) -> Spread:
     action()
     return Spread.of([timed(action) for _ in range(rounds)])
-
-
-def _memory(device: str) -> float:
-    """The most bytes that this process has held so far."""
-    if device == "cuda":
-        return float(torch.cuda.max_memory_allocated())
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def alone(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What an action returns, run in a process of its own."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(action)
 
 
 def line(row: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ Comparisons hold within one run only. A process of its own, so that no form prof
 
 from __future__ import annotations
 
+import ctypes
 import json
 import multiprocessing
 import platform
@@ -86,6 +87,31 @@ def timed(action: Action) -> float:
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter() - start
+
+
+def most_held(action: Action, device: str) -> float:
+    """Bytes that an action holds at most, beyond what was held: tensors on a GPU, else the process (on Linux)."""
+    if device == "cuda":
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        action()
+        return float(torch.cuda.max_memory_allocated() - before)
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed is given back, or the action would reuse it unseen
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    before = _status("VmRSS")
+    action()
+    return float(_status("VmHWM") - before)
+
+
+def _status(name: str) -> int:
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def alone(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What an action returns, run in a process of its own, so that its memory is its own; it must be picklable."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(action)
 
 
 def ceilings(device: str, threads: int) -> dict[str, float]:

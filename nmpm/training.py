@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint
 from nmpm.augmentation import check_mirrors, mirrored
 from nmpm.calibration import calibrate
 from nmpm.comparison import Comparison
+from nmpm.compilation import compile_network
 from nmpm.constraints import Constraints
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator import Bundle, Emulator
@@ -65,6 +66,8 @@ class EmulatorModule(LightningModule):
         emd: Every how many frames to compute the exact earth mover's distance in tests; 0 for never (it is slow).
         recompute: Whether gradients recompute each bundle instead of keeping what they need of it: the memory of one
             bundle instead of K, for the time of one more forward pass.
+        compile: Whether to compile the network by torch.compile, where that works. It takes half a minute or more at
+            the start; on a CPU it gains next to nothing.
         seed: Of the noise.
     """
 
@@ -87,6 +90,7 @@ class EmulatorModule(LightningModule):
         horizons: Sequence[int] = (1, 8, 32, 100),
         emd: int = 0,
         recompute: bool = False,
+        compile: bool = False,  # noqa: A002 (torch's word)
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -102,7 +106,7 @@ class EmulatorModule(LightningModule):
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
         self.position_noise, self.mirror = position_noise, tuple(mirror)
-        self.recompute = recompute
+        self.recompute, self.compiled = recompute, compile
         self.seed = seed
         self.save_hyperparameters(
             {
@@ -122,6 +126,7 @@ class EmulatorModule(LightningModule):
                 "horizons": list(horizons),
                 "emd": emd,
                 "recompute": recompute,
+                "compile": compile,
                 "seed": seed,
             },
             logger=False,
@@ -156,6 +161,9 @@ class EmulatorModule(LightningModule):
         if stage == "fit" and not self.emulator.calibrated:
             loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]
             calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
+        if stage == "fit" and self.compiled:
+            example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
+            compile_network(self.emulator.processor, example)
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Make the step's randomness a function of the step, so that a resumed run repeats it."""

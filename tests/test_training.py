@@ -263,3 +263,24 @@ def test_a_training_step_runs_on_the_device_alone(make_dataset, statics):
     with Questions() as questions:
         assert bool(window.mask.any())
     assert questions.asked  # it does see such questions
+
+
+@pytest.mark.parametrize("backend", ["eager", "broken"])
+def test_a_compiled_network_trains_to_the_same_weights_and_a_broken_compiler_is_no_harm(
+    make_dataset, tmp_path, backend, monkeypatch, caplog
+):
+    def broken(*_):
+        raise RuntimeError("no compiler here")
+
+    data, ends = data_of(make_dataset()), []
+    plain = torch.nn.Module.compile
+    monkeypatch.setattr(
+        torch.nn.Module, "compile", lambda self: plain(self, backend=broken if backend == "broken" else "eager")
+    )
+    for compiled in (False, True):
+        module = module_of(data, compile=compiled)
+        trainer_of(tmp_path / str(compiled), 2).fit(module, data)
+        ends.append(module.state_dict())
+    assert list(ends[0]) == list(ends[1])
+    assert all(torch.equal(one, other) for one, other in zip(ends[0].values(), ends[1].values(), strict=True))
+    assert ("not compiled" in caplog.text) == (backend == "broken")
