@@ -163,8 +163,7 @@ def test_constraints_travel_with_the_model():
 def test_float64_is_computed_in_float64():
     scene = box()
     particles = cloud(scene)
-    tensors = {f.name: getattr(particles, f.name) for f in dataclasses.fields(particles)}
-    doubled = type(particles)(**{k: v.double() if v.is_floating_point() else v for k, v in tensors.items()})
+    doubled = particles.double()
     single, double = emulator_of(scene, decoder=Residual()), emulator_of(scene, decoder=Residual()).double()
     exact = rollout(double, doubled, 8)
     assert exact.dtype == torch.float64

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 from collections.abc import Iterator
 
@@ -37,7 +36,7 @@ def duration(subject: Subject, size: Size) -> Iterator[Line]:
         _GROUP, f"{size.horizons} training horizons ({frames} frames)", long.sound, long.figures(), needs, curves
     )  # fmt: skip
     yield failure(long)
-    far = run(subject, one(state), size.far)
+    far = run(subject, state.scenes(slice(1)), size.far)
     yield Line(_GROUP, f"{size.far:,} frames", far.sound, far.figures(), needs)
     yield from settled(subject, long, state, size)
 
@@ -98,8 +97,3 @@ def _thinned(values: Tensor) -> list[float]:
 def run(subject: Subject, state: Particles, frames: int, every: int = 0) -> Course:
     """Roll out and measure."""
     return follow(subject.emulator, state, stream(subject.emulator, state, frames), every)
-
-
-def one(state: Particles) -> Particles:
-    """The first scene alone."""
-    return Particles(**{field.name: getattr(state, field.name)[:1] for field in dataclasses.fields(state)})

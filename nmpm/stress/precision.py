@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -18,7 +17,6 @@ from nmpm.sim import MpmPreset
 from nmpm.sim.gravity import turned
 from nmpm.sim.mpm import draw_scene, simulate_from
 from nmpm.stress.course import follow
-from nmpm.stress.duration import one
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
@@ -34,7 +32,7 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
     emulator = subject.emulator
     plain = rollout(emulator, state, frames)
     nudged = rollout(emulator, nudge(subject, state), frames)
-    double = rollout(copy.deepcopy(emulator).double(), _doubled(state), frames)
+    double = rollout(copy.deepcopy(emulator).double(), state.double(), frames)
     own = _apart(subject, state, plain, nudged)
     rounding = _apart(subject, state, plain, double.to(plain.dtype))
     yield Line(
@@ -58,7 +56,7 @@ def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
     if subject.simulator is not None:
         figures["simulator_growth_per_100_frames"] = _simulator_growth(subject, subject.simulator, frames, size)
     yield Line(_GROUP, "growth of a nudge (exponent)", None, figures)
-    norms = _gradients(subject.emulator, one(state), size.bundles)
+    norms = _gradients(subject.emulator, state.scenes(slice(1)), size.bundles)
     yield Line(
         _GROUP, "gradients through unrolled bundles", all(math.isfinite(norm) for norm in norms.values()),
         {f"norm_K{bundles}": norm for bundles, norm in norms.items()}, "finite",
@@ -123,8 +121,3 @@ def _at(subject: Subject, apart: Tensor, own: Tensor) -> dict[str, float]:
         f"apart_cells_at_{last}": float(apart[-1]),
         f"nudged_cells_at_{last}": float(own[-1]),
     }
-
-
-def _doubled(state: Particles) -> Particles:
-    tensors = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-    return Particles(**{key: value.double() if value.is_floating_point() else value for key, value in tensors.items()})

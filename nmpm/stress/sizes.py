@@ -10,12 +10,12 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
-from nmpm.particles import Particles
+from nmpm.particles import Particles, Window
 from nmpm.rollouts import rollout
 from nmpm.scene import Scene
 from nmpm.stress.course import MOST_GAIN
 from nmpm.stress.lines import Line, Size
-from nmpm.stress.speeds import alone, judged
+from nmpm.stress.speeds import judged
 from nmpm.stress.subject import Subject, simulated
 
 _GROUP = "size and symmetry"
@@ -38,7 +38,7 @@ def _wide(subject: Subject, times: int, size: Size) -> Line:
         window = simulated(preset.widened(times), subject.seeds(size.scenes), size.compared)
         scene = preset.widened(times).scene
     else:
-        window, scene = alone(subject.starts(1)), widened(subject.emulator.scene, times)
+        window, scene = Window.of(subject.starts(1)), widened(subject.emulator.scene, times)
     try:
         wide = subject.over(subject.emulator.over(scene))
     except ConfigError as error:
@@ -68,8 +68,10 @@ def _regridded(subject: Subject, name: str, factor: float, size: Size) -> Line:
     except ConfigError as error:
         return Line(_GROUP, f"grid {name}: {error}", None, {})
     other.load_state_dict(mine.state_dict())
-    window = simulated(subject.preset, subject.seeds(size.scenes), size.compared) if subject.preset else None
-    window = window or alone(subject.starts(1))
+    if subject.preset is None:
+        window = Window.of(subject.starts(1))
+    else:
+        window = simulated(subject.preset, subject.seeds(size.scenes), size.compared)
     _, figures = judged(subject.over(other.eval()), window)
     return Line(_GROUP, f"grid {name}", None, figures)
 

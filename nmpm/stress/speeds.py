@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-import torch
-
-from nmpm.particles import Particles, Window
+from nmpm.particles import Window
 from nmpm.rollouts import rollout
 from nmpm.sim import MpmPreset
 from nmpm.stress.course import MOST_GAIN, Course, follow
@@ -57,7 +55,7 @@ def _faster(subject: Subject, factor: float, size: Size) -> Window:
         blocks = dataclasses.replace(preset.blocks, speed=factor * preset.blocks.speed)
         return simulated(dataclasses.replace(preset, blocks=blocks), subject.seeds(size.scenes), size.compared)
     state = subject.starts(size.scenes)
-    return alone(state.moved(state.position, factor * state.velocity))
+    return Window.of(state.moved(state.position, factor * state.velocity))
 
 
 def _heavier(subject: Subject, factor: float, size: Size) -> Window:
@@ -65,16 +63,8 @@ def _heavier(subject: Subject, factor: float, size: Size) -> Window:
     if preset is not None:
         return simulated(_weighed(preset, factor), subject.seeds(size.scenes), size.compared)
     state = subject.starts(size.scenes)
-    return alone(dataclasses.replace(state, gravity=factor * state.gravity))
+    return Window.of(dataclasses.replace(state, gravity=factor * state.gravity))
 
 
 def _weighed(preset: MpmPreset, factor: float) -> MpmPreset:
     return dataclasses.replace(preset, gravity=tuple(factor * g for g in preset.gravity))
-
-
-def alone(state: Particles) -> Window:
-    """A window that holds nothing but a state: its two frames, and none to compare with."""
-    others = {
-        f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in ("position", "velocity")
-    }
-    return Window(frames=torch.stack([state.position - state.velocity, state.position], dim=1), **others)
