@@ -10,12 +10,11 @@ from nmpm.particles import Particles
 from nmpm.rollouts import rollout, stream
 from nmpm.scene import Scene
 from nmpm.starts import lattice, resting, thrown_blocks
-from nmpm.stress.course import MOST_GAIN, Course, follow
+from nmpm.stress.course import SOUND, Course, follow
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
 _GROUP = "many and few"
-_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
 _SHARE = 0.1
 """Of the box: the volume that the counts share."""
 
@@ -40,7 +39,7 @@ def _finer(subject: Subject, size: Size) -> Iterator[Line]:
         places[number] = course.last.mean(1)
         apart = (places[number] - places[numbers[-1]]) / places[number].new_tensor(subject.emulator.grid.spacing)
         figures = course.figures() | {"centre_apart_cells": float(apart.norm())}
-        yield Line(_GROUP, f"{state.position.shape[1]:,} particles of the same volume", course.sound, figures, _NEEDS)
+        yield Line(_GROUP, f"{state.position.shape[1]:,} particles of the same volume", course.sound, figures, SOUND)
 
 
 def _denser(subject: Subject, factor: float, size: Size) -> Line:
@@ -51,7 +50,7 @@ def _denser(subject: Subject, factor: float, size: Size) -> Line:
     low, high = state.position.new_tensor(scene.bounds).T
     position = (centre + (state.position - centre) * factor ** (-1 / scene.dim)).clamp(low, high)
     course = _run(subject, scene, state.moved(position, state.velocity), subject.horizon)
-    return Line(_GROUP, f"density × {factor:g}", course.sound, course.figures(), _NEEDS)
+    return Line(_GROUP, f"density × {factor:g}", course.sound, course.figures(), SOUND)
 
 
 def _nothing(subject: Subject) -> Line:
@@ -77,7 +76,7 @@ def _full(subject: Subject, size: Size) -> Line:
     course = _run(subject, scene, state, 4 * subject.horizon)
     cells = (course.last - state.position) / state.position.new_tensor(subject.emulator.grid.spacing)
     figures = course.figures() | {"moved_cells": float(cells.square().sum(-1).mean().sqrt())}
-    return Line(_GROUP, f"a full box ({state.position.shape[1]:,} particles)", course.sound, figures, _NEEDS)
+    return Line(_GROUP, f"a full box ({state.position.shape[1]:,} particles)", course.sound, figures, SOUND)
 
 
 def _run(subject: Subject, scene: Scene, state: Particles, frames: int) -> Course:

@@ -15,6 +15,9 @@ from nmpm.scene import Scene
 MOST_GAIN = 0.01
 """Share of the initial energy by which it may grow where nothing is fed in."""
 
+SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
+"""What `Course.sound` says, in words."""
+
 
 @dataclass(frozen=True)
 class Course:

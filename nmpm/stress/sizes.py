@@ -13,13 +13,12 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
 from nmpm.rollouts import rollout
 from nmpm.scene import Scene
-from nmpm.stress.course import MOST_GAIN
+from nmpm.stress.course import SOUND
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.speeds import judged
 from nmpm.stress.subject import Subject, simulated
 
 _GROUP = "size and symmetry"
-_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
 
 
 def sizes(subject: Subject, size: Size) -> Iterator[Line]:
@@ -44,7 +43,7 @@ def _wide(subject: Subject, times: int, size: Size) -> Line:
     except ConfigError as error:
         return Line(_GROUP, f"{name}: {error}", None, {})
     course, figures = judged(wide, window)
-    return Line(_GROUP, name, course.sound, figures, _NEEDS)
+    return Line(_GROUP, name, course.sound, figures, SOUND)
 
 
 def widened(scene: Scene, times: int) -> Scene:
