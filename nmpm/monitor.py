@@ -10,7 +10,7 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from nmpm.constraints import energy
+from nmpm.constraints import MOST_GAIN, energy, equal_shares, lowest_potential
 from nmpm.emulator import Bundle, Emulator
 from nmpm.errors import NmpmError
 from nmpm.particles import Particles
@@ -66,7 +66,7 @@ class Monitor:
 
     policy: Policy = Policy.WARN
     speed: float = 4.0
-    energy_gain: float = 0.01
+    energy_gain: float = MOST_GAIN
     crowding: float | None = None
     incidents: list[Incident] = field(default_factory=list)
     peaks: dict[str, float] = field(default_factory=dict)
@@ -83,13 +83,10 @@ class Monitor:
         if emulator.scene.gravity is None and not emulator.scene.gravity_varies:
             self._reference = None
             return
-        real = particles.mask.to(particles.position.dtype)
-        share = (real / real.sum(-1, keepdim=True).clamp(min=1)).unsqueeze(-1)
-        gravity = particles.gravity.unsqueeze(1)
-        begun = energy(particles.position, particles.velocity, gravity, share)
-        corners = torch.cartesian_prod(*(gravity.new_tensor(bound) for bound in emulator.scene.bounds))
-        lowest = -(corners.reshape(-1, emulator.scene.dim) @ particles.gravity.T).amax(0)
-        self._reference = begun, (begun - lowest).clamp(min=torch.finfo(begun.dtype).tiny), share
+        share = equal_shares(particles.mask, particles.position.dtype)
+        begun = energy(particles.position, particles.velocity, particles.gravity.unsqueeze(1), share)
+        above = begun - lowest_potential(emulator.scene, particles.gravity)
+        self._reference = begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
         """Look at a bundle.

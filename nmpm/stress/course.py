@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nmpm.constraints import MOST_GAIN, lowest_potential
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles
 from nmpm.scene import Scene
-
-MOST_GAIN = 0.01
-"""Share of the initial energy by which it may grow where nothing is fed in."""
 
 SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
 """What `Course.sound` says, in words."""
@@ -113,9 +111,9 @@ def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -
         (B, T) in length² per frame².
     """
     gravity = start.gravity[:, None, None]
-    corners = torch.cartesian_prod(*(position.new_tensor(bound) for bound in scene.bounds)).reshape(-1, scene.dim)
-    lowest = (corners @ start.gravity.T).max(dim=0).values[:, None, None]
-    each = velocity.square().sum(-1) / 2 + lowest - (position * gravity).sum(-1)
+    lowest = lowest_potential(scene, start.gravity)[:, None, None]
+    # Counted from the lowest corner particle by particle: a sum far from the origin would lose the digits.
+    each = velocity.square().sum(-1) / 2 - lowest - (position * gravity).sum(-1)
     real = start.mask.unsqueeze(1)
     return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)
 
