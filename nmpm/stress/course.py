@@ -25,19 +25,15 @@ class Course:
         gain: (B, T) kinetic and potential energy above the start's, over the start's.
         speed: (B, T) of the fastest particle, in cells per frame.
         lost: (B, T) particles that are outside of the domain or nowhere.
-        filled: (B, V) volume that the particles fill over their own, at frames `every`, 2 `every`, …
-        every: Frames between two measures of the volume.
+        filled: (B, V) volume that the particles fill over their own, at the V frames that `follow` was asked for.
         last: (B, N, D) positions at the end.
-        velocity: (B, N, D) of the last frame.
     """
 
     gain: Tensor
     speed: Tensor
     lost: Tensor
     filled: Tensor
-    every: int
     last: Tensor
-    velocity: Tensor
 
     @property
     def frames(self) -> int:
@@ -81,21 +77,21 @@ def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], ever
     begun = energy(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
     spacing = start.position.new_tensor(emulator.grid.spacing)
     gains, speeds, losses, volumes = [], [], [], []
-    last, velocity, frame = start.position, start.velocity, 0
+    last, frame = start.position, 0
     for bundle in bundles:
         path = torch.cat([last.unsqueeze(1), bundle], dim=1)
         steps = path.diff(dim=1)
         gains.append((energy(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
         speeds.append(_largest((steps / spacing).norm(dim=-1), real))
         losses.append((outside(scene, bundle) & real.unsqueeze(1)).sum(-1))
-        last, velocity = bundle[:, -1], steps[:, -1]
+        last = bundle[:, -1]
         if every and (frame + bundle.shape[1]) // every > frame // every:
             volumes.append(filled(emulator, start, last))
         frame += bundle.shape[1]
     none = start.position.new_zeros(len(real), 0)
     gain, speed, lost = (torch.cat(parts, dim=1) if parts else none for parts in (gains, speeds, losses))
     volume = torch.stack(volumes, dim=1) if volumes else none
-    return Course(gain, speed, lost, volume, every, last, velocity)
+    return Course(gain, speed, lost, volume, last)
 
 
 def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:

@@ -174,7 +174,7 @@ def test_lattice_fills_a_box():
 def test_what_fails_is_not_hidden_by_a_mean():
     gain = torch.tensor([[0.0, 0.0], [0.0, 0.5]])
     none = torch.zeros(2, 2)
-    course = Course(gain, none, none, none, 0, torch.zeros(2, 1, 2), torch.zeros(2, 1, 2))
+    course = Course(gain, none, none, none, torch.zeros(2, 1, 2))
     assert course.steps_to_failure() == [3, 2]
     assert course.figures()["energy_gain_percent"] == 50.0
 
