@@ -14,6 +14,7 @@ from nmpm.constraints import MOST_GAIN, energy, equal_shares, lowest_potential
 from nmpm.emulator import Bundle, Emulator
 from nmpm.errors import NmpmError
 from nmpm.particles import Particles
+from nmpm.rasterise import volume_fraction
 
 _CROWDING_EVERY = 16  # bundles: its sum over particles is as dear as all the rest
 
@@ -120,11 +121,10 @@ class Monitor:
 
     def _see_crowding(self, emulator: Emulator, particles: Particles, last: Tensor) -> None:
         grid, scene = emulator.grid, emulator.scene
-        count = emulator.transfer.p2g(particles.mask.unsqueeze(-1).float(), grid.to_cells(last.nan_to_num()), grid)
-        fraction = (count * (scene.particle_volume / grid.cell_volume)).flatten(1).amax(1)
+        fraction = volume_fraction(scene, grid, emulator.transfer, particles.mask, grid.to_cells(last.nan_to_num()))
         channels = [i for i, name in enumerate(scene.input_channels) if name.endswith(".volume")]
         limit = float(emulator.input_high[channels].max()) if self.crowding is None else self.crowding
-        self._note("crowding", fraction, limit)
+        self._note("crowding", fraction.flatten(1).amax(1), limit)
         low, high = last.new_tensor(scene.bounds).T
         self.at_walls = int((((last <= low) | (last >= high)).any(-1) & particles.mask).sum())
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from nmpm.constraints import MOST_GAIN, lowest_potential
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles
+from nmpm.rasterise import volume_fraction
 from nmpm.scene import Scene
 
 SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
@@ -129,8 +130,7 @@ def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
     """
     grid, scene = emulator.grid, emulator.scene
     cells = grid.to_cells(torch.where(start.mask.unsqueeze(-1), position, position.new_tensor(scene.domain).mean(1)))
-    count = emulator.transfer.p2g(start.mask.unsqueeze(-1).float(), cells, grid)
-    fraction = count * (scene.particle_volume / grid.cell_volume)
+    fraction = volume_fraction(scene, grid, emulator.transfer, start.mask, cells)
     own = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
     return fraction.clamp(max=1.0).flatten(1).sum(1) / own
 
