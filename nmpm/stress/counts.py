@@ -10,7 +10,7 @@ from nmpm.particles import Particles
 from nmpm.rollouts import rollout, stream
 from nmpm.scene import Scene
 from nmpm.starts import lattice, resting, thrown_blocks
-from nmpm.stress.course import SOUND, Course, follow
+from nmpm.stress.course import SOUND, Course, apart, follow
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
@@ -74,8 +74,8 @@ def _full(subject: Subject, size: Size) -> Line:
     scene = dataclasses.replace(scene, particle_volume=volume)
     state = resting(scene, lattice(scene.bounds, volume ** (1 / scene.dim)))
     course = _run(subject, scene, state, 4 * subject.horizon)
-    cells = (course.last - state.position) / state.position.new_tensor(subject.emulator.grid.spacing)
-    figures = course.figures() | {"moved_cells": float(cells.square().sum(-1).mean().sqrt())}
+    moved = apart(subject.emulator.grid, state.mask, state.position.unsqueeze(1), course.last.unsqueeze(1))
+    figures = course.figures() | {"moved_cells": float(moved)}
     return Line(_GROUP, f"a full box ({state.position.shape[1]:,} particles)", course.sound, figures, SOUND)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nmpm.constraints import MOST_GAIN, lowest_potential
 from nmpm.emulator import Emulator
+from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.rasterise import volume_fraction
 from nmpm.scene import Scene
@@ -121,6 +122,22 @@ def outside(scene: Scene, position: Tensor) -> Tensor:
     walls = torch.tensor([not wraps for wraps in scene.periodic], device=position.device)
     beyond: Tensor = (((position < lower) | (position > upper)) & walls).any(-1)
     return beyond | ~position.isfinite().all(-1)
+
+
+def apart(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Root mean square distance of the same particles in two rollouts, over all scenes.
+
+    Args:
+        grid: Gives the cells.
+        mask: (B, N) bool, which particles are real.
+        one: (B, T, N, D) positions.
+        other: (B, T, N, D) positions.
+
+    Returns:
+        (T,) in cells.
+    """
+    squared = ((one - other) / one.new_tensor(grid.spacing)).square().sum(-1)
+    return (torch.where(mask.unsqueeze(1), squared, 0.0).sum((0, 2)) / mask.sum()).sqrt()
 
 
 def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
 from nmpm.rollouts import rollout
 from nmpm.scene import Scene
-from nmpm.stress.course import SOUND
+from nmpm.stress.course import SOUND, apart
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.speeds import judged
 from nmpm.stress.subject import Subject, simulated
@@ -123,7 +123,6 @@ def _shifted(subject: Subject, state: Particles, straight: Tensor) -> Line:
 
 
 def _difference(subject: Subject, name: str, state: Particles, one: Tensor, other: Tensor) -> Line:
-    cells = ((one - other) / one.new_tensor(subject.emulator.grid.spacing)).square().sum(-1)
-    each = torch.where(state.mask.unsqueeze(1), cells, 0.0).sum((0, 2)) / state.mask.sum()
-    figures = {f"apart_cells_at_{frame}": float(each[frame - 1].sqrt()) for frame in (subject.horizon, one.shape[1])}
+    distance = apart(subject.emulator.grid, state.mask, one, other)
+    figures = {f"apart_cells_at_{frame}": float(distance[frame - 1]) for frame in (subject.horizon, len(distance))}
     return Line(_GROUP, name, None, figures)

@@ -14,7 +14,7 @@ from nmpm.rollouts import rollout
 from nmpm.sim import load_preset
 from nmpm.starts import lattice, resting, thrown_blocks
 from nmpm.stress import GROUPS, Line, Size, Subject, battery
-from nmpm.stress.course import Course, energy, filled, follow, outside
+from nmpm.stress.course import Course, apart, energy, filled, follow, outside
 from nmpm.stress.precision import growth, nudge
 from nmpm.stress.report import as_json, summary, write
 from nmpm.stress.sizes import widened
@@ -192,3 +192,15 @@ def test_absolute_models_are_taken_too():
     emulator = Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), decoder=Absolute()).eval()
     assert rollout(emulator, cloud(scene), 4).isfinite().all()
     assert list(battery(Subject("absolute", emulator, 8), TINY, {"precision": GROUPS["precision"]}))
+
+
+def test_how_far_apart_two_rollouts_are_is_in_cells_and_of_real_particles():
+    scene = box()
+    emulator = emulator_of(scene)
+    mask = torch.tensor([[True, True], [True, False]])
+    one = torch.full((2, 3, 2, 2), 0.5)
+    other = one.clone()
+    other[:, 1, 0, 0] += 2 * emulator.grid.spacing[0]
+    other[1, :, 1] = float("nan")
+    values = apart(emulator.grid, mask, one, other).tolist()
+    assert values == pytest.approx([0.0, 2 * math.sqrt(2 / 3), 0.0], rel=1e-5)
