@@ -13,6 +13,7 @@ from nmpm.emulator import Emulator
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.rasterise import volume_fraction
+from nmpm.rollouts import beyond_walls
 from nmpm.scene import Scene
 
 SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
@@ -118,10 +119,7 @@ def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -
 
 def outside(scene: Scene, position: Tensor) -> Tensor:
     """Whether positions (..., D) are beyond the domain's walls, or not finite."""
-    lower, upper = position.new_tensor(scene.domain).T
-    walls = torch.tensor([not wraps for wraps in scene.periodic], device=position.device)
-    beyond: Tensor = (((position < lower) | (position > upper)) & walls).any(-1)
-    return beyond | ~position.isfinite().all(-1)
+    return beyond_walls(scene, position) | ~position.isfinite().all(-1)
 
 
 def apart(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:

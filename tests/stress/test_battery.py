@@ -10,7 +10,7 @@ from nmpm.constraints import Constraints
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator
 from nmpm.processors import Pointwise
-from nmpm.rollouts import rollout
+from nmpm.rollouts import beyond_walls, rollout
 from nmpm.sim import load_preset
 from nmpm.starts import lattice, resting, thrown_blocks
 from nmpm.stress import GROUPS, Line, Size, Subject, battery
@@ -96,6 +96,7 @@ def test_who_is_outside_or_nowhere_is_lost():
     scene = box()
     position = torch.tensor([[0.5, 0.5], [0.95, 0.5], [0.5, 0.0], [float("nan"), 0.5], [0.08, 0.92]])
     assert outside(scene, position).tolist() == [False, True, True, True, False]
+    assert beyond_walls(scene, position).tolist() == [False, True, True, False, False]
     assert not outside(box(boundary=("periodic", "wall")), position[1])
 
 
