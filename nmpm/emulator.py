@@ -92,7 +92,7 @@ class Emulator(nn.Module):
         super().__init__()
         self.scene = scene
         self.constraints = constraints or Constraints()
-        if self.constraints.energy and scene.gravity is None and not scene.gravity_varies:
+        if self.constraints.energy and not scene.gravity_known:
             raise ConfigError(
                 "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
             )

@@ -81,7 +81,7 @@ class Monitor:
         """Forget what was seen, and take a state as the one that a rollout starts from."""
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
         self._padded = not bool(particles.mask.all())
-        if emulator.scene.gravity is None and not emulator.scene.gravity_varies:
+        if not emulator.scene.gravity_known:
             self._reference = None
             return
         share = equal_shares(particles.mask, particles.position.dtype)
