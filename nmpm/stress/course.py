@@ -13,7 +13,7 @@ from nmpm.emulator import Emulator
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.rasterise import volume_fraction
-from nmpm.rollouts import beyond_walls
+from nmpm.rollouts import beyond_walls, stream
 from nmpm.scene import Scene
 
 SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
@@ -95,6 +95,11 @@ def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], ever
     gain, speed, lost = (torch.cat(parts, dim=1) if parts else none for parts in (gains, speeds, losses))
     volume = torch.stack(volumes, dim=1) if volumes else none
     return Course(gain, speed, lost, volume, last)
+
+
+def run(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Course:
+    """Roll out, keeping no positions but the last, and measure as `follow` does."""
+    return follow(emulator, start, stream(emulator, start, frames), every)
 
 
 def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from nmpm.particles import Particles
-from nmpm.rollouts import stream
-from nmpm.stress.course import SOUND, Course, filled, follow
+from nmpm.stress.course import SOUND, Course, filled, run
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject, simulated
 
@@ -29,13 +28,13 @@ def duration(subject: Subject, size: Size) -> Iterator[Line]:
     """Long rollouts of the scenes that the model knows."""
     state = subject.starts(size.scenes)
     frames = size.horizons * subject.horizon
-    long = run(subject, state, frames)
+    long = run(subject.emulator, state, frames)
     curves = {"energy, % above the start": (_thinned(100 * long.gain.amax(0)), frames)}
     yield Line(
         _GROUP, f"{size.horizons} training horizons ({frames} frames)", long.sound, long.figures(), SOUND, curves
     )  # fmt: skip
     yield failure(long)
-    far = run(subject, state.scenes(slice(1)), size.far)
+    far = run(subject.emulator, state.scenes(slice(1)), size.far)
     yield Line(_GROUP, f"{size.far:,} frames", far.sound, far.figures(), SOUND)
     yield from settled(subject, long, state, size)
 
@@ -61,7 +60,7 @@ def settled(subject: Subject, course: Course, state: Particles, size: Size) -> I
         last = course.last
     rest = state.moved(last, torch.zeros_like(last))
     own = filled(subject.emulator, rest, rest.position).unsqueeze(1)
-    long = run(subject, rest, size.settled, every=max(1, size.settled // 20))
+    long = run(subject.emulator, rest, size.settled, every=max(1, size.settled // 20))
     ratio = long.filled / own - 1
     change = float(ratio.abs().max())
     yield Line(
@@ -91,8 +90,3 @@ def _thinned(values: Tensor) -> list[float]:
     """At most 400 of (T,) values, evenly spaced."""
     kept: list[float] = values[:: max(1, len(values) // 400)].tolist()
     return kept
-
-
-def run(subject: Subject, state: Particles, frames: int, every: int = 0) -> Course:
-    """Roll out and measure."""
-    return follow(subject.emulator, state, stream(subject.emulator, state, frames), every)
