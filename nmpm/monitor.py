@@ -53,16 +53,30 @@ class Incident:
         return f"{self.what} {self.value:.4g} (limit {self.limit:.4g}) in scene {self.scene} by frame {self.frame}"
 
 
+@dataclass(frozen=True)
+class _Reference:
+    """The first state's energy (B,), how far it is above the lowest possible (B,), and the shares (B, N, 1)."""
+
+    energy: Tensor
+    above_lowest: Tensor
+    share: Tensor
+
+
 @dataclass
 class Monitor:
     """Limits that a rollout is watched for, once per bundle.
 
     Args:
         policy: To warn, once for each kind of incident, to stop, or only to record.
-        speed: Largest distance of a particle per frame, in cells.
+        speed: Largest step of a particle along an axis, in the last frame of a bundle, in the narrowest cells.
         energy_gain: Largest share of the first state's energy that may be gained; not watched where gravity is unknown.
         crowding: Largest volume fraction of a cell, looked at every 16th bundle; the largest that the network is shown
             when left out.
+
+    Attributes:
+        incidents: The first of each kind in this rollout.
+        peaks: The largest value of each measure in this rollout, by the names that incidents have.
+        at_walls: Particles at the scene's bounds or beyond, when crowding was last looked at.
     """
 
     policy: Policy = Policy.WARN
@@ -75,7 +89,7 @@ class Monitor:
     _frames: int = 0
     _bundles: int = 0
     _padded: bool = False
-    _reference: tuple[Tensor, Tensor, Tensor] | None = None
+    _reference: _Reference | None = None
 
     def start(self, emulator: Emulator, particles: Particles) -> None:
         """Forget what was seen, and take a state as the one that a rollout starts from."""
@@ -87,7 +101,7 @@ class Monitor:
         share = equal_shares(particles.mask, particles.position.dtype)
         begun = energy(particles.position, particles.velocity, particles.gravity.unsqueeze(1), share)
         above = begun - lowest_potential(emulator.scene, particles.gravity)
-        self._reference = begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share
+        self._reference = _Reference(begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share)
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
         """Look at a bundle.
@@ -113,13 +127,12 @@ class Monitor:
             self._note("not finite", (~way.isfinite()).float(), 0.0)
         self._note("speed", way, self.speed)
         if self._reference is not None:
-            begun, scale, share = self._reference
-            now = energy(last, bundle.velocity, particles.gravity.unsqueeze(1), share)
-            self._note("energy", (now - begun) / scale, self.energy_gain)
+            now = energy(last, bundle.velocity, particles.gravity.unsqueeze(1), self._reference.share)
+            self._note("energy", (now - self._reference.energy) / self._reference.above_lowest, self.energy_gain)
         if self._bundles % _CROWDING_EVERY == 1:
-            self._see_crowding(emulator, particles, last)
+            self._see_crowding_and_walls(emulator, particles, last)
 
-    def _see_crowding(self, emulator: Emulator, particles: Particles, last: Tensor) -> None:
+    def _see_crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> None:
         grid, scene = emulator.grid, emulator.scene
         fraction = volume_fraction(scene, grid, emulator.transfer, particles.mask, grid.to_cells(last.nan_to_num()))
         channels = [i for i, name in enumerate(scene.input_channels) if name.endswith(".volume")]

@@ -28,7 +28,7 @@ class Course:
         gain: (B, T) kinetic and potential energy above the start's, over the start's.
         speed: (B, T) of the fastest particle, in cells per frame.
         lost: (B, T) particles that are outside of the domain or nowhere.
-        filled: (B, V) volume that the particles fill over their own, at the V frames that `follow` was asked for.
+        filled: (B, V) volume that the particles fill over their own, at the V frames at which `follow` measures it.
         last: (B, N, D) positions at the end.
     """
 
@@ -77,14 +77,14 @@ def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], ever
         every: Frames between two measures of the volume, rounded up to bundles; 0 for none.
     """
     scene, real = emulator.scene, start.mask
-    begun = energy(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
+    begun = energy_above_lowest(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
     spacing = start.position.new_tensor(emulator.grid.spacing)
     gains, speeds, losses, volumes = [], [], [], []
     last, frame = start.position, 0
     for bundle in bundles:
         path = torch.cat([last.unsqueeze(1), bundle], dim=1)
         steps = path.diff(dim=1)
-        gains.append((energy(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
+        gains.append((energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
         speeds.append(_largest((steps / spacing).norm(dim=-1), real))
         losses.append((outside(scene, bundle) & real.unsqueeze(1)).sum(-1))
         last = bundle[:, -1]
@@ -102,8 +102,10 @@ def run(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Co
     return follow(emulator, start, stream(emulator, start, frames), every)
 
 
-def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
+def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
     """Kinetic and potential energy per mass, all particles of a mass, the potential from the bounds' lowest corner.
+
+    Counted from there particle by particle: in a sum of large potentials, far from the origin, digits would be lost.
 
     Args:
         scene: Gives the bounds.
@@ -116,7 +118,6 @@ def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -
     """
     gravity = start.gravity[:, None, None]
     lowest = lowest_potential(scene, start.gravity)[:, None, None]
-    # Counted from the lowest corner particle by particle: a sum far from the origin would lose the digits.
     each = velocity.square().sum(-1) / 2 - lowest - (position * gravity).sum(-1)
     real = start.mask.unsqueeze(1)
     return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)

@@ -82,11 +82,12 @@ def _drift(subject: Subject, state: Particles, one: Tensor, other: Tensor, frame
 
 
 def _change(subject: Subject, state: Particles, one: Tensor, other: Tensor) -> float:
+    """The most that a scene's filled volume differs between (B, N, D) and (B, N, D), in percent."""
     volumes = [filled(subject.emulator, state, position) for position in (one, other)]
     return 100 * float((volumes[1] / volumes[0] - 1).abs().max())
 
 
 def _thinned(values: Tensor) -> list[float]:
-    """At most 400 of (T,) values, evenly spaced."""
+    """Evenly spaced ones of (T,) values, fewer than 800."""
     kept: list[float] = values[:: max(1, len(values) // 400)].tolist()
     return kept

@@ -14,7 +14,7 @@ from nmpm.rollouts import beyond_walls, rollout
 from nmpm.sim import load_preset
 from nmpm.starts import lattice, resting, thrown_blocks
 from nmpm.stress import GROUPS, Line, Size, Subject, battery
-from nmpm.stress.course import Course, apart, energy, filled, follow, outside
+from nmpm.stress.course import Course, apart, energy_above_lowest, filled, follow, outside
 from nmpm.stress.precision import growth, nudge
 from nmpm.stress.report import as_json, summary, write
 from nmpm.stress.sizes import widened
@@ -103,7 +103,7 @@ def test_who_is_outside_or_nowhere_is_lost():
 def test_energy_is_that_of_a_stone():
     scene = box()
     state = resting(scene, torch.tensor([[0.5, 0.6], [0.5, 0.2]]))
-    values = energy(scene, state, state.position[:, None], torch.full((1, 1, 2, 2), 0.001))
+    values = energy_above_lowest(scene, state, state.position[:, None], torch.full((1, 1, 2, 2), 0.001))
     expected = 0.001**2 + 9.81 * 0.0025**2 * (0.5 + 0.1) / 2
     assert values.item() == pytest.approx(expected, rel=1e-5)
 
