@@ -16,7 +16,7 @@ from nmpm.rollouts import rollout, unroll
 from nmpm.sim import MpmPreset
 from nmpm.sim.gravity import turned
 from nmpm.sim.mpm import draw_scene, simulate_from
-from nmpm.stress.course import apart, follow
+from nmpm.stress.course import SOUND, apart, follow
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
@@ -45,7 +45,7 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
         course = follow(emulator, state, [half])
         figures = _at(subject, apart(emulator.grid, state.mask, plain, half), own) | course.figures()
         name = f"{str(dtype).removeprefix('torch.')} network beside float32"
-        yield Line(_GROUP, name, course.sound, figures, "nobody lost, no energy gained")
+        yield Line(_GROUP, name, course.sound, figures, SOUND)
 
 
 def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
