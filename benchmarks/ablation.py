@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from nmpm.atomic import replacing
 from nmpm.calibration import calibrate
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.particles import Particles, Window
+from nmpm.particles import Window
 from nmpm.plain import tupled
 from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule
@@ -131,8 +131,7 @@ class Probe:
     def call(self) -> float:
         """Seconds of a call at batch 1: the next m frames of one scene."""
         emulator = self.module.emulator.eval()
-        tensors = {field.name: getattr(self.window.initial, field.name)[:1] for field in fields(self.window.initial)}
-        state = Particles(**tensors)
+        state = self.window.initial.scenes(slice(1))
         solid = emulator.solid(state)
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16):

@@ -3,7 +3,8 @@
 Each rule is a fact about the scenes, to be switched on where it holds. But for the bounds, none acts in training, which
 has to see the network's own mistakes.
 
-All quantities are in grid units: cells, cells per frame; energies need cells that are as wide along each axis.
+All quantities are in grid units: cells, cells per frame. Energies may be in any unit of length that is the same along
+each axis, as cells need not be.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ import torch
 from torch import Tensor
 
 from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Scene
+
+MOST_GAIN = 0.01
+"""Share of the initial energy, counted from `lowest_potential`, that may be gained where nothing is fed in."""
 
 
 def stop(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -96,6 +101,26 @@ def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> T
     fall = gravity.reshape(batch, *extra, 1, dim)
     each = velocity.square() / 2 - cells * fall
     return (each * share.reshape(batch, *extra, count, 1)).sum((-2, -1))
+
+
+def equal_shares(mask: Tensor, dtype: torch.dtype) -> Tensor:
+    """(B, N, 1): each real particle's part of a scene's mean, all of a mass; mask (B, N) bool."""
+    real = mask.to(dtype)
+    return (real / real.sum(-1, keepdim=True).clamp(min=1)).unsqueeze(-1)
+
+
+def lowest_potential(scene: Scene, gravity: Tensor) -> Tensor:
+    """Potential energy per mass where it is lowest within the scene's bounds: in one of their corners.
+
+    Args:
+        scene: Gives the bounds.
+        gravity: (B, D) in length per frame².
+
+    Returns:
+        (B,) in length² per frame².
+    """
+    low, high = gravity.new_tensor(scene.bounds).T
+    return -torch.maximum(gravity * low, gravity * high).sum(-1)
 
 
 def affordable(cells: Tensor, step: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 An obstacle is where the solid fraction of the grid, interpolated linearly, exceeds `SURFACE`. A path stops before it
 gets deeper than that, and goes on straight along the surface as far as it can; what an obstacle has moved over is
-pushed out. Paths are looked at in pieces of at most half a cell, so that nobody jumps over a wall of one cell.
+pushed out. Paths are looked at in pieces of at most half a cell, so that nobody jumps over a wall of one cell. Only
+steps of more than 32 cells, and slides of more in a bundle, fall into longer ones, lest one runaway costs all memory.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ SURFACE = 0.4
 
 _PIECE = 0.5  # cells
 _MOST_PIECES = 64
-_WAYS_OUT = (0.5, 1.0, 1.5, 2.0)  # cells
+_WAYS_OUT = (0.5, 1.0, 1.5, 2.0)  # cells: the first that leads out of an obstacle is taken
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,16 @@ class Contact:
         return path
 
     def _slid(self, scene: Tensor, start: Tensor, path: Tensor, pieces: int) -> Tensor:
-        """(n, m, D): paths of particles of scenes (n,) up to where they touch, and along the surface from there."""
+        """(n, m, D): paths of particles of scenes (n,) up to where they touch, and along the surface from there.
+
+        What is left of the way at the touch loses its part into the solid, and is gone straight, evenly over the frames
+        left, until the surface bends into it.
+        """
         count, frames, _ = path.shape
         before = torch.cat([start.unsqueeze(1), path[:, :-1]], dim=1)
         shares = torch.arange(1, pieces + 1, device=path.device, dtype=path.dtype) / pieces
         points = (before.unsqueeze(2) + (path - before).unsqueeze(2) * shares[:, None]).flatten(1, 2)
-        free = (self._depth(scene, points) <= SURFACE).cumprod(1).sum(1)
+        free = (self._depth(scene, points) <= SURFACE).cumprod(1).sum(1)  # pieces before the first that is too deep
         row = torch.arange(count, device=path.device)
         touch = torch.where((free > 0).unsqueeze(-1), points[row, free - 1], start)
         blocked = points[row, free.clamp(max=points.shape[1] - 1)]
@@ -118,6 +123,6 @@ class Contact:
 
 
 def _pieces(steps: Tensor) -> int:
-    """Into how many pieces of at most half a cell the longest of steps (..., D) falls."""
+    """Into how many pieces of at most half a cell the longest of steps (..., D) falls; `_MOST_PIECES` at most."""
     longest = float(steps.detach().norm(dim=-1).max()) if steps.numel() else 0.0
     return min(_MOST_PIECES, max(1, math.ceil(longest / _PIECE)))

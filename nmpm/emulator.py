@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from nmpm.constraints import BOUNDS, Constraints, affordable, at_rest, energy
+from nmpm.constraints import BOUNDS, Constraints, affordable, at_rest, energy, equal_shares
 from nmpm.contact import Contact
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
@@ -100,7 +100,7 @@ class Emulator(nn.Module):
         super().__init__()
         self.scene = scene
         self.constraints = constraints or Constraints()
-        if self.constraints.energy and scene.gravity is None and not scene.gravity_varies:
+        if self.constraints.energy and not scene.gravity_known:
             raise ConfigError(
                 "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
             )
@@ -196,7 +196,7 @@ class Emulator(nn.Module):
         if not self.constraints.energy or self.training:
             return None
         cells, velocity, gravity = self._in_cells(particles)
-        return energy(*self._lengths(cells, velocity, gravity), _share(particles, cells))
+        return energy(*self._lengths(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
 
     def forward(self, particles: Particles, solid: Tensor, budget: Tensor | None = None) -> Bundle:
         """Predict the next m frames.
@@ -220,7 +220,8 @@ class Emulator(nn.Module):
             fields = output.to(self.precision) * self.output_scale
             smoothed = self._gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried(velocity, smoothed)
-            flight = _Flight(cells, carried, gravity, particles.material, fields, _share(particles, cells))
+            share = equal_shares(particles.mask, cells.dtype)
+            flight = _Flight(cells, carried, gravity, particles.material, fields, share)
             parts = [self._advect(flight.part(piece)) for piece in pieces(cells.shape[1], cells.device)]
             path = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
             if not self.training:
@@ -304,9 +305,3 @@ class Emulator(nn.Module):
             return rule(cells, low, high)
         wraps = torch.tensor(self.scene.periodic, device=cells.device)
         return torch.where(wraps, cells, rule(torch.where(wraps, (low + high) / 2, cells), low, high))
-
-
-def _share(particles: Particles, cells: Tensor) -> Tensor:
-    """(B, N, 1): each real particle's part of a scene's mean."""
-    real = particles.mask.to(cells.dtype)
-    return (real / real.sum(-1, keepdim=True).clamp(min=1)).unsqueeze(-1)

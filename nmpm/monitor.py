@@ -10,10 +10,11 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from nmpm.constraints import energy
+from nmpm.constraints import MOST_GAIN, energy, equal_shares, lowest_potential
 from nmpm.emulator import Bundle, Emulator
 from nmpm.errors import NmpmError
 from nmpm.particles import Particles
+from nmpm.rasterise import volume_fraction
 
 _CROWDING_EVERY = 16  # bundles: its sum over particles is as dear as all the rest
 
@@ -52,21 +53,35 @@ class Incident:
         return f"{self.what} {self.value:.4g} (limit {self.limit:.4g}) in scene {self.scene} by frame {self.frame}"
 
 
+@dataclass(frozen=True)
+class _Reference:
+    """The first state's energy (B,), how far it is above the lowest possible (B,), and the shares (B, N, 1)."""
+
+    energy: Tensor
+    above_lowest: Tensor
+    share: Tensor
+
+
 @dataclass
 class Monitor:
     """Limits that a rollout is watched for, once per bundle.
 
     Args:
         policy: To warn, once for each kind of incident, to stop, or only to record.
-        speed: Largest distance of a particle per frame, in cells.
+        speed: Largest step of a particle along an axis, in the last frame of a bundle, in the narrowest cells.
         energy_gain: Largest share of the first state's energy that may be gained; not watched where gravity is unknown.
         crowding: Largest volume fraction of a cell, looked at every 16th bundle; the largest that the network is shown
             when left out.
+
+    Attributes:
+        incidents: The first of each kind in this rollout.
+        peaks: The largest value of each measure in this rollout, by the names that incidents have.
+        at_walls: Particles at the scene's bounds or beyond, when crowding was last looked at.
     """
 
     policy: Policy = Policy.WARN
     speed: float = 4.0
-    energy_gain: float = 0.01
+    energy_gain: float = MOST_GAIN
     crowding: float | None = None
     incidents: list[Incident] = field(default_factory=list)
     peaks: dict[str, float] = field(default_factory=dict)
@@ -74,22 +89,19 @@ class Monitor:
     _frames: int = 0
     _bundles: int = 0
     _padded: bool = False
-    _reference: tuple[Tensor, Tensor, Tensor] | None = None
+    _reference: _Reference | None = None
 
     def start(self, emulator: Emulator, particles: Particles) -> None:
         """Forget what was seen, and take a state as the one that a rollout starts from."""
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
         self._padded = not bool(particles.mask.all())
-        if emulator.scene.gravity is None and not emulator.scene.gravity_varies:
+        if not emulator.scene.gravity_known:
             self._reference = None
             return
-        real = particles.mask.to(particles.position.dtype)
-        share = (real / real.sum(-1, keepdim=True).clamp(min=1)).unsqueeze(-1)
-        gravity = particles.gravity.unsqueeze(1)
-        begun = energy(particles.position, particles.velocity, gravity, share)
-        corners = torch.cartesian_prod(*(gravity.new_tensor(bound) for bound in emulator.scene.bounds))
-        lowest = -(corners.reshape(-1, emulator.scene.dim) @ particles.gravity.T).amax(0)
-        self._reference = begun, (begun - lowest).clamp(min=torch.finfo(begun.dtype).tiny), share
+        share = equal_shares(particles.mask, particles.position.dtype)
+        begun = energy(particles.position, particles.velocity, particles.gravity.unsqueeze(1), share)
+        above = begun - lowest_potential(emulator.scene, particles.gravity)
+        self._reference = _Reference(begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share)
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
         """Look at a bundle.
@@ -115,19 +127,17 @@ class Monitor:
             self._note("not finite", (~way.isfinite()).float(), 0.0)
         self._note("speed", way, self.speed)
         if self._reference is not None:
-            begun, scale, share = self._reference
-            now = energy(last, bundle.velocity, particles.gravity.unsqueeze(1), share)
-            self._note("energy", (now - begun) / scale, self.energy_gain)
+            now = energy(last, bundle.velocity, particles.gravity.unsqueeze(1), self._reference.share)
+            self._note("energy", (now - self._reference.energy) / self._reference.above_lowest, self.energy_gain)
         if self._bundles % _CROWDING_EVERY == 1:
-            self._see_crowding(emulator, particles, last)
+            self._see_crowding_and_walls(emulator, particles, last)
 
-    def _see_crowding(self, emulator: Emulator, particles: Particles, last: Tensor) -> None:
+    def _see_crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> None:
         grid, scene = emulator.grid, emulator.scene
-        count = emulator.transfer.p2g(particles.mask.unsqueeze(-1).float(), grid.to_cells(last.nan_to_num()), grid)
-        fraction = (count * (scene.particle_volume / grid.cell_volume)).flatten(1).amax(1)
+        fraction = volume_fraction(scene, grid, emulator.transfer, particles.mask, grid.to_cells(last.nan_to_num()))
         channels = [i for i, name in enumerate(scene.input_channels) if name.endswith(".volume")]
         limit = float(emulator.input_high[channels].max()) if self.crowding is None else self.crowding
-        self._note("crowding", fraction, limit)
+        self._note("crowding", fraction.flatten(1).amax(1), limit)
         low, high = last.new_tensor(scene.bounds).T
         self.at_walls = int((((last <= low) | (last >= high)).any(-1) & particles.mask).sum())
 

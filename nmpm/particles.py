@@ -8,6 +8,7 @@ particles (likewise), D space dimensions, T frames. Positions are in domain leng
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -15,20 +16,28 @@ import torch
 from torch import Tensor
 
 
-class _Movable:
-    """Dataclasses of tensors that travel together between devices."""
+class _Batched:
+    """Dataclasses of tensors (B, …) of the same B scenes, which are moved, converted and picked together."""
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
         """The same on another device."""
-        moved = {
-            field.name: getattr(self, field.name).to(device, non_blocking=non_blocking)
-            for field in dataclasses.fields(self)  # type: ignore[arg-type]
-        }
-        return type(self)(**moved)
+        return self._mapped(lambda values: values.to(device, non_blocking=non_blocking))
+
+    def double(self) -> Self:
+        """The same in float64; indices and masks keep their types."""
+        return self._mapped(lambda values: values.double() if values.is_floating_point() else values)
+
+    def scenes(self, chosen: slice) -> Self:
+        """Some of the scenes: views (B', …) of the tensors, the padding that of the whole batch."""
+        return self._mapped(lambda values: values[chosen])
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
+        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]
+        return type(self)(**{name: change(getattr(self, name)) for name in names})
 
 
 @dataclass(frozen=True)
-class Particles(_Movable):
+class Particles(_Batched):
     """The state of B scenes at one frame.
 
     Args:
@@ -70,7 +79,7 @@ class Particles(_Movable):
 
 
 @dataclass(frozen=True)
-class Window(_Movable):
+class Window(_Batched):
     """Consecutive recorded frames of B scenes: two to start from, the rest to predict.
 
     Args:
@@ -100,6 +109,18 @@ class Window(_Movable):
             "gravity": (batch, dim),
         }
         _check_shapes(self, expected)
+
+    @classmethod
+    def of(cls, state: Particles) -> Self:
+        """The two frames (B, 2, N, D) of a state, and none to predict."""
+        return cls(
+            frames=torch.stack([state.position - state.velocity, state.position], dim=1),
+            material=state.material,
+            mask=state.mask,
+            obstacle=state.obstacle,
+            obstacle_mask=state.obstacle_mask,
+            gravity=state.gravity,
+        )
 
     @property
     def initial(self) -> Particles:

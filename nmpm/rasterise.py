@@ -53,9 +53,22 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
         return particles.position.new_zeros(batch, 0, *grid.shape)
     if not scene.obstacles:
         return walls.expand(batch, 1, *grid.shape)
-    ones = particles.obstacle_mask.unsqueeze(-1).float()
-    count = transfer.p2g(ones, grid.to_cells(particles.obstacle), grid)
-    return (walls + count * (scene.particle_volume / grid.cell_volume)).clamp(max=1.0)
+    cells = grid.to_cells(particles.obstacle)
+    return (walls + volume_fraction(scene, grid, transfer, particles.obstacle_mask, cells)).clamp(max=1.0)
+
+
+def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, mask: Tensor, cells: Tensor) -> Tensor:
+    """The share of each cell taken by particles of whatever kind, (B, 1, *S); above 1 where they are crowded.
+
+    Args:
+        scene: Gives the particles' volume.
+        grid: What to rasterise onto.
+        transfer: How to.
+        mask: (B, N) bool, which particles are real.
+        cells: (B, N, D) positions in cells.
+    """
+    count = transfer.p2g(mask.unsqueeze(-1).float(), cells, grid)
+    return count * (scene.particle_volume / grid.cell_volume)
 
 
 def wall_fraction(scene: Scene, grid: Grid) -> Tensor:

@@ -55,9 +55,7 @@ def check_state(scene: Scene, particles: Particles) -> None:
                 f"Scene {scene_index} of the batch, particle {particle}: its {name} is"
                 f" {values[scene_index, particle].tolist()}; it must be finite."
             )
-    lower, upper = particles.position.new_tensor(scene.domain).T
-    walls = torch.tensor([not wraps for wraps in scene.periodic], device=lower.device)
-    beyond = (((particles.position < lower) | (particles.position > upper)) & walls).any(-1) & real
+    beyond = beyond_walls(scene, particles.position) & real
     if beyond.any():
         scene_index, particle = map(int, beyond.nonzero()[0])
         raise DataError(
@@ -65,6 +63,14 @@ def check_state(scene: Scene, particles: Particles) -> None:
             f" {particles.position[scene_index, particle].tolist()}, outside of the domain {list(scene.domain)}"
             f" ({int(beyond.sum())} particles are)."
         )
+
+
+def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
+    """Which positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
+    lower, upper = position.new_tensor(scene.domain).T
+    walls = torch.tensor([not wraps for wraps in scene.periodic], device=position.device)
+    beyond: Tensor = (((position < lower) | (position > upper)) & walls).any(-1)
+    return beyond
 
 
 def check_weights(emulator: Emulator) -> None:

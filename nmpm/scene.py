@@ -89,6 +89,21 @@ class Scene:
         return self.obstacles or self.bounds != self.domain
 
     @property
+    def gravity_known(self) -> bool:
+        """Whether the gravity that states carry is the scene's, not zero for want of knowledge."""
+        return self.gravity is not None or self.gravity_varies
+
+    @property
+    def volume(self) -> float:
+        """Volume within the bounds, in length ** dim."""
+        return math.prod(high - low for low, high in self.bounds)
+
+    @property
+    def particle_spacing(self) -> float:
+        """Distance between particles on a square lattice of their own density, in length."""
+        return float(self.particle_volume ** (1 / self.dim))
+
+    @property
     def input_channels(self) -> tuple[str, ...]:
         """Names of the grid channels the processor sees, in order."""
         axes = "xyz"[: self.dim]

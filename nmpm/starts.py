@@ -29,7 +29,7 @@ def thrown_blocks(scene: Scene, count: int = 1000, blocks: int = 1, speed: float
         ValueError: if the blocks do not fit into the box.
     """
     rng = np.random.default_rng(seed)
-    spacing = scene.particle_volume ** (1 / scene.dim)
+    spacing = scene.particle_spacing
     side = max(1, round((count / blocks) ** (1 / scene.dim)))
     low, high = np.array(scene.bounds).T
     room = (high - low) / np.array([blocks] + [1] * (scene.dim - 1)) - side * spacing

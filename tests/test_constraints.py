@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box, cloud
 
-from nmpm.constraints import Constraints, affordable, at_rest, energy
+from nmpm.constraints import Constraints, affordable, at_rest, energy, equal_shares, lowest_potential
 from nmpm.decoders import Absolute, Residual
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError, DataError
@@ -163,8 +163,7 @@ def test_constraints_travel_with_the_model():
 def test_float64_is_computed_in_float64():
     scene = box()
     particles = cloud(scene)
-    tensors = {f.name: getattr(particles, f.name) for f in dataclasses.fields(particles)}
-    doubled = type(particles)(**{k: v.double() if v.is_floating_point() else v for k, v in tensors.items()})
+    doubled = particles.double()
     single, double = emulator_of(scene, decoder=Residual()), emulator_of(scene, decoder=Residual()).double()
     exact = rollout(double, doubled, 8)
     assert exact.dtype == torch.float64
@@ -183,3 +182,22 @@ def test_energies_of_cells_that_are_not_square_are_counted_in_lengths():
     gains = [(e.budget(fall) - e.budget(particles)).item() for e in (square, oblong)]
     assert gains[0] == pytest.approx(gains[1], rel=1e-4)  # both in units of the first axis' cells
     assert oblong.budget(along).item() == pytest.approx(oblong.budget(particles).item(), rel=1e-4)
+
+
+def test_shares_are_of_real_particles():
+    mask = torch.tensor([[True, True, False], [True, True, True], [False, False, False]])
+    expected = torch.tensor([[0.5, 0.5, 0.0], [1 / 3] * 3, [0.0] * 3]).unsqueeze(-1)
+    torch.testing.assert_close(equal_shares(mask, torch.float32), expected)
+
+
+@pytest.mark.parametrize("bounds", [((0.1, 0.9),), ((0.1, 0.9), (-0.2, 0.4)), ((0.1, 0.9), (-0.2, 0.4), (0.0, 2.0))])
+def test_nowhere_within_the_bounds_is_the_potential_lower(bounds):
+    generator = torch.Generator().manual_seed(0)
+    scene = box(dim=len(bounds), bounds=bounds, domain=bounds)
+    low, high = torch.tensor(bounds).T
+    gravity = torch.randn(4, scene.dim, generator=generator)
+    places = low + (high - low) * torch.rand(1000, scene.dim, generator=generator)
+    lowest = lowest_potential(scene, gravity)
+    assert (-(gravity @ places.T) >= lowest.unsqueeze(1)).all()
+    corner = torch.where(gravity > 0, high, low)
+    torch.testing.assert_close(lowest, -(gravity * corner).sum(-1))

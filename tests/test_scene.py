@@ -30,6 +30,19 @@ def test_only_what_varies_becomes_a_channel():
     assert mixed.output_channels == mixed.input_channels[:4]
 
 
+def test_gravity_is_known_where_it_is_one_or_each_trajectory_has_its_own():
+    assert BOX.gravity_known
+    unknown = dataclasses.replace(BOX, gravity=None)
+    assert not unknown.gravity_known
+    assert dataclasses.replace(unknown, gravity_varies=True).gravity_known
+
+
+def test_volume_is_that_of_the_bounds_and_spacing_that_of_a_lattice():
+    scene = dataclasses.replace(BOX, particle_volume=0.01**2)
+    assert scene.volume == pytest.approx(0.8**2)
+    assert scene.particle_spacing == pytest.approx(0.01)
+
+
 def test_survives_as_plain_data():
     scene = dataclasses.replace(BOX, boundary=("periodic", "wall"), obstacles=True)
     assert Scene.from_dict(scene.to_dict()) == scene

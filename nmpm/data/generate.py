@@ -12,7 +12,6 @@ import json
 import logging
 import os
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from nmpm.atomic import replacing
+from nmpm.data.archives import DAMAGED_NPZ
 from nmpm.data.folder_lock import locked
 from nmpm.data.format import (
     METADATA_FILE,
@@ -227,7 +227,7 @@ def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Traj
             with np.load(part, allow_pickle=False) as arrays:
                 attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
                 yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
-        except (zipfile.BadZipFile, NotImplementedError, ValueError, KeyError, EOFError) as error:
+        except DAMAGED_NPZ as error:
             raise DataError(f"{part}: damaged ({error}); delete it, and the same call makes it again.") from error
         advance()
 
@@ -246,7 +246,7 @@ def metadata_of(preset: Preset) -> Metadata:
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,
         extra={
-            "default_connectivity_radius": round(1.8 * scene.particle_volume ** (1 / scene.dim), 6),
+            "default_connectivity_radius": round(1.8 * scene.particle_spacing, 6),
             "num_particles_max": preset.most_particles,
             "generator": f"nmpm {__version__}, {preset.generator}",
             "note": "Simulated by nmpm; not measured, and not anybody else's dataset.",

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 
-from nmpm.particles import Particles
-from nmpm.rollouts import rollout, stream
-from nmpm.scene import Scene
+from nmpm.rollouts import rollout
 from nmpm.starts import lattice, resting, thrown_blocks
-from nmpm.stress.course import MOST_GAIN, Course, follow
+from nmpm.stress.course import SOUND, apart, run
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
 _GROUP = "many and few"
-_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
 _SHARE = 0.1
 """Of the box: the volume that the counts share."""
 
@@ -30,17 +26,17 @@ def counts(subject: Subject, size: Size) -> Iterator[Line]:
 
 
 def _finer(subject: Subject, size: Size) -> Iterator[Line]:
-    """The last, finest one is what the centre of mass of the others is compared with."""
-    volume, places = _SHARE * _volume(subject.emulator.scene), {}
-    numbers = [10**power for power in range(8) if 10**power <= size.particles]
-    for number in reversed(numbers):
+    """The finest comes first: its centre of mass is what those of the others are compared with."""
+    volume, finest = _SHARE * subject.emulator.scene.volume, None
+    for number in (10**power for power in reversed(range(8)) if 10**power <= size.particles):
         scene = dataclasses.replace(subject.emulator.scene, particle_volume=volume / number)
         state = thrown_blocks(scene, count=number, seed=subject.seed)
-        course = _run(subject, scene, state, 2 * subject.horizon)
-        places[number] = course.last.mean(1)
-        apart = (places[number] - places[numbers[-1]]) / places[number].new_tensor(subject.emulator.grid.spacing)
-        figures = course.figures() | {"centre_apart_cells": float(apart.norm())}
-        yield Line(_GROUP, f"{state.position.shape[1]:,} particles of the same volume", course.sound, figures, _NEEDS)
+        course = run(subject.emulator.over(scene), state, 2 * subject.horizon)
+        centre = course.last.mean(1)
+        finest = centre if finest is None else finest
+        cells = (centre - finest) / centre.new_tensor(subject.emulator.grid.spacing)
+        figures = course.figures() | {"centre_apart_cells": float(cells.norm())}
+        yield Line(_GROUP, f"{state.position.shape[1]:,} particles of the same volume", course.sound, figures, SOUND)
 
 
 def _denser(subject: Subject, factor: float, size: Size) -> Line:
@@ -50,8 +46,8 @@ def _denser(subject: Subject, factor: float, size: Size) -> Line:
     centre = (state.position * real).sum(1, keepdim=True) / real.sum(1, keepdim=True)
     low, high = state.position.new_tensor(scene.bounds).T
     position = (centre + (state.position - centre) * factor ** (-1 / scene.dim)).clamp(low, high)
-    course = _run(subject, scene, state.moved(position, state.velocity), subject.horizon)
-    return Line(_GROUP, f"density × {factor:g}", course.sound, course.figures(), _NEEDS)
+    course = run(subject.emulator.over(scene), state.moved(position, state.velocity), subject.horizon)
+    return Line(_GROUP, f"density × {factor:g}", course.sound, course.figures(), SOUND)
 
 
 def _nothing(subject: Subject) -> Line:
@@ -71,19 +67,9 @@ def _nothing(subject: Subject) -> Line:
 def _full(subject: Subject, size: Size) -> Line:
     """Nowhere to go: what fills the box hardly moves. The particles are coarser where too many would be needed."""
     scene = subject.emulator.scene
-    volume = max(scene.particle_volume, _volume(scene) / size.particles)
-    scene = dataclasses.replace(scene, particle_volume=volume)
-    state = resting(scene, lattice(scene.bounds, volume ** (1 / scene.dim)))
-    course = _run(subject, scene, state, 4 * subject.horizon)
-    cells = (course.last - state.position) / state.position.new_tensor(subject.emulator.grid.spacing)
-    figures = course.figures() | {"moved_cells": float(cells.square().sum(-1).mean().sqrt())}
-    return Line(_GROUP, f"a full box ({state.position.shape[1]:,} particles)", course.sound, figures, _NEEDS)
-
-
-def _run(subject: Subject, scene: Scene, state: Particles, frames: int) -> Course:
-    emulator = subject.emulator.over(scene)
-    return follow(emulator, state, stream(emulator, state, frames))
-
-
-def _volume(scene: Scene) -> float:
-    return math.prod(high - low for low, high in scene.bounds)
+    scene = dataclasses.replace(scene, particle_volume=max(scene.particle_volume, scene.volume / size.particles))
+    state = resting(scene, lattice(scene.bounds, scene.particle_spacing))
+    course = run(subject.emulator.over(scene), state, 4 * subject.horizon)
+    moved = apart(subject.emulator.grid, state.mask, state.position.unsqueeze(1), course.last.unsqueeze(1))
+    figures = course.figures() | {"moved_cells": float(moved)}
+    return Line(_GROUP, f"a full box ({state.position.shape[1]:,} particles)", course.sound, figures, SOUND)

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nmpm.constraints import MOST_GAIN, lowest_potential
 from nmpm.emulator import Emulator
+from nmpm.grid import Grid
 from nmpm.particles import Particles
+from nmpm.rasterise import volume_fraction
+from nmpm.rollouts import beyond_walls, stream
 from nmpm.scene import Scene
 
-MOST_GAIN = 0.01
-"""Share of the initial energy by which it may grow where nothing is fed in."""
+SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
+"""What `Course.sound` says, in words."""
 
 
 @dataclass(frozen=True)
@@ -24,19 +28,15 @@ class Course:
         gain: (B, T) kinetic and potential energy above the start's, over the start's.
         speed: (B, T) of the fastest particle, in cells per frame.
         lost: (B, T) particles that are outside of the domain or nowhere.
-        filled: (B, V) volume that the particles fill over their own, at frames `every`, 2 `every`, …
-        every: Frames between two measures of the volume.
+        filled: (B, V) volume that the particles fill over their own, at the V frames at which `follow` measures it.
         last: (B, N, D) positions at the end.
-        velocity: (B, N, D) of the last frame.
     """
 
     gain: Tensor
     speed: Tensor
     lost: Tensor
     filled: Tensor
-    every: int
     last: Tensor
-    velocity: Tensor
 
     @property
     def frames(self) -> int:
@@ -77,28 +77,35 @@ def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], ever
         every: Frames between two measures of the volume, rounded up to bundles; 0 for none.
     """
     scene, real = emulator.scene, start.mask
-    begun = energy(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
+    begun = energy_above_lowest(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
     spacing = start.position.new_tensor(emulator.grid.spacing)
     gains, speeds, losses, volumes = [], [], [], []
-    last, velocity, frame = start.position, start.velocity, 0
+    last, frame = start.position, 0
     for bundle in bundles:
         path = torch.cat([last.unsqueeze(1), bundle], dim=1)
         steps = path.diff(dim=1)
-        gains.append((energy(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
+        gains.append((energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
         speeds.append(_largest((steps / spacing).norm(dim=-1), real))
         losses.append((outside(scene, bundle) & real.unsqueeze(1)).sum(-1))
-        last, velocity = bundle[:, -1], steps[:, -1]
+        last = bundle[:, -1]
         if every and (frame + bundle.shape[1]) // every > frame // every:
             volumes.append(filled(emulator, start, last))
         frame += bundle.shape[1]
     none = start.position.new_zeros(len(real), 0)
     gain, speed, lost = (torch.cat(parts, dim=1) if parts else none for parts in (gains, speeds, losses))
     volume = torch.stack(volumes, dim=1) if volumes else none
-    return Course(gain, speed, lost, volume, every, last, velocity)
+    return Course(gain, speed, lost, volume, last)
 
 
-def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
+def run(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Course:
+    """Roll out, keeping no positions but the last, and measure as `follow` does."""
+    return follow(emulator, start, stream(emulator, start, frames), every)
+
+
+def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
     """Kinetic and potential energy per mass, all particles of a mass, the potential from the bounds' lowest corner.
+
+    Counted from there particle by particle: in a sum of large potentials, far from the origin, digits would be lost.
 
     Args:
         scene: Gives the bounds.
@@ -110,19 +117,31 @@ def energy(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -
         (B, T) in length² per frame².
     """
     gravity = start.gravity[:, None, None]
-    corners = torch.cartesian_prod(*(position.new_tensor(bound) for bound in scene.bounds)).reshape(-1, scene.dim)
-    lowest = (corners @ start.gravity.T).max(dim=0).values[:, None, None]
-    each = velocity.square().sum(-1) / 2 + lowest - (position * gravity).sum(-1)
+    lowest = lowest_potential(scene, start.gravity)[:, None, None]
+    each = velocity.square().sum(-1) / 2 - lowest - (position * gravity).sum(-1)
     real = start.mask.unsqueeze(1)
     return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)
 
 
 def outside(scene: Scene, position: Tensor) -> Tensor:
     """Whether positions (..., D) are beyond the domain's walls, or not finite."""
-    lower, upper = position.new_tensor(scene.domain).T
-    walls = torch.tensor([not wraps for wraps in scene.periodic], device=position.device)
-    beyond: Tensor = (((position < lower) | (position > upper)) & walls).any(-1)
-    return beyond | ~position.isfinite().all(-1)
+    return beyond_walls(scene, position) | ~position.isfinite().all(-1)
+
+
+def apart(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Root mean square distance of the same particles in two rollouts, over all scenes.
+
+    Args:
+        grid: Gives the cells.
+        mask: (B, N) bool, which particles are real.
+        one: (B, T, N, D) positions.
+        other: (B, T, N, D) positions.
+
+    Returns:
+        (T,) in cells.
+    """
+    squared = ((one - other) / one.new_tensor(grid.spacing)).square().sum(-1)
+    return (torch.where(mask.unsqueeze(1), squared, 0.0).sum((0, 2)) / mask.sum()).sqrt()
 
 
 def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
@@ -132,8 +151,7 @@ def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
     """
     grid, scene = emulator.grid, emulator.scene
     cells = grid.to_cells(torch.where(start.mask.unsqueeze(-1), position, position.new_tensor(scene.domain).mean(1)))
-    count = emulator.transfer.p2g(start.mask.unsqueeze(-1).float(), cells, grid)
-    fraction = count * (scene.particle_volume / grid.cell_volume)
+    fraction = volume_fraction(scene, grid, emulator.transfer, start.mask, cells)
     own = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
     return fraction.clamp(max=1.0).flatten(1).sum(1) / own
 

@@ -81,7 +81,7 @@ def _moving(emulator: Emulator, bundles: int) -> Line:
     (left, right), (low, high), *rest = scene.bounds
     first = (left, left + 3 * h)
     still = bar(scene, (first, (low, (low + high) / 2), *rest))
-    block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), _spacing(scene))
+    block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), scene.particle_spacing)
     state = resting(scene, block, still)
 
     def place(bundle: int) -> float:
@@ -109,7 +109,7 @@ def _inlet(emulator: Emulator, bundles: int) -> Line:
     ]
     if scene.dim > 1:
         sides[1] = (scene.bounds[1][1] - 8 * h[1], scene.bounds[1][1] - 2 * h[1])
-    fresh = resting(scene, lattice(tuple(sides), _spacing(scene)))
+    fresh = resting(scene, lattice(tuple(sides), scene.particle_spacing))
 
     def fed(state: Particles, bundle: int) -> Particles:
         return joined(state, fresh) if bundle % 5 == 0 and bundle else state
@@ -127,7 +127,7 @@ def joined(one: Particles, other: Particles) -> Particles:
 
 def bar(scene: Scene, box: tuple[Interval, ...]) -> Tensor:
     """(M, D) obstacle particles that fill a box."""
-    return lattice(box, _spacing(scene))
+    return lattice(box, scene.particle_spacing)
 
 
 def _most(
@@ -158,13 +158,9 @@ def _block(emulator: Emulator, slab: tuple[Interval, ...], speed: float, solid: 
     scene, h = emulator.scene, emulator.grid.spacing
     box = [(low + (high - low) / 3, high - (high - low) / 3) for low, high in scene.bounds]
     box[1] = (slab[1][1] + 2 * h[1], slab[1][1] + 16 * h[1])
-    state = resting(scene, lattice(tuple(box), _spacing(scene)), solid)
+    state = resting(scene, lattice(tuple(box), scene.particle_spacing), solid)
     down = state.velocity.new_tensor([0.0, -speed * h[1]] + [0.0] * (scene.dim - 2))
     return state.moved(state.position, state.velocity + down)
-
-
-def _spacing(scene: Scene) -> float:
-    return float(scene.particle_volume ** (1 / scene.dim))
 
 
 def _floats(figures: dict[str, int]) -> dict[str, float]:

@@ -14,7 +14,6 @@ from torch import Tensor
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
 from nmpm.rollouts import rollout
-from nmpm.stress.duration import one
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
@@ -43,7 +42,7 @@ def _refused(name: str, attempt: Callable[[float], object]) -> Line:
 
 
 def _particle(subject: Subject, what: str, bad: float) -> object:
-    state = one(subject.starts(1))
+    state = subject.starts(1)
     values = getattr(state, what).clone()
     values[0, 0, 0] = bad
     return rollout(subject.emulator, dataclasses.replace(state, **{what: values}), 1)
@@ -67,4 +66,4 @@ def _spoilt(subject: Subject, choose: Callable[..., Tensor], bad: float) -> obje
     emulator = copy.deepcopy(subject.emulator)
     values = choose(emulator).data
     values[(0,) * values.dim()] = bad
-    return rollout(emulator, one(subject.starts(1)), 1)
+    return rollout(emulator, subject.starts(1), 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -17,8 +16,7 @@ from nmpm.rollouts import rollout, unroll
 from nmpm.sim import MpmPreset
 from nmpm.sim.gravity import turned
 from nmpm.sim.mpm import draw_scene, simulate_from
-from nmpm.stress.course import follow
-from nmpm.stress.duration import one
+from nmpm.stress.course import SOUND, apart, follow
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject
 
@@ -34,9 +32,9 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
     emulator = subject.emulator
     plain = rollout(emulator, state, frames)
     nudged = rollout(emulator, nudge(subject, state), frames)
-    double = rollout(copy.deepcopy(emulator).double(), _doubled(state), frames)
-    own = _apart(subject, state, plain, nudged)
-    rounding = _apart(subject, state, plain, double.to(plain.dtype))
+    double = rollout(copy.deepcopy(emulator).double(), state.double(), frames)
+    own = apart(emulator.grid, state.mask, plain, nudged)
+    rounding = apart(emulator.grid, state.mask, plain, double.to(plain.dtype))
     yield Line(
         _GROUP, "float32 beside float64", bool(rounding[-1] <= 10 * own[-1]), _at(subject, rounding, own),
         "no further apart than ten nudges of a millionth of the domain",
@@ -45,20 +43,21 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
         with torch.autocast(state.position.device.type, dtype):
             half = rollout(emulator, state, frames)
         course = follow(emulator, state, [half])
-        figures = _at(subject, _apart(subject, state, plain, half), own) | course.figures()
+        figures = _at(subject, apart(emulator.grid, state.mask, plain, half), own) | course.figures()
         name = f"{str(dtype).removeprefix('torch.')} network beside float32"
-        yield Line(_GROUP, name, course.sound, figures, "nobody lost, no energy gained")
+        yield Line(_GROUP, name, course.sound, figures, SOUND)
 
 
 def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
     """How fast a nudge grows, in the emulator and in the simulator; gradients through more and more bundles."""
     state, frames = subject.starts(size.scenes), 4 * subject.horizon
-    pair = rollout(subject.emulator, state, frames), rollout(subject.emulator, nudge(subject, state), frames)
-    figures = {"growth_per_100_frames": growth(_apart(subject, state, *pair))}
+    emulator = subject.emulator
+    pair = rollout(emulator, state, frames), rollout(emulator, nudge(subject, state), frames)
+    figures = {"growth_per_100_frames": growth(apart(emulator.grid, state.mask, *pair))}
     if subject.simulator is not None:
         figures["simulator_growth_per_100_frames"] = _simulator_growth(subject, subject.simulator, frames, size)
     yield Line(_GROUP, "growth of a nudge (exponent)", None, figures)
-    norms = _gradients(subject.emulator, one(state), size.bundles)
+    norms = _gradients(emulator, state.scenes(slice(1)), size.bundles)
     yield Line(
         _GROUP, "gradients through unrolled bundles", all(math.isfinite(norm) for norm in norms.values()),
         {f"norm_K{bundles}": norm for bundles, norm in norms.items()}, "finite",
@@ -74,10 +73,10 @@ def nudge(subject: Subject, state: Particles) -> Particles:
     return state.moved((state.position + NUDGE * side * noise).clamp(low, high), state.velocity)
 
 
-def growth(apart: Tensor) -> float:
+def growth(distance: Tensor) -> float:
     """Slope of the logarithm of a (T,) distance, per 100 frames: an estimate of the largest Lyapunov exponent."""
-    frames = torch.arange(len(apart), dtype=torch.float64)
-    logs = apart.double().clamp(min=1e-30).log()
+    frames = torch.arange(len(distance), dtype=torch.float64)
+    logs = distance.double().clamp(min=1e-30).log()
     centred = frames - frames.mean()
     return 100 * float((centred * logs).sum() / centred.square().sum())
 
@@ -93,8 +92,8 @@ def _simulator_growth(subject: Subject, preset: MpmPreset, frames: int, size: Si
             simulate_from(preset, position, start.velocity, frames, start.counts, None, gravity, ramps).position[1:]
             for position in (start.position, start.position + NUDGE * side * rng.standard_normal(start.position.shape))
         ]
-        apart = np.sqrt(np.square(runs[0] - runs[1]).sum(-1).mean(-1))
-        slopes.append(growth(torch.from_numpy(apart)))
+        distance = np.sqrt(np.square(runs[0] - runs[1]).sum(-1).mean(-1))
+        slopes.append(growth(torch.from_numpy(distance)))
     return float(np.mean(slopes))
 
 
@@ -110,21 +109,10 @@ def _gradients(emulator: Emulator, state: Particles, most: int) -> dict[int, flo
     return norms
 
 
-def _apart(subject: Subject, state: Particles, one: Tensor, other: Tensor) -> Tensor:
-    """(T,) root mean square distance of particles, in cells."""
-    cells = ((one - other) / one.new_tensor(subject.emulator.grid.spacing)).square().sum(-1)
-    return (torch.where(state.mask.unsqueeze(1), cells, 0.0).sum((0, 2)) / state.mask.sum()).sqrt()
-
-
-def _at(subject: Subject, apart: Tensor, own: Tensor) -> dict[str, float]:
-    first, last = subject.horizon, len(apart)
+def _at(subject: Subject, distance: Tensor, own: Tensor) -> dict[str, float]:
+    first, last = subject.horizon, len(distance)
     return {
-        f"apart_cells_at_{first}": float(apart[first - 1]),
-        f"apart_cells_at_{last}": float(apart[-1]),
+        f"apart_cells_at_{first}": float(distance[first - 1]),
+        f"apart_cells_at_{last}": float(distance[-1]),
         f"nudged_cells_at_{last}": float(own[-1]),
     }
-
-
-def _doubled(state: Particles) -> Particles:
-    tensors = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-    return Particles(**{key: value.double() if value.is_floating_point() else value for key, value in tensors.items()})

@@ -10,16 +10,15 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
-from nmpm.particles import Particles
+from nmpm.particles import Particles, Window
 from nmpm.rollouts import rollout
 from nmpm.scene import Scene
-from nmpm.stress.course import MOST_GAIN
+from nmpm.stress.course import SOUND, apart
 from nmpm.stress.lines import Line, Size
-from nmpm.stress.speeds import alone, judged
+from nmpm.stress.speeds import judged
 from nmpm.stress.subject import Subject, simulated
 
 _GROUP = "size and symmetry"
-_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
 
 
 def sizes(subject: Subject, size: Size) -> Iterator[Line]:
@@ -38,13 +37,13 @@ def _wide(subject: Subject, times: int, size: Size) -> Line:
         window = simulated(preset.widened(times), subject.seeds(size.scenes), size.compared)
         scene = preset.widened(times).scene
     else:
-        window, scene = alone(subject.starts(1)), widened(subject.emulator.scene, times)
+        window, scene = Window.of(subject.starts(1)), widened(subject.emulator.scene, times)
     try:
         wide = subject.over(subject.emulator.over(scene))
     except ConfigError as error:
         return Line(_GROUP, f"{name}: {error}", None, {})
     course, figures = judged(wide, window)
-    return Line(_GROUP, name, course.sound, figures, _NEEDS)
+    return Line(_GROUP, name, course.sound, figures, SOUND)
 
 
 def widened(scene: Scene, times: int) -> Scene:
@@ -68,8 +67,10 @@ def _regridded(subject: Subject, name: str, factor: float, size: Size) -> Line:
     except ConfigError as error:
         return Line(_GROUP, f"grid {name}: {error}", None, {})
     other.load_state_dict(mine.state_dict())
-    window = simulated(subject.preset, subject.seeds(size.scenes), size.compared) if subject.preset else None
-    window = window or alone(subject.starts(1))
+    if subject.preset is None:
+        window = Window.of(subject.starts(1))
+    else:
+        window = simulated(subject.preset, subject.seeds(size.scenes), size.compared)
     _, figures = judged(subject.over(other.eval()), window)
     return Line(_GROUP, f"grid {name}", None, figures)
 
@@ -122,7 +123,6 @@ def _shifted(subject: Subject, state: Particles, straight: Tensor) -> Line:
 
 
 def _difference(subject: Subject, name: str, state: Particles, one: Tensor, other: Tensor) -> Line:
-    cells = ((one - other) / one.new_tensor(subject.emulator.grid.spacing)).square().sum(-1)
-    each = torch.where(state.mask.unsqueeze(1), cells, 0.0).sum((0, 2)) / state.mask.sum()
-    figures = {f"apart_cells_at_{frame}": float(each[frame - 1].sqrt()) for frame in (subject.horizon, one.shape[1])}
+    distance = apart(subject.emulator.grid, state.mask, one, other)
+    figures = {f"apart_cells_at_{frame}": float(distance[frame - 1]) for frame in (subject.horizon, len(distance))}
     return Line(_GROUP, name, None, figures)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-import torch
-
-from nmpm.particles import Particles, Window
+from nmpm.particles import Window
 from nmpm.rollouts import rollout
 from nmpm.sim import MpmPreset
-from nmpm.stress.course import MOST_GAIN, Course, follow
+from nmpm.stress.course import SOUND, Course, follow
 from nmpm.stress.lines import Line, Size
 from nmpm.stress.subject import Subject, simulated
 
@@ -18,7 +16,6 @@ SPEEDS = (0.0, 1e-3, 1.0, 3.0, 10.0)
 GRAVITIES = (0.0, 0.5, 2.0, -1.0)
 
 _GROUP = "fast and slow"
-_NEEDS = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
 
 
 def speeds(subject: Subject, size: Size) -> Iterator[Line]:
@@ -48,7 +45,7 @@ def judged(subject: Subject, window: Window) -> tuple[Course, dict[str, float]]:
 
 def _line(subject: Subject, name: str, window: Window) -> Line:
     course, figures = judged(subject, window)
-    return Line(_GROUP, name, course.sound, figures, _NEEDS)
+    return Line(_GROUP, name, course.sound, figures, SOUND)
 
 
 def _faster(subject: Subject, factor: float, size: Size) -> Window:
@@ -57,7 +54,7 @@ def _faster(subject: Subject, factor: float, size: Size) -> Window:
         blocks = dataclasses.replace(preset.blocks, speed=factor * preset.blocks.speed)
         return simulated(dataclasses.replace(preset, blocks=blocks), subject.seeds(size.scenes), size.compared)
     state = subject.starts(size.scenes)
-    return alone(state.moved(state.position, factor * state.velocity))
+    return Window.of(state.moved(state.position, factor * state.velocity))
 
 
 def _heavier(subject: Subject, factor: float, size: Size) -> Window:
@@ -65,16 +62,8 @@ def _heavier(subject: Subject, factor: float, size: Size) -> Window:
     if preset is not None:
         return simulated(_weighed(preset, factor), subject.seeds(size.scenes), size.compared)
     state = subject.starts(size.scenes)
-    return alone(dataclasses.replace(state, gravity=factor * state.gravity))
+    return Window.of(dataclasses.replace(state, gravity=factor * state.gravity))
 
 
 def _weighed(preset: MpmPreset, factor: float) -> MpmPreset:
     return dataclasses.replace(preset, gravity=tuple(factor * g for g in preset.gravity))
-
-
-def alone(state: Particles) -> Window:
-    """A window that holds nothing but a state: its two frames, and none to compare with."""
-    others = {
-        f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in ("position", "velocity")
-    }
-    return Window(frames=torch.stack([state.position - state.velocity, state.position], dim=1), **others)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -50,8 +49,8 @@ class Subject:
         if self.preset is not None:
             return simulated(self.preset, self.seeds(count), 0).initial
         scene = self.emulator.scene
-        room = math.prod(high - low for low, high in scene.bounds)
-        return thrown_blocks(scene, count=max(1, min(1000, int(0.1 * room / scene.particle_volume))), seed=self.seed)
+        few = max(1, min(1000, int(0.1 * scene.volume / scene.particle_volume)))
+        return thrown_blocks(scene, count=few, seed=self.seed)
 
     def seeds(self, count: int) -> list[int]:
         """Seeds of scenes that no dataset holds."""

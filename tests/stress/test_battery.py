@@ -10,11 +10,11 @@ from nmpm.constraints import Constraints
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator
 from nmpm.processors import Pointwise
-from nmpm.rollouts import rollout
+from nmpm.rollouts import beyond_walls, rollout
 from nmpm.sim import load_preset
 from nmpm.starts import lattice, resting, thrown_blocks
 from nmpm.stress import GROUPS, Line, Size, Subject, battery
-from nmpm.stress.course import Course, energy, filled, follow, outside
+from nmpm.stress.course import Course, apart, energy_above_lowest, filled, follow, outside
 from nmpm.stress.precision import growth, nudge
 from nmpm.stress.report import as_json, summary, write
 from nmpm.stress.sizes import widened
@@ -96,13 +96,14 @@ def test_who_is_outside_or_nowhere_is_lost():
     scene = box()
     position = torch.tensor([[0.5, 0.5], [0.95, 0.5], [0.5, 0.0], [float("nan"), 0.5], [0.08, 0.92]])
     assert outside(scene, position).tolist() == [False, True, True, True, False]
+    assert beyond_walls(scene, position).tolist() == [False, True, True, False, False]
     assert not outside(box(boundary=("periodic", "wall")), position[1])
 
 
 def test_energy_is_that_of_a_stone():
     scene = box()
     state = resting(scene, torch.tensor([[0.5, 0.6], [0.5, 0.2]]))
-    values = energy(scene, state, state.position[:, None], torch.full((1, 1, 2, 2), 0.001))
+    values = energy_above_lowest(scene, state, state.position[:, None], torch.full((1, 1, 2, 2), 0.001))
     expected = 0.001**2 + 9.81 * 0.0025**2 * (0.5 + 0.1) / 2
     assert values.item() == pytest.approx(expected, rel=1e-5)
 
@@ -174,7 +175,7 @@ def test_lattice_fills_a_box():
 def test_what_fails_is_not_hidden_by_a_mean():
     gain = torch.tensor([[0.0, 0.0], [0.0, 0.5]])
     none = torch.zeros(2, 2)
-    course = Course(gain, none, none, none, 0, torch.zeros(2, 1, 2), torch.zeros(2, 1, 2))
+    course = Course(gain, none, none, none, torch.zeros(2, 1, 2))
     assert course.steps_to_failure() == [3, 2]
     assert course.figures()["energy_gain_percent"] == 50.0
 
@@ -192,3 +193,15 @@ def test_absolute_models_are_taken_too():
     emulator = Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), decoder=Absolute()).eval()
     assert rollout(emulator, cloud(scene), 4).isfinite().all()
     assert list(battery(Subject("absolute", emulator, 8), TINY, {"precision": GROUPS["precision"]}))
+
+
+def test_how_far_apart_two_rollouts_are_is_in_cells_and_of_real_particles():
+    scene = box()
+    emulator = emulator_of(scene)
+    mask = torch.tensor([[True, True], [True, False]])
+    one = torch.full((2, 3, 2, 2), 0.5)
+    other = one.clone()
+    other[:, 1, 0, 0] += 2 * emulator.grid.spacing[0]
+    other[1, :, 1] = float("nan")
+    values = apart(emulator.grid, mask, one, other).tolist()
+    assert values == pytest.approx([0.0, 2 * math.sqrt(2 / 3), 0.0], rel=1e-5)

@@ -8,7 +8,6 @@ per trajectory. NumPy stores objects as a pickle, which is read by the restricte
 from __future__ import annotations
 
 import re
-import struct
 import zipfile
 from collections.abc import Iterator
 from functools import partial
@@ -17,6 +16,7 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
+from nmpm.data.archives import DAMAGED_NPZ
 from nmpm.data.convert.base import Format, Options, Reread, Source, split_of
 from nmpm.data.convert.pickles import load_pickled, numbers
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
@@ -61,7 +61,7 @@ def _members(path: Path) -> tuple[str, ...]:
     try:
         with zipfile.ZipFile(path) as file:
             names = [name.removesuffix(".npy") for name in file.namelist() if name.endswith(".npy")]
-    except (OSError, ValueError, struct.error, zipfile.BadZipFile, NotImplementedError) as error:
+    except DAMAGED_NPZ as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
     if not names:
         raise DataError(f"{path}: the file holds no array.")
@@ -84,7 +84,7 @@ def _array(path: Path, name: str) -> Any:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
             shape, fortran, kind = _header(file)
             data = file.read()
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+    except DAMAGED_NPZ as error:
         raise DataError(f"{where}: cannot be read ({str(error)[:200]}). Copy or download the file again.") from error
     if kind.hasobject:
         return load_pickled(data, where)

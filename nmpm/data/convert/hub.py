@@ -7,6 +7,7 @@ import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from nmpm.data.archives import DAMAGED_ZIP
 from nmpm.data.catalog import dataset_home
 from nmpm.data.folder_lock import locked
 from nmpm.data.format import SPLITS
@@ -95,8 +96,8 @@ def _unpack(fetched: Path, archives: list[Path], target: Path) -> None:
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, place)
         part.rename(target)
-    except (zipfile.BadZipFile, NotImplementedError, OSError) as error:
-        raise DataError(f"{target}: cannot be unpacked ({error}).") from error
+    except DAMAGED_ZIP as error:
+        raise DataError(f"{target}: cannot be unpacked ({_first_line(error)}).") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 

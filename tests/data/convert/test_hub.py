@@ -1,6 +1,7 @@
 """Without any connection: what the hub would give is put in place of it."""
 
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import huggingface_hub
@@ -59,6 +60,17 @@ def test_archives_that_lead_out_are_refused(hub, tmp_path, name):
     with pytest.raises(DataError, match="refuses to unpack"):
         hub_folder("Goop")
     assert not list(tmp_path.rglob("x.h5"))
+
+
+@pytest.mark.parametrize("place", range(0, 200, 7))
+def test_damaged_archives_are_named(hub, tmp_path, place):
+    with zipfile.ZipFile(hub / "Goop" / "train.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("train/sim_0.json", bytes(range(256)))
+    data = bytearray((hub / "Goop" / "train.zip").read_bytes())
+    data[place] ^= 0x55
+    (hub / "Goop" / "train.zip").write_bytes(data)
+    with suppress(DataError):  # a damaged date does no harm
+        hub_folder("Goop")
 
 
 @pytest.mark.parametrize("name", ["", "..", "../up", "a/b/c/d", "a/../b", "Goop;rm"])

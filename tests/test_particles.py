@@ -1,0 +1,34 @@
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.particles import Particles, Window
+
+KEPT = {"material": torch.int64, "mask": torch.bool, "obstacle_mask": torch.bool}
+
+
+def state(batch: int = 3) -> Particles:
+    return cloud(box(), count=5, batch=batch, statics=2)
+
+
+@pytest.mark.parametrize("whole", [state(), Window.of(state())], ids=["Particles", "Window"])
+def test_double_leaves_indices_and_masks(whole):
+    for name, values in vars(whole.double()).items():
+        assert values.dtype == KEPT.get(name, torch.float64)
+        torch.testing.assert_close(values, getattr(whole, name), check_dtype=False, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("whole", [state(), Window.of(state())], ids=["Particles", "Window"])
+def test_some_scenes_are_views(whole):
+    some = whole.scenes(slice(1, 3))
+    for name, values in vars(some).items():
+        assert torch.equal(values, getattr(whole, name)[1:])
+        assert values.untyped_storage().data_ptr() == getattr(whole, name).untyped_storage().data_ptr()
+
+
+def test_a_window_of_a_state_starts_there_and_predicts_nothing():
+    start = state()
+    window = Window.of(start)
+    assert window.target.shape == (3, 0, 5, 2)
+    for name, values in vars(window.initial).items():
+        torch.testing.assert_close(values, getattr(start, name), rtol=0, atol=1e-7)
