@@ -161,7 +161,7 @@ def test_emphasis_draws_windows_in_proportion_to_their_motion():
     recording = Recording(frames, torch.zeros(3, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
     motion = Motion({7: recording}, length=4)
     rng = np.random.default_rng(0)
-    drawn = [motion.draw(rng) for _ in range(4000)]
+    drawn = [motion.at(share) for share in rng.random(4000)]
     assert {trajectory for trajectory, _ in drawn} == {7}
     starts = np.bincount([start for _, start in drawn], minlength=37) / 4000
     expected = np.array([min(3, max(0, 9 - start)) for start in range(37)]) / 24
