@@ -4,8 +4,8 @@ The trajectories of a dataset, shuffled again and again, form one endless row; b
 `buffer_size`. The windows of a buffer, shuffled again and again, form another endless row; batch after batch is cut
 from it, dealt to the ranks in turn, until `passes` times as many windows as an average buffer holds have been drawn.
 So every window is as likely as any other, no rank sees what another sees within a pass, and batch i of a rank is a
-pure function of the seed and the data: training that stopped goes on with the batch it would have seen. The batches of
-all ranks together are those of one process with as large a batch; where their size changes, training goes on in the same
+pure function of the seed and the data: training that stopped goes on with the batch it would have seen. All ranks'
+batches together are that of one process with as large a batch; where their size changes, training goes on in the same
 row of windows (`WindowPlan.after`).
 """
 
