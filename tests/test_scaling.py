@@ -54,7 +54,7 @@ def two(folder, tmp_path_factory) -> dict[str, list[dict]]:
         stderr=subprocess.DEVNULL,
     )
     try:
-        assert launcher.wait(timeout=180) == 0
+        assert launcher.wait(timeout=280) == 0
     finally:
         launcher.terminate()  # it ends the processes that it started
     told = {name: [json.loads((root / f"{name}-{rank}.json").read_text()) for rank in (0, 1)] for name in runs}
