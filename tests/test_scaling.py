@@ -6,6 +6,7 @@ import subprocess
 import sys
 from itertools import chain, islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,8 @@ from conftest import made_up_metadata, made_up_trajectory
 from trainings import data_of, signs, train
 
 from nmpm.calibration import calibrate
-from nmpm.data.format import write_metadata, write_split
+from nmpm.data.format import Split, write_metadata, write_split
+from nmpm.prediction_writer import PredictionWriter
 from nmpm.training import EmulatorModule
 
 SIZES = ((30, 9), (24, 7), (18, 8), (21, 6), (16, 5))
@@ -150,3 +152,12 @@ def test_calibration_of_parts_is_that_of_the_whole(folder, monkeypatch):
     calibrate(parted, windows[:1])
     for name, value in whole.named_buffers():
         torch.testing.assert_close(dict(parted.named_buffers())[name], value)
+
+
+def test_one_process_writes_the_predictions_of_all_in_order(monkeypatch, tmp_path):
+    made = [made_up_trajectory(5, particles) for particles in (3, 4, 5)]
+    monkeypatch.setattr("nmpm.prediction_writer.collected", lambda mine: [made[::2], made[1::2]])
+    trainer = SimpleNamespace(is_global_zero=True, default_root_dir=tmp_path)
+    PredictionWriter().on_predict_end(trainer, None)
+    written = Split(tmp_path / "predictions.h5")
+    assert [written.read(index).position.shape[1] for index in range(len(written))] == [3, 4, 5]
