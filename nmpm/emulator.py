@@ -19,6 +19,7 @@ from nmpm.contact import Contact
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
+from nmpm.parallel import normal_like
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout, Processor, UNet
 from nmpm.rasterise import grid_state, solid_fraction, wall_fraction
@@ -214,7 +215,7 @@ class Emulator(nn.Module):
             seen = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
             normalised = (seen - self.input_mean) / self.input_std
             if self.training and self.grid_noise > 0:
-                normalised = normalised + self.grid_noise * torch.randn_like(normalised)
+                normalised = normalised + self.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
         with torch.autocast(device, enabled=False):
             fields = output.to(self.precision) * self.output_scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,16 @@ from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nmpm.data.format import Trajectory, write_split
 from nmpm.export import predicted_trajectory
+from nmpm.parallel import collected
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
 
 class PredictionWriter(BasePredictionWriter):
-    """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder, a file per process if several."""
+    """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder.
+
+    Of several processes, the first writes what all have made, in the order in which one alone would.
+    """
 
     def __init__(self) -> None:
         super().__init__(write_interval="batch")
@@ -37,6 +42,9 @@ class PredictionWriter(BasePredictionWriter):
             self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        rank = f"_{trainer.global_rank}" if trainer.world_size > 1 else ""
-        write_split(Path(trainer.default_root_dir) / f"predictions{rank}.h5", self._made)
+        dealt = collected(self._made)
+        if trainer.is_global_zero:
+            turns = zip_longest(*dealt)  # trajectories are dealt in turn, so the last turn may be short
+            made = [trajectory for turn in turns for trajectory in turn if trajectory is not None]
+            write_split(Path(trainer.default_root_dir) / "predictions.h5", made)
         self._made = []

@@ -26,6 +26,7 @@ from nmpm.emulator import Bundle, Emulator
 from nmpm.errors import ConfigError
 from nmpm.losses import position_error
 from nmpm.metrics import EarthMover
+from nmpm.parallel import normal_like, of_all, of_the_first, share_of
 from nmpm.particles import Particles, Window
 from nmpm.processors import Processor, UNet
 from nmpm.rollouts import rollout, unroll
@@ -166,17 +167,27 @@ class EmulatorModule(LightningModule):
             compile_network(self.emulator.processor, example)
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
-        """Make the step's randomness a function of the step, so that a resumed run repeats it."""
-        entropy = (self.seed, self.global_rank, self.trainer.fit_loop.total_batch_idx)
+        """Make the batch's randomness a function of its number, so that a resumed run repeats it.
+
+        It is the same for all processes: each takes its own rows of what is drawn for all (`nmpm.parallel`).
+        """
+        entropy = (self.seed, 0, self.trainer.fit_loop.total_batch_idx)
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        """This process's part of the mean error over the particles of all processes, which is what is logged.
+
+        Over several batches (`accumulate_grad_batches`) Lightning takes the plain mean, so that a particle weighs a
+        little more in a batch with fewer.
+        """
         for axis in self.mirror:
-            batch = mirrored(batch, self.emulator.scene, axis, torch.rand(len(batch.frames), device=self.device) < 0.5)
+            chances = share_of(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
+            batch = mirrored(batch, self.emulator.scene, axis, chances < 0.5)
         bundles = self._unrolled(self._perturbed(batch.initial), self.bundles(self._progress()))
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
-        loss = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
-        self.log("train/loss", loss, prog_bar=True)
+        error = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
+        loss, logged = of_all(error, batch.mask.sum())
+        self.log("train/loss", logged, prog_bar=True)
         return loss
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:
@@ -242,14 +253,18 @@ class EmulatorModule(LightningModule):
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
     def _clock(self) -> float:
-        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine."""
+        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine.
+
+        By the clock of process 0: with rates of their own, the processes' weights would drift apart.
+        """
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, Timer) and callback._duration:
-                return min(callback.time_elapsed() / callback._duration, 1.0)
+                over = min(callback.time_elapsed() / callback._duration, 1.0)
+                return of_the_first(over, self.trainer.strategy.root_device)
         return 0.0
 
     def _perturbed(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
             return particles
-        noise = self.position_noise * torch.randn_like(particles.position)
+        noise = self.position_noise * normal_like(particles.position)
         return particles.moved(particles.position + noise, particles.velocity)

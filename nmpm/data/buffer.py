@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, groupby
 from typing import Protocol
 
 import numpy as np
@@ -51,9 +51,9 @@ class Motion:
         self.windows = [(index, start) for index, distance in travelled.items() for start in range(len(distance))]
         self.cumulative = np.cumsum(np.concatenate(list(travelled.values())))
 
-    def draw(self, rng: np.random.Generator) -> tuple[int, int]:
-        """A window as (trajectory, first frame); any if nothing moves anywhere."""
-        place = rng.random() * self.cumulative[-1]
+    def at(self, share: float) -> tuple[int, int]:
+        """The window, as (trajectory, first frame), at a share in [0, 1) of all motion; any if nothing moves."""
+        place = share * self.cumulative[-1]
         return self.windows[min(int(np.searchsorted(self.cumulative, place, side="right")), len(self.windows) - 1)]
 
 
@@ -104,12 +104,12 @@ class TrajectoryBuffer:
         Raises:
             DataError: if a trajectory cannot be read or does not fit the scene.
         """
-        plan, per_buffer = self.plan, self.plan.batches_per_buffer(world)
-        held = self._hold(plan.members(start // per_buffer, rank, world), None)
-        for buffer in count(start // per_buffer):
+        plan = self.plan
+        held = self._hold(plan.members(plan.place(start, world)[0], rank, world), None)
+        for buffer, indices in groupby(count(start), key=lambda index: plan.place(index, world)[0]):
             upcoming = in_background(self._hold, plan.members(buffer + 1, rank, world), held)
-            for index in range(max(start, buffer * per_buffer), (buffer + 1) * per_buffer):
-                drawn = self._emphasised(plan.batch(index, rank, world), held.motion, index, rank)
+            for index in indices:
+                drawn = self._emphasised(plan.batch(index, rank, world), held.motion, index, rank, world)
                 yield held.window(drawn, plan.length)
             held = upcoming.result()
 
@@ -127,11 +127,19 @@ class TrajectoryBuffer:
         return _Held(shelf.to(self.device), recordings, motion)
 
     def _emphasised(
-        self, drawn: list[tuple[int, int]], motion: Motion | None, index: int, rank: int
+        self, drawn: list[tuple[int, int]], motion: Motion | None, index: int, rank: int, world: int
     ) -> list[tuple[int, int]]:
-        """The windows drawn, some of them replaced by others that were drawn in proportion to motion."""
+        """The windows drawn, some of them replaced by others that were drawn in proportion to motion.
+
+        The chances are drawn for the batches of all ranks, as one process with so large a batch would, and each rank
+        takes its part of them.
+        """
         if motion is None:
             return drawn
-        rng = np.random.default_rng((self.plan.seed, MOTION, index, rank))
-        replaced = rng.random(len(drawn)) < self.plan.emphasis
-        return [motion.draw(rng) if swap else window for swap, window in zip(replaced, drawn, strict=True)]
+        rng = np.random.default_rng((self.plan.seed, MOTION, index, 0))
+        replaced = rng.random(len(drawn) * world) < self.plan.emphasis
+        first = rank * len(drawn)
+        mine = replaced[first : first + len(drawn)]
+        before = int(replaced[:first].sum())
+        shares = iter(rng.random(before + int(mine.sum()))[before:])
+        return [motion.at(next(shares)) if swap else window for swap, window in zip(mine, drawn, strict=True)]

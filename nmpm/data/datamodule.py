@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -11,10 +11,9 @@ import torch
 from lightning.pytorch import LightningDataModule
 
 from nmpm.data.buffer import Source, TrajectoryBuffer
+from nmpm.data.evaluation import EvaluationLoader
 from nmpm.data.origins import Embedded, Folder, Hub, Live, Origin, Stated
-from nmpm.data.plan import WindowPlan
-from nmpm.data.recording import Recordings
-from nmpm.data.shelf import collate
+from nmpm.data.plan import Start, WindowPlan
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
@@ -24,12 +23,21 @@ SourceName = Literal["disk", "simulate", "hub"]
 _GPU_SHARE = 0.25  # of the free memory; the rest is for the model
 
 
+@dataclass(frozen=True)
+class _Course:
+    """How training batches are cut from the plan: from where on, and of what size. Kept in checkpoints."""
+
+    start: Start
+    batch_size: int
+    world: int
+
+
 class TrajectoryDataModule(LightningDataModule):
     """Recorded or simulated trajectories, as `Window` batches.
 
     Training batches come without end (give the Trainer `max_steps`), each of windows of horizon + 2 frames, and go on
-    where training stopped when a checkpoint is resumed. Validation, test and prediction batches hold whole
-    trajectories, each once over all ranks; prediction uses the test split.
+    where training stopped when a checkpoint is resumed, with another number of processes or batch size too. Validation,
+    test and prediction batches hold whole trajectories, each once over all ranks; prediction uses the test split.
 
     Args:
         path: A dataset: a folder in the native layout, or anything that `nmpm convert` reads, converted on first use.
@@ -85,6 +93,7 @@ class TrajectoryDataModule(LightningDataModule):
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
+        self._course: _Course | None = None
 
     def __str__(self) -> str:
         # Lightning's own would go through the endless training batches.
@@ -109,8 +118,23 @@ class TrajectoryDataModule(LightningDataModule):
         """Simulates, fetches or converts the dataset on first use, in one process."""
         _ = self.origin.folder
 
+    def setup(self, stage: str) -> None:
+        """Forgets an earlier training, unless this one goes on with it."""
+        if stage == "fit" and not self.batches_seen:
+            self._course = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """How the batches seen so far were cut; how many they are is in the Trainer's own progress."""
+        return asdict(self._course) if self._course is not None else {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Takes up the training of a checkpoint."""
+        self._course = _Course(Start(**state["start"]), state["batch_size"], state["world"])
+
     def train_dataloader(self) -> TrainingLoader:
-        """Endless batches of training windows."""
+        """Endless batches of training windows, from the first one on that was not seen before a resumed checkpoint."""
+        _, world = self.ranks
+        course = self._course or _Course(Start(), self.batch_size, world)
         source, plan = self.origin.training(
             self.horizon + 2,
             batch_size=self.batch_size,
@@ -118,7 +142,10 @@ class TrajectoryDataModule(LightningDataModule):
             passes=self.passes,
             seed=self.seed,
             emphasis=self.emphasis,
+            start=course.start,
         )
+        plan = plan.after(self.batches_seen, course.batch_size, course.world, world)
+        self._course = _Course(plan.start, self.batch_size, world)
         return TrainingLoader(TrajectoryBuffer(source, plan, self.buffer_device(source, plan)), self)
 
     def buffer_device(self, source: Source, plan: WindowPlan) -> torch.device:
@@ -182,51 +209,6 @@ class TrainingLoader:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Has nothing to restore."""
-
-
-class EvaluationLoader:
-    """Whole trajectories in batches of equal length, dealt to the ranks in turn.
-
-    Args:
-        recordings: The trajectories.
-        batch_size: At most so many in a batch.
-        limit: Only the first so many; all when None.
-        rank: This process's number.
-        world: Number of processes.
-
-    Raises:
-        DataError: if a trajectory has nothing to predict, that is, fewer than 3 frames.
-        ConfigError: if there are more processes than trajectories.
-    """
-
-    def __init__(
-        self, recordings: Recordings, batch_size: int, limit: int | None = None, rank: int = 0, world: int = 1
-    ) -> None:
-        self.recordings = recordings
-        recordings.require_frames(3, "an evaluation")
-        frames = recordings.split.frames
-        order = sorted(range(len(recordings))[:limit], key=frames)
-        if len(order) < world:
-            # A rank without a batch would leave the others waiting for it.
-            raise ConfigError(
-                f"{recordings.split.path}: {len(order)} trajectories cannot be shared by {world} processes. Evaluate"
-                " with fewer devices, or on more trajectories."
-            )
-        groups = (list(group) for _, group in itertools.groupby(order[rank::world], key=frames))
-        self.batches: tuple[tuple[int, ...], ...] = tuple(
-            tuple(group[first : first + batch_size]) for group in groups for first in range(0, len(group), batch_size)
-        )
-
-    def __len__(self) -> int:
-        return len(self.batches)
-
-    def __iter__(self) -> Iterator[Window]:
-        for batch in self.batches:
-            yield self._window(batch)
-
-    def _window(self, batch: Sequence[int]) -> Window:
-        chosen = [self.recordings[index] for index in batch]
-        return collate(chosen, self.recordings.scene)
 
 
 def _origin(path: str | None, name: str | None, source: str, stated: Stated, generate: dict[str, Any]) -> Origin:

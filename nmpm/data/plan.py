@@ -4,19 +4,37 @@ The trajectories of a dataset, shuffled again and again, form one endless row; b
 `buffer_size`. The windows of a buffer, shuffled again and again, form another endless row; batch after batch is cut
 from it, dealt to the ranks in turn, until `passes` times as many windows as an average buffer holds have been drawn.
 So every window is as likely as any other, no rank sees what another sees within a pass, and batch i of a rank is a
-pure function of the seed and the data: training that stopped goes on with the batch it would have seen.
+pure function of the seed and the data: training that stopped goes on with the batch it would have seen. All ranks'
+batches together are that of one process with as large a batch; where their size changes, training goes on in the same
+row of windows (`WindowPlan.after`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 
 from nmpm.errors import ConfigError
 
 _TRAJECTORIES, _WINDOWS, MOTION = 0, 1, 2  # separate the streams of random numbers
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where batches of a size begin.
+
+    Args:
+        batch: Number of the first of them.
+        buffer: The buffer that it is drawn from.
+        drawn: How many windows of that buffer were drawn before.
+    """
+
+    batch: int = 0
+    buffer: int = 0
+    drawn: int = 0
 
 
 @dataclass(frozen=True)
@@ -31,6 +49,7 @@ class WindowPlan:
         passes: How often a buffer's windows are seen, on average, before the next buffer.
         seed: Another seed gives another order.
         emphasis: Share of the windows that is drawn in proportion to the motion in them, in [0, 1].
+        start: Where the batches of this size begin, if there were others before.
 
     Raises:
         ConfigError: if a number is out of its range.
@@ -43,6 +62,7 @@ class WindowPlan:
     passes: float
     seed: int
     emphasis: float = 0.0
+    start: Start = Start()
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "buffer_size", "passes"):
@@ -72,25 +92,52 @@ class WindowPlan:
         chosen = {int(_shuffle(total, self.seed, _TRAJECTORIES, p // total)[p % total]) for p in places}
         return tuple(sorted(chosen))
 
+    def place(self, index: int, world: int) -> tuple[int, int]:
+        """The buffer that a batch is drawn from, and how many of its windows are drawn before."""
+        stride, per_buffer = self._stride(world), self.batches_per_buffer(world)
+        since = index - self.start.batch
+        left = max(0, per_buffer - self.start.drawn // stride)
+        if since < left:
+            return self.start.buffer, self.start.drawn + since * stride
+        buffers, turn = divmod(since - left, per_buffer)
+        return self.start.buffer + 1 + buffers, turn * stride
+
     def batch(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
         """The windows of a batch, each as (trajectory, first frame)."""
-        per_buffer = self.batches_per_buffer(world)
-        buffer, turn = divmod(index, per_buffer)
+        buffer, drawn = self.place(index, world)
         members = self.members(buffer, rank, world)
         ends = np.cumsum([self.windows(trajectory) for trajectory in members])
         total = int(ends[-1])
-        first = self._turn(turn, rank, world) * self.batch_size
+        first = drawn + self._offset(rank)
         places = range(first, first + self.batch_size)
-        drawn = [int(_shuffle(total, self.seed, _WINDOWS, buffer, p // total)[p % total]) for p in places]
-        owners = np.searchsorted(ends, drawn, side="right").tolist()
+        chosen = [int(_shuffle(total, self.seed, _WINDOWS, buffer, p // total)[p % total]) for p in places]
+        owners = np.searchsorted(ends, chosen, side="right").tolist()
         return [
             (members[owner], window - int(ends[owner]) + self.windows(members[owner]))
-            for owner, window in zip(owners, drawn, strict=True)
+            for owner, window in zip(owners, chosen, strict=True)
         ]
 
-    def _turn(self, turn: int, rank: int, world: int) -> int:
+    def after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
+        """This plan, to be gone on with after batches of another size: with the first window that none of them had.
+
+        Args:
+            batches: Batches that each rank has had, from the first on.
+            batch_size: Windows in each of those since `start`.
+            earlier: Number of ranks that had them.
+            world: Number of ranks from now on.
+        """
+        if batch_size * earlier == self.batch_size * world:
+            return self
+        buffer, drawn = replace(self, batch_size=batch_size).place(batches, earlier)
+        return replace(self, start=Start(batches, buffer, drawn))
+
+    def _stride(self, world: int) -> int:
+        """Windows of a buffer that one batch of every rank takes."""
+        return self.batch_size * world
+
+    def _offset(self, rank: int) -> int:
         """Batches are dealt to the ranks in turn."""
-        return turn * world + rank
+        return rank * self.batch_size
 
 
 @dataclass(frozen=True)
@@ -111,8 +158,19 @@ class EndlessPlan(WindowPlan):
         first = (buffer * world + rank) * self.buffer_size
         return tuple(range(first, first + self.buffer_size))
 
-    def _turn(self, turn: int, rank: int, world: int) -> int:  # noqa: ARG002
-        return turn
+    def after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
+        """As for a plan with an end, but with the first buffer that no rank has begun."""
+        if (batch_size, earlier) == (self.batch_size, world):
+            return self
+        buffer, drawn = replace(self, batch_size=batch_size).place(batches, earlier)
+        begun = (buffer + (drawn > 0)) * earlier
+        return replace(self, start=Start(batches, -(-begun // world)))
+
+    def _stride(self, world: int) -> int:  # noqa: ARG002
+        return self.batch_size
+
+    def _offset(self, rank: int) -> int:  # noqa: ARG002
+        return 0
 
 
 @lru_cache(maxsize=8)

@@ -1,3 +1,4 @@
+import dataclasses
 from collections import Counter
 from itertools import islice
 
@@ -73,6 +74,30 @@ class TestPlan:
         one_pass = Counter(w for index in range(2) for rank in range(4) for w in plan.batch(index, rank, 4))
         assert set(one_pass.values()) == {1}
         assert len(one_pass) == 16
+
+    @given(plan=PLANS, legs=st.lists(st.tuples(*[st.integers(1, 7)] * 3), min_size=2, max_size=4))
+    @settings(max_examples=60, deadline=None)
+    def test_batches_of_another_size_go_on_in_the_same_row(self, plan, legs):
+        """Legs of some batches, of some size, for some ranks: no place is drawn twice or left out."""
+        index, before, expected = 0, None, (0, 0)
+        for batches, batch_size, world in legs:
+            plan = dataclasses.replace(plan, batch_size=batch_size)
+            plan = plan.after(index, *before, world) if before else plan
+            for number in range(index, index + batches):
+                buffer, drawn = plan.place(number, world)
+                assert (buffer, drawn) in (expected, (expected[0] + 1, 0))
+                if buffer > expected[0]:
+                    assert expected[1] > (plan.batches_per_buffer(world) - 1) * batch_size * world
+                expected = (buffer, drawn + batch_size * world)
+            index, before = index + batches, (batch_size, world)
+
+    @given(plan=PLANS, index=st.integers(0, 99))
+    @settings(max_examples=30, deadline=None)
+    def test_ranks_have_the_batch_of_one_with_as_large_a_batch(self, plan, index):
+        whole = dataclasses.replace(plan, batch_size=3 * plan.batch_size)
+        parts = [plan.batch(index, rank, 3) for rank in range(3)]
+        assert parts[0] + parts[1] + parts[2] == whole.batch(index, 0, 1)
+        assert plan.after(index, whole.batch_size, 1, 3) == plan
 
     def test_every_window_is_as_likely(self):
         plan = WindowPlan(frames=(8,) * 6, length=3, batch_size=4, buffer_size=2, passes=1, seed=3)
@@ -161,7 +186,7 @@ def test_emphasis_draws_windows_in_proportion_to_their_motion():
     recording = Recording(frames, torch.zeros(3, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
     motion = Motion({7: recording}, length=4)
     rng = np.random.default_rng(0)
-    drawn = [motion.draw(rng) for _ in range(4000)]
+    drawn = [motion.at(share) for share in rng.random(4000)]
     assert {trajectory for trajectory, _ in drawn} == {7}
     starts = np.bincount([start for _, start in drawn], minlength=37) / 4000
     expected = np.array([min(3, max(0, 9 - start)) for start in range(37)]) / 24
@@ -177,6 +202,14 @@ def test_emphasis_keeps_batches_a_function_of_their_number(make_dataset):
         assert torch.equal(one.frames, other.frames)
     plain = TrajectoryDataModule(path=str(data.origin.path), horizon=4, batch_size=4).train_dataloader().buffer
     assert any(not torch.equal(a.frames, b.frames) for a, b in zip(run, plain.batches(), strict=False))
+
+
+def test_emphasis_is_the_same_for_ranks_and_for_one_with_as_large_a_batch(make_dataset):
+    folder = make_dataset()
+    of = {size: TrajectoryDataModule(path=str(folder), horizon=4, batch_size=size, emphasis=0.5) for size in (2, 6)}
+    parts = [of[2].train_dataloader().buffer.batches(rank=rank, world=3) for rank in range(3)]
+    for *ranks, whole in islice(zip(*parts, of[6].train_dataloader().buffer.batches(), strict=True), 12):
+        assert torch.equal(torch.cat([part.frames for part in ranks]), whole.frames)
 
 
 @pytest.mark.parametrize("emphasis", [-0.1, 1.5])

@@ -57,6 +57,14 @@ def test_a_buffers_windows_are_all_seen():
     assert len(drawn) == 9
 
 
+@pytest.mark.parametrize(("earlier", "world"), [(1, 2), (2, 1), (3, 2), (2, 3)])
+def test_no_trajectory_is_seen_again_by_another_number_of_ranks(earlier, world):
+    seen = {index for rank in range(earlier) for batch in range(7) for index, _ in PLAN.batch(batch, rank, earlier)}
+    after = PLAN.after(7, PLAN.batch_size, earlier, world)
+    more = {index for rank in range(world) for batch in range(7, 14) for index, _ in after.batch(batch, rank, world)}
+    assert max(seen) < min(more) <= max(seen) + 2 * world
+
+
 def test_a_failed_simulation_is_reported():
     fast = dataclasses.replace(TINY, blocks=dataclasses.replace(TINY.blocks, speed=1e200))
     with pytest.raises(ConfigError, match=r"Preset goop, seed .*finite"):

@@ -1,0 +1,84 @@
+"""Small trainings that keep a diary; run as a script (by torchrun) it does those of a JSON file in each process."""
+
+import json
+import sys
+from pathlib import Path
+
+import lightning
+import torch
+
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.particles import Window
+from nmpm.processors import UNet
+from nmpm.schedules import Schedule
+from nmpm.training import EmulatorModule
+
+TINY = UNet(width=4, depth=1, perceptron=(4,))
+
+
+def signs(batch: Window) -> list[str]:
+    """What tells the windows of a batch apart."""
+    return [f"{total:.10g}" for total in batch.frames.double().sum((1, 2, 3)).tolist()]
+
+
+class Diary(lightning.Callback):
+    """Notes the windows, loss, learning rate and seed of every batch."""
+
+    def __init__(self):
+        self.windows, self.losses, self.rates, self.seeds = [], [], [], []
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        self.windows.append(signs(batch))
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.seeds.append(torch.initial_seed())
+        self.losses.append(trainer.callback_metrics["train/loss"].item())
+        self.rates.append(trainer.optimizers[0].param_groups[0]["lr"])
+
+
+def data_of(folder: Path, **options) -> TrajectoryDataModule:
+    known = {"path": str(folder), "horizon": 4, "batch_size": 4, "buffer_size": 2, "passes": 1.0}
+    return TrajectoryDataModule(**(known | options))
+
+
+def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = None, **options) -> dict:
+    """Train, keep the last checkpoint in the file `last`, and give the diary."""
+    module = data_of(folder, **options.pop("data", {}))
+    model = {"unroll": 2, "position_noise": 1e-4, "grid_noise": 0.01, "mirror": (0,)} | options.pop("model", {})
+    torch.manual_seed(0)
+    schedule = Schedule(warmup=30)
+    emulator = EmulatorModule(module.scene, cells=8, frames=2, processor=TINY, schedule=schedule, **model)
+    emulator.emulator.calibrated.fill_(options.pop("calibrated", False))
+    diary = Diary()
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        devices=devices,
+        strategy="ddp" if devices > 1 else "auto",
+        default_root_dir=last.parent,
+        callbacks=[diary],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        limit_val_batches=0,
+        **options,
+    )
+    trainer.fit(emulator, module, ckpt_path=ckpt_path, weights_only=True)
+    trainer.save_checkpoint(last)
+    weights = torch.cat([value.double().flatten() for value in emulator.state_dict().values()])
+    return {
+        "losses": diary.losses,
+        "windows": diary.windows,
+        "rates": diary.rates,
+        "seeds": diary.seeds,
+        "weights": weights.tolist(),
+        "rank": trainer.global_rank,
+    }
+
+
+if __name__ == "__main__":
+    plan = Path(sys.argv[1])
+    for name, run in json.loads(plan.read_text()).items():
+        before = run.pop("ckpt_path", None)
+        told = train(Path(run.pop("folder")), plan.parent / f"{name}.ckpt", 2, before and Path(before), **run)
+        (plan.parent / f"{name}-{told['rank']}.json").write_text(json.dumps(told))
