@@ -47,6 +47,13 @@ _KEY = "simulation"
 _log = logging.getLogger(__name__)
 
 
+def _are_counts(counts: object) -> bool:
+    """Whether these are numbers of trajectories, one for each split."""
+    if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):
+        return False
+    return all(isinstance(number, int) and number >= 0 for number in counts.values())
+
+
 @dataclass(frozen=True)
 class Request:
     """A dataset to simulate.
@@ -65,10 +72,11 @@ class Request:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if set(self.counts) != set(SPLITS) or min(self.counts.values()) < 0 or not self.splits or self.seed < 0:
+        if not _are_counts(self.counts) or not self.splits or self.seed < 0:
             raise ConfigError(
-                f"counts = {dict(self.counts)}, seed = {self.seed}: give the number of trajectories in each of "
-                f"{', '.join(SPLITS)}, at least 1 in all; neither they nor the seed may be negative."
+                f"counts = {self.counts}, seed = {self.seed}: give the number of trajectories in each of "
+                f"{', '.join(SPLITS)}, as in {{train: 3, valid: 1, test: 1}}, at least 1 in all; neither they nor the "
+                "seed may be negative."
             )
 
     @property
