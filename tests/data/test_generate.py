@@ -209,7 +209,10 @@ def test_a_split_of_none_gets_no_file(tmp_path):
 NONE = dict.fromkeys(COUNTS, 0)
 
 
-@pytest.mark.parametrize("counts", [{"train": 1}, {**COUNTS, "test": -1}, NONE, {**COUNTS, "more": 1}, {**COUNTS, "test": 1.5}, "{train:3}"])
+IMPOSSIBLE = ({"train": 1}, {**COUNTS, "test": -1}, NONE, {**COUNTS, "more": 1}, {**COUNTS, "test": 1.5}, "{train:3}")
+
+
+@pytest.mark.parametrize("counts", IMPOSSIBLE)
 def test_counts_that_cannot_be_are_refused(tmp_path, counts):
     with pytest.raises(ConfigError, match="train, valid, test"):
         generate(TINY, tmp_path, counts)
