@@ -49,7 +49,7 @@ class Transfer(ABC):
     def p2g(self, values: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Sum particle values (B, N, C) at `cells` (B, N, D) onto the nodes, (B, C, *S)."""
         summed = scatter(self.scatter_stencil(cells, grid), values, grid.size)
-        return summed.transpose(1, 2).reshape(len(summed), -1, *grid.shape)
+        return summed.transpose(1, 2).reshape(summed.shape[0], -1, *grid.shape)
 
     def momentum(self, velocity: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         """Momentum and number of particles of each material on the nodes, each particle of mass 1.
