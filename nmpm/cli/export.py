@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from nmpm.emulator import Emulator
     from nmpm.export import Part
 
-DESCRIPTION = """Write a trained model as a file that runs without nmpm: ONNX, for ONNX Runtime, without torch either; or
+DESCRIPTION = """Write a trained model as a file that runs without nmpm: ONNX, for ONNX Runtime, without torch; or
 a package of AOTInductor (.pt2), machine code for the processor that it is made on, for torch in Python or C++. Scenes
 and particles may be as many as you like. The file says itself what goes in and comes out, in which units; it is
 compared with the model once it is written, and removed if it differs."""

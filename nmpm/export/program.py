@@ -26,7 +26,7 @@ def program(part: Part) -> ExportedProgram:
         recipe = type(part.emulator.recipe).__name__
         raise ConfigError(
             f"torch.export cannot follow {recipe} ({type(error).__name__}: {first_line(error)}). Networks that decide"
-            " by their data, or by the number of scenes, cannot be exported: use torch.where, and x.shape[0] for len(x)."
+            " by their data, or fix the number of scenes, cannot be exported: use torch.where, x.shape[0] for len(x)."
         ) from error
 
 
