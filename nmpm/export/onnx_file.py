@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,16 +75,17 @@ def check_installed() -> None:
 
 def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
     try:
-        made: Any = torch.onnx.export(
-            exported,
-            (),
-            input_names=[value.name for value in part.inputs],
-            output_names=[value.name for value in part.outputs],
-            opset_version=OPSET,
-            dynamo=True,
-            external_data=False,
-            verbose=False,
-        )
+        with _quiet():
+            made: Any = torch.onnx.export(
+                exported,
+                (),
+                input_names=[value.name for value in part.inputs],
+                output_names=[value.name for value in part.outputs],
+                opset_version=OPSET,
+                dynamo=True,
+                external_data=False,
+                verbose=False,
+            )
     except RuntimeError as error:
         recipe = type(part.emulator.recipe).__name__
         raise ConfigError(
@@ -90,6 +94,20 @@ def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
         ) from error
     model: ModelProto = made.model_proto
     return model
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what torch says of itself meanwhile: its own deprecations, and that torchvision is not there."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _reason(error: BaseException) -> str:

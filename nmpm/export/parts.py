@@ -169,7 +169,7 @@ class Network(Part):
         about = f"channels {seen}; velocities in cells per frame, volumes and solids as shares of a cell"
         decoder = type(emulator.decoder).__name__
         self.inputs = (Value("grid", ("B", len(scene.input_channels), *shape), about),)
-        out = ("B", emulator.frames, len(scene.output_channels), *shape)
+        out: tuple[str | int, ...] = ("B", emulator.frames, len(scene.output_channels), *shape)
         self.outputs = (Value("fields", out, f"channels {said}, in cells per frame, for the decoder {decoder}"),)
 
     def forward(self, grid: Tensor) -> tuple[Tensor]:

@@ -30,7 +30,7 @@ def program(part: Part) -> ExportedProgram:
         ) from error
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
     """What an error says first, for a message."""
     return next((line for line in str(error).splitlines() if line.strip()), "no reason given")
 
