@@ -2,8 +2,8 @@
 
 python benchmarks/exported.py --zoo goop --particles 1000 --repeats 30 --json exported.json
 
-With its constraints and without, one scene, one thread each. Milliseconds of the processor, median and range; the largest difference from the emulator's
-positions in one call, in cells.
+With its constraints (held) and without (free), one scene, one thread each. Milliseconds of the processor, median and
+range; the largest difference from the emulator's positions in one call, in cells.
 """
 
 from __future__ import annotations
