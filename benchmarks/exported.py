@@ -14,7 +14,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import onnxruntime
@@ -64,7 +64,10 @@ def in_turns(calls: dict[str, Call], repeats: int) -> dict[str, list[float]]:
     return {name: values[1:] for name, values in spent.items()}
 
 
-def calls_of(emulator: Emulator, state: Particles, folder: Path, label: str) -> dict[str, Call]:
+EXPORTED = {"onnx": ("ONNX Runtime", by_onnx_runtime), "pt2": ("AOTInductor", by_inductor)}
+
+
+def calls_of(emulator: Emulator, state: Particles, folder: Path, label: str, formats: Sequence[str]) -> dict[str, Call]:
     """The ways to make one call, the exported ones from files written to a folder."""
     step = Step(emulator)
     inputs = {"position": state.position, "velocity": state.velocity, "material": state.material}
@@ -72,16 +75,14 @@ def calls_of(emulator: Emulator, state: Particles, folder: Path, label: str) -> 
     budget = emulator.budget(state)
     inputs |= {} if budget is None else {"budget": budget}
     inputs = {value.name: inputs[value.name] for value in step.inputs}
-    paths = {suffix: folder / f"{label}.{suffix}" for suffix in FORMATS}
-    for suffix, path in paths.items():
-        start = time.perf_counter()
+    calls = {f"{label}, eager": eager(step.emulator, state)}
+    for suffix in formats:
+        path, start = folder / f"{label}.{suffix}", time.perf_counter()
         FORMATS[suffix].write(step, {}, path)
         sys.stderr.write(f"{label} {suffix}: written in {time.perf_counter() - start:.0f} s\n")
-    return {
-        f"{label}, eager": eager(step.emulator, state),
-        f"{label}, ONNX Runtime": by_onnx_runtime(paths["onnx"], inputs),
-        f"{label}, AOTInductor": by_inductor(paths["pt2"], inputs),
-    }
+        name, run = EXPORTED[suffix]
+        calls[f"{label}, {name}"] = run(path, inputs)
+    return calls
 
 
 def main() -> None:
@@ -91,6 +92,7 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--forms", nargs="+", choices=["held", "free"], default=["held", "free"])
+    parser.add_argument("--formats", nargs="+", choices=list(EXPORTED), default=list(EXPORTED))
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
@@ -101,7 +103,7 @@ def main() -> None:
         constraints = {"held": model.emulator.constraints, "free": Constraints(solids=False)}
         for label in chosen.forms:
             model.emulator.constraints = constraints[label]
-            calls |= calls_of(model.emulator, state, Path(name), label)
+            calls |= calls_of(model.emulator, state, Path(name), label, chosen.formats)
         lines = report(calls, in_turns(calls, chosen.repeats), min(model.emulator.grid.spacing))
     if chosen.json is not None:
         with replacing(chosen.json) as temporary:
