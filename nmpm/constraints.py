@@ -97,7 +97,7 @@ def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> T
         (B, ...).
     """
     extra = (1,) * (cells.dim() - 3)
-    batch, count, dim = len(cells), cells.shape[-2], cells.shape[-1]
+    batch, count, dim = cells.shape[0], cells.shape[-2], cells.shape[-1]
     fall = gravity.reshape(batch, *extra, 1, dim)
     each = velocity.square() / 2 - cells * fall
     return (each * share.reshape(batch, *extra, count, 1)).sum((-2, -1))
@@ -160,3 +160,16 @@ def at_rest(start: Tensor, path: Tensor, speed: float) -> Tensor:
     """
     still: Tensor = (path[:, -1] - start).norm(dim=-1) < speed * path.shape[1]
     return still
+
+
+def otherwise_if(condition: Tensor, otherwise: Callable[[], Tensor], path: Tensor) -> Tensor:
+    """A path, or another one that is only computed if a condition holds; an exported program computes both.
+
+    Args:
+        condition: () bool.
+        otherwise: Gives the other path, of the same shape.
+        path: (B, m, N, D).
+    """
+    if torch.compiler.is_exporting():  # a program has no branches that depend on its data
+        return torch.where(condition, otherwise(), path)
+    return otherwise() if condition else path

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from nmpm.constraints import BOUNDS, Constraints, affordable, at_rest, energy, equal_shares
+from nmpm.constraints import BOUNDS, Constraints, affordable, at_rest, energy, equal_shares, otherwise_if
 from nmpm.contact import Contact
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
@@ -199,6 +199,12 @@ class Emulator(nn.Module):
         cells, velocity, gravity = self._in_cells(particles)
         return energy(*self._lengths(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
 
+    def normalised(self, state: Tensor) -> Tensor:
+        """What the processor sees of a grid state (B, C_in, *S) in grid units."""
+        # Beyond what training saw, a network's answers are arbitrary and may be huge.
+        seen = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
+        return (seen - self.input_mean) / self.input_std
+
     def forward(self, particles: Particles, solid: Tensor, budget: Tensor | None = None) -> Bundle:
         """Predict the next m frames.
 
@@ -211,9 +217,7 @@ class Emulator(nn.Module):
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self._in_cells(particles)
             state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)
-            # Beyond what training saw, a network's answers are arbitrary and may be huge.
-            seen = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
-            normalised = (seen - self.input_mean) / self.input_std
+            normalised = self.normalised(state)
             if self.training and self.grid_noise > 0:
                 normalised = normalised + self.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
@@ -271,8 +275,9 @@ class Emulator(nn.Module):
         if budget is not None:
             steps = path.diff(dim=1, prepend=flight.cells.unsqueeze(1))
             spent = energy(*self._lengths(path, steps, flight.gravity), flight.share)
-            if (spent > budget.unsqueeze(1)).any():  # seldom: then all frames once more, each within it
-                path = self._clear(flight, self._advect(flight, budget), solid)
+            # Seldom: then all frames once more, each within it.
+            excess = (spent > budget.unsqueeze(1)).any()
+            path = otherwise_if(excess, lambda: self._clear(flight, self._advect(flight, budget), solid), path)
         if self.constraints.rest_speed:
             still = at_rest(flight.cells, path, self.constraints.rest_speed)
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)

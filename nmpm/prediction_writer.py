@@ -1,4 +1,4 @@
-"""The callback behind `nmpm predict`; apart from `nmpm.export`, as Lightning takes seconds to import."""
+"""The callback behind `nmpm predict`; apart from `nmpm.predicted`, as Lightning takes seconds to import."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nmpm.data.format import Trajectory, write_split
-from nmpm.export import predicted_trajectory
 from nmpm.parallel import collected
 from nmpm.particles import Window
+from nmpm.predicted import predicted_trajectory
 from nmpm.scene import Scene
 
 

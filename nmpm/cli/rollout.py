@@ -85,8 +85,8 @@ def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> N
     from rich.progress import track
 
     from nmpm.data.format import write_split
-    from nmpm.export import predicted_trajectory
     from nmpm.monitor import Monitor, Policy
+    from nmpm.predicted import predicted_trajectory
     from nmpm.rollouts import stream
 
     bundles, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))

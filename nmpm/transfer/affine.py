@@ -104,4 +104,4 @@ def _scattered(stencil: Stencil, values: Tensor, size: int) -> Tensor:
 
 
 def _on_grid(sums: Tensor, grid: Grid) -> Tensor:
-    return sums.transpose(1, 2).reshape(len(sums), -1, *grid.shape)
+    return sums.transpose(1, 2).reshape(sums.shape[0], -1, *grid.shape)

@@ -54,7 +54,7 @@ class Transfer(ABC):
             for piece in pieces(cells.shape[1], cells.device)
         )
         summed = sum(others, start=first)
-        return summed.transpose(1, 2).reshape(len(summed), -1, *grid.shape)
+        return summed.transpose(1, 2).reshape(summed.shape[0], -1, *grid.shape)
 
     def momentum(self, velocity: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         """Momentum and number of particles of each material on the nodes, each particle of mass 1.

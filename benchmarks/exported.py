@@ -1,0 +1,132 @@
+"""One call of a zoo model as a rollout makes it: by the emulator, by ONNX Runtime and by AOTInductor, in turns.
+
+python benchmarks/exported.py --zoo goop --particles 1000 --repeats 30 --json exported.json
+
+With its constraints (held) and without (free), one scene, one thread each. Milliseconds of the processor, median and
+range; the largest difference from the emulator's positions in one call, in cells.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import onnxruntime
+import torch
+from torch import Tensor, _inductor
+
+from nmpm.atomic import replacing
+from nmpm.constraints import Constraints
+from nmpm.emulator import Emulator
+from nmpm.export import FORMATS, Step
+from nmpm.particles import Particles
+from nmpm.zoo import Zoo
+
+Call = Callable[[], Tensor]
+
+
+def eager(emulator: Emulator, state: Particles) -> Call:
+    """The emulator's own call; solid fraction and budget are a rollout's, made once."""
+    solid, budget = emulator.solid(state), emulator.budget(state)
+    return lambda: emulator(state, solid, budget).position
+
+
+def by_onnx_runtime(path: Path, inputs: dict[str, Tensor]) -> Call:
+    """ONNX Runtime on one thread that does not spin while others have their turn."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    arrays = {name: value.numpy() for name, value in inputs.items()}
+    return lambda: torch.from_numpy(session.run(["positions"], arrays)[0])
+
+
+def by_inductor(path: Path, inputs: dict[str, Tensor]) -> Call:
+    """The package's machine code, called from Python."""
+    model = _inductor.aoti_load_package(str(path))
+    return lambda: model(**inputs)[0]
+
+
+def in_turns(calls: dict[str, Call], repeats: int) -> dict[str, list[float]]:
+    """Milliseconds of the processor of each, one after the other, the first round left out."""
+    spent: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats + 1):
+        for name, call in calls.items():
+            start = time.process_time()
+            call()
+            spent[name].append(1e3 * (time.process_time() - start))
+    return {name: values[1:] for name, values in spent.items()}
+
+
+EXPORTED = {"onnx": ("ONNX Runtime", by_onnx_runtime), "pt2": ("AOTInductor", by_inductor)}
+
+
+def calls_of(emulator: Emulator, state: Particles, folder: Path, label: str, formats: Sequence[str]) -> dict[str, Call]:
+    """The ways to make one call, the exported ones from files written to a folder."""
+    step = Step(emulator)
+    inputs = {"position": state.position, "velocity": state.velocity, "material": state.material}
+    inputs |= {"gravity": state.gravity, "solid": step.emulator.solid(state)}
+    budget = emulator.budget(state)
+    inputs |= {} if budget is None else {"budget": budget}
+    inputs = {value.name: inputs[value.name] for value in step.inputs}
+    calls = {f"{label}, eager": eager(step.emulator, state)}
+    for suffix in formats:
+        path, start = folder / f"{label}.{suffix}", time.perf_counter()
+        FORMATS[suffix].write(step, {}, path)
+        sys.stderr.write(f"{label} {suffix}: written in {time.perf_counter() - start:.0f} s\n")
+        name, run = EXPORTED[suffix]
+        calls[f"{label}, {name}"] = run(path, inputs)
+    return calls
+
+
+def main() -> None:
+    """Export, measure, print, and write JSON if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--zoo", default="goop")
+    parser.add_argument("--particles", type=int, default=1000)
+    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--forms", nargs="+", choices=["held", "free"], default=["held", "free"])
+    parser.add_argument("--formats", nargs="+", choices=list(EXPORTED), default=list(EXPORTED))
+    parser.add_argument("--json", type=Path)
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    model = Zoo.load(chosen.zoo)
+    state = model.example(count=chosen.particles)
+    with tempfile.TemporaryDirectory() as name, torch.no_grad():
+        calls: dict[str, Call] = {}
+        constraints = {"held": model.emulator.constraints, "free": Constraints(solids=False)}
+        for label in chosen.forms:
+            model.emulator.constraints = constraints[label]
+            calls |= calls_of(model.emulator, state, Path(name), label, chosen.formats)
+        lines = report(calls, in_turns(calls, chosen.repeats), min(model.emulator.grid.spacing))
+    if chosen.json is not None:
+        with replacing(chosen.json) as temporary:
+            temporary.write_text(
+                json.dumps({"zoo": chosen.zoo, "particles": chosen.particles, "lines": lines}, indent=1) + "\n"
+            )
+
+
+def report(calls: dict[str, Call], spent: dict[str, list[float]], cell: float) -> list[dict[str, object]]:
+    """Print a line for each way, and give the same as plain data."""
+    lines: list[dict[str, object]] = []
+    for name, values in spent.items():
+        own = f"{name.partition(',')[0]}, eager"
+        gap = (calls[name]() - calls[own]()).abs().max().item() / cell
+        ratios = [mine / other for mine, other in zip(values, spent[own], strict=True)]
+        middle, share = statistics.median(values), statistics.median(ratios)
+        sys.stdout.write(
+            f"{name:<24}{middle:7.2f} ms ({min(values):.2f}-{max(values):.2f})   {share:.2f} of eager"
+            f" ({min(ratios):.2f}-{max(ratios):.2f})   {gap:.1e} cells\n"
+        )
+        lines.append({"name": name, "ms": values, "median_ms": middle, "of_eager": share, "cells": gap})
+    return lines
+
+
+if __name__ == "__main__":
+    main()
