@@ -50,7 +50,8 @@ def by_onnx_runtime(path: Path, inputs: dict[str, Tensor]) -> Call:
 def by_inductor(path: Path, inputs: dict[str, Tensor]) -> Call:
     """The package's machine code, called from Python."""
     model = _inductor.aoti_load_package(str(path))
-    return lambda: model(**inputs)[0]
+    ordered = {name: value.contiguous() for name, value in inputs.items()}
+    return lambda: model(**ordered)[0]
 
 
 def in_turns(calls: dict[str, Call], repeats: int) -> dict[str, list[float]]:

@@ -161,6 +161,10 @@ def test_a_compiled_package_is_the_emulator(tmp_path):
     form.write(part, description(part, "mine", "made up"), path)
     for batch, count in ((1, 40), (3, 25)):
         assert form.difference(part, path, batch, count) < 1e-5
+    inputs = part.example(1, 40)
+    strided = inputs | {"position": inputs["position"].mT.contiguous().mT}  # the same numbers, otherwise laid out
+    for one, other in zip(form.run(path, inputs), form.run(path, strided), strict=True):
+        assert torch.equal(one, other)
     about = torch._inductor.aoti_load_package(str(path)).get_metadata()
     assert json.loads(about["scene"])["materials"] == ["goop"]
 

@@ -1,4 +1,7 @@
-"""Packages of AOTInductor (.pt2): machine code for the processor they were made on, run by torch from Python or C++."""
+"""Packages of AOTInductor (.pt2): machine code for the processor they were made on, run by torch from Python or C++.
+
+They take contiguous tensors, and take others for such without a word: call `contiguous()` on what goes in.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +50,10 @@ def run_compiled(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]
     """The outputs of a package."""
     from torch import _inductor
 
+    # Machine code reads memory in the order in which it was made, and does not look whether an input has that.
+    ordered = {name: value.contiguous() for name, value in inputs.items()}
     with torch.no_grad():
-        outputs: tuple[Tensor, ...] = _inductor.aoti_load_package(str(path))(**inputs)
+        outputs: tuple[Tensor, ...] = _inductor.aoti_load_package(str(path))(**ordered)
     return tuple(outputs)
 
 

@@ -32,6 +32,7 @@ def description(part: Part, model: str, training_data: str) -> dict[str, str]:
         "dt": repr(emulator.scene.dt),
         "dt_unit": "seconds per frame",
         "constraints": json.dumps(dataclasses.asdict(emulator.constraints)),
+        "layout": "contiguous, the last axis fastest",
         "inputs": _values(part.inputs),
         "outputs": _values(part.outputs),
     }
