@@ -155,6 +155,7 @@ def test_a_file_says_what_it_is(exported):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # a C++ compiler at work
 def test_a_compiled_package_is_the_emulator(tmp_path):
     emulator = EMULATORS["held"]()
     part, form, path = Step(emulator), FORMATS["pt2"], tmp_path / "step.pt2"
