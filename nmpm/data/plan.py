@@ -128,8 +128,11 @@ class WindowPlan:
         """
         if batch_size * earlier == self.batch_size * world:
             return self
-        buffer, drawn = replace(self, batch_size=batch_size).place(batches, earlier)
-        return replace(self, start=Start(batches, buffer, drawn))
+        if batches == self.start.batch:
+            return self
+        had = replace(self, batch_size=batch_size)
+        buffer, drawn = had.place(batches - 1, earlier)  # a buffer's rest, too small for those, may do for these
+        return replace(self, start=Start(batches, buffer, drawn + had._stride(earlier)))
 
     def _stride(self, world: int) -> int:
         """Windows of a buffer that one batch of every rank takes."""

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.buffer import Motion, TrajectoryBuffer
@@ -76,6 +76,7 @@ class TestPlan:
         assert len(one_pass) == 16
 
     @given(plan=PLANS, legs=st.lists(st.tuples(*[st.integers(1, 7)] * 3), min_size=2, max_size=4))
+    @example(plan=WindowPlan((6,), 2, 1, 1, 1, 0), legs=[(1, 1, 4), (1, 1, 1)])  # one window left of five
     @settings(max_examples=60, deadline=None)
     def test_batches_of_another_size_go_on_in_the_same_row(self, plan, legs):
         """Legs of some batches, of some size, for some ranks: no place is drawn twice or left out."""
