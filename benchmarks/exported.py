@@ -9,7 +9,6 @@ range; the largest difference from the emulator's positions in one call, in cell
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import tempfile
@@ -20,8 +19,8 @@ from pathlib import Path
 import onnxruntime
 import torch
 from torch import Tensor, _inductor
+from turns import write
 
-from nmpm.atomic import replacing
 from nmpm.constraints import Constraints
 from nmpm.emulator import Emulator
 from nmpm.export import FORMATS, Step
@@ -106,11 +105,7 @@ def main() -> None:
             model.emulator.constraints = constraints[label]
             calls |= calls_of(model.emulator, state, Path(name), label, chosen.formats)
         lines = report(calls, in_turns(calls, chosen.repeats), min(model.emulator.grid.spacing))
-    if chosen.json is not None:
-        with replacing(chosen.json) as temporary:
-            temporary.write_text(
-                json.dumps({"zoo": chosen.zoo, "particles": chosen.particles, "lines": lines}, indent=1) + "\n"
-            )
+    write(chosen.json, {"zoo": chosen.zoo, "particles": chosen.particles, "lines": lines})
 
 
 def report(calls: dict[str, Call], spent: dict[str, list[float]], cell: float) -> list[dict[str, object]]:

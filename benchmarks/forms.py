@@ -7,8 +7,8 @@ bundles and optimizer are the same for all, unless a form's name says otherwise.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
+from turns import arguments
 
 from nmpm.calibration import calibrate
 from nmpm.constraints import Constraints
@@ -65,6 +66,22 @@ FORMS: Mapping[str, Form] = MappingProxyType(
 )
 
 
+PRESETS: Mapping[int, str] = MappingProxyType({2: "waterramps", 3: "waterdrop3d"})
+"""The box for each number of axes where sizes are compared."""
+SIZED = "ours"
+"""The form that sizes are compared of."""
+
+
+def form_arguments(about: str | None, batch: int) -> argparse.ArgumentParser:
+    """The options of benchmarks that compare the forms, with the batch that is usual there."""
+    parser = arguments(about)
+    parser.add_argument("--preset", default="waterramps")
+    parser.add_argument("--particles", type=int, default=2300)
+    parser.add_argument("--batch", type=int, default=batch)
+    parser.add_argument("--width", type=int, default=64)
+    return parser
+
+
 class ChannelsFirst(nn.Module):
     """A network whose input comes as the seed's code lays it out."""
 
@@ -92,8 +109,7 @@ def emulator(form: Form, scene: Scene, width: int, cells: int | Sequence[int] = 
 def scenes(preset: str, count: int, batch: int) -> tuple[Scene, Particles]:
     """Thrown blocks in a preset's box, (batch, count) particles; so fine that they fill a fifth of it, if need be."""
     scene = load_preset(preset).scene
-    room = math.prod(high - low for low, high in scene.bounds)
-    scene = dataclasses.replace(scene, particle_volume=min(scene.particle_volume, 0.2 * room / count))
+    scene = dataclasses.replace(scene, particle_volume=min(scene.particle_volume, 0.2 * scene.volume / count))
     states = [thrown_blocks(scene, count=count, blocks=2, seed=seed) for seed in range(batch)]
     joined = {name: torch.cat([getattr(s, name) for s in states]) for name in vars(states[0])}
     return scene, Particles(**joined)

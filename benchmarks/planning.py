@@ -9,20 +9,16 @@ devices take is not measured but computed, as if they did not wait for one anoth
 
 from __future__ import annotations
 
-import argparse
 import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
-from forms import FORMS, Training
-from turns import Spread, alone, machine, most_held, timed, write
+from forms import FORMS, PRESETS, SIZED, Training
+from turns import Spread, alone, arguments, machine, most_held, timed, write
 
 SIZES = (("64x64", 2_000), ("64x64", 20_000), ("64x64", 200_000), ("128x128", 2_000), ("128x128", 20_000),
          ("256x256", 20_000), ("32x32x32", 10_000), ("64x64x64", 100_000))  # fmt: skip
-PRESETS = {2: "waterramps", 3: "waterdrop3d"}
-FORM = "ours"
 STEPS, SCENES = 100_000, 16
 DEVICES = (2, 4, 8)
 
@@ -31,7 +27,7 @@ def sized(grid: str, particles: int, options: dict[str, Any], threads: int, roun
     """Seconds of a step, and the bytes that it holds at most."""
     torch.set_num_threads(threads)
     cells = [int(side) for side in grid.split("x")]
-    training = Training(FORMS[FORM], preset=PRESETS[len(cells)], particles=particles, cells=cells, **options)
+    training = Training(FORMS[SIZED], preset=PRESETS[len(cells)], particles=particles, cells=cells, **options)
     held = most_held(training, options["device"])
     return {"seconds": Spread.of([timed(training) for _ in range(rounds)]), "bytes": held}
 
@@ -59,14 +55,11 @@ def line(found: dict[str, Any], batch: int) -> str:
 
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser = arguments(__doc__)
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--width", type=int, default=32)
     parser.add_argument("--unroll", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     chosen = parser.parse_args()
     options = {name: getattr(chosen, name) for name in ("batch", "width", "unroll", "device")}
     sys.stdout.write(f"{machine(chosen.device, chosen.threads)}; {options}; 8 frames a bundle\n")

@@ -7,28 +7,18 @@ python benchmarks/rollout_call.py --json call.json
 
 from __future__ import annotations
 
-import argparse
 import sys
 from functools import partial
-from pathlib import Path
 
-import torch
-from forms import FORMS, FRAMES, Rolling
+from forms import FORMS, FRAMES, Rolling, form_arguments
 from turns import Spread, in_turns, machine, write
 
 
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--preset", default="waterramps")
-    parser.add_argument("--particles", type=int, default=2300)
-    parser.add_argument("--batch", type=int, default=1)
-    parser.add_argument("--width", type=int, default=64)
+    parser = form_arguments(__doc__, batch=1)
     parser.add_argument("--calls", type=int, default=10, help="calls per timed run (default: 10)")
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     chosen = parser.parse_args()
     options = {name: getattr(chosen, name) for name in ("preset", "particles", "batch", "width", "calls", "device")}
     makers = {name: partial(Rolling, form, **options) for name, form in FORMS.items()}

@@ -1,6 +1,6 @@
 """Cost against the number of particles and the size of the grid, one scene: time of a call and its parts, and memory.
 
-python benchmarks/scaling.py                                      on the CPU, up to 10⁷ particles, 1024² and 96³ cells
+python benchmarks/scaling.py                                      on the CPU, up to 10⁷ particles, 1024² and 64³ cells
 python benchmarks/scaling.py --device cuda --particles 1e3 1e4 1e5 1e6 1e7 4e7 --grids 64x64 1024x1024 128x128x128
 python benchmarks/scaling.py --json scaling.json
 
@@ -10,24 +10,20 @@ positions and values of the particles once; how often grid nodes are touched is 
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
-from forms import FORMS, FRAMES, emulator, scenes
-from turns import Spread, alone, ceilings, machine, most_held, timed, write
+from forms import FORMS, FRAMES, PRESETS, SIZED, emulator, scenes
+from turns import Spread, alone, arguments, ceilings, machine, most_held, timed, write
 
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles
 from nmpm.rasterise import grid_state
 
-PRESETS = {2: "waterramps", 3: "waterdrop3d"}
 WIDTH = 32
-FORM = "ours"
 FLOAT = 4  # bytes
 WIDTHS = (10, 14, 28, 10, 8, 13, 8, 16)
 
@@ -35,8 +31,8 @@ WIDTHS = (10, 14, 28, 10, 8, 13, 8, 16)
 def in_a_box(count: int, shape: tuple[int, ...]) -> tuple[Emulator, Particles]:
     """An emulator on a grid, and blocks of so many particles."""
     scene, state = scenes(PRESETS[len(shape)], count, 1)
-    made = emulator(FORMS[FORM], scene, WIDTH, shape).eval().requires_grad_(False)
-    made.processor.to(FORMS[FORM].precision)
+    made = emulator(FORMS[SIZED], scene, WIDTH, shape).eval().requires_grad_(False)
+    made.processor.to(FORMS[SIZED].precision)
     return made, state
 
 
@@ -95,15 +91,12 @@ def line(row: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser = arguments(__doc__)
     parser.add_argument("--particles", type=float, nargs="+", default=[1e3, 1e4, 1e5, 1e6, 1e7])
     parser.add_argument(
         "--grids", nargs="+", default=["32x32", "64x64", "256x256", "1024x1024", "32x32x32", "64x64x64"]
     )
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     chosen = parser.parse_args()
     shapes = [tuple(int(side) for side in text.split("x")) for text in chosen.grids]
     sizes = [(round(count), (64, 64)) for count in chosen.particles]

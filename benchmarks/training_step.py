@@ -7,14 +7,11 @@ python benchmarks/training_step.py --json step.json
 
 from __future__ import annotations
 
-import argparse
 import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import torch
-from forms import FORMS, Training
+from forms import FORMS, Training, form_arguments
 from torch.utils.flop_counter import FlopCounterMode
 from turns import Spread, ceilings, in_turns, machine, write
 
@@ -29,16 +26,9 @@ def flop(name: str, options: dict[str, Any]) -> float:
 
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--preset", default="waterramps")
-    parser.add_argument("--particles", type=int, default=2300)
-    parser.add_argument("--batch", type=int, default=16)
-    parser.add_argument("--width", type=int, default=64)
+    parser = form_arguments(__doc__, batch=16)
     parser.add_argument("--unroll", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     chosen = parser.parse_args()
     names = ("preset", "particles", "batch", "width", "unroll", "device")
     options = {name: getattr(chosen, name) for name in names}

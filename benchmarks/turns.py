@@ -5,6 +5,7 @@ Comparisons hold within one run only. A process of its own, so that no form prof
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import json
 import multiprocessing
@@ -44,6 +45,15 @@ class Spread:
     def shown(self, unit: float = 1e-3) -> str:
         """In units of so many seconds, as "median (least-most)"."""
         return f"{self.median / unit:.4g} ({self.least / unit:.4g}-{self.most / unit:.4g})"
+
+
+def arguments(about: str | None) -> argparse.ArgumentParser:
+    """The options that every benchmark of forms and sizes has."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    return parser
 
 
 def in_turns(makers: Mapping[str, Callable[[], Action]], rounds: int, threads: int) -> dict[str, list[float]]:

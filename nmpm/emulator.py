@@ -141,7 +141,7 @@ class Emulator(nn.Module):
         return next(real, self.precision)
 
     def with_network(self, precision: torch.dtype) -> Emulator:
-        """A copy whose network has weights of this type; transfers and advection stay as they are.
+        """This emulator if its network has weights of this type, else a copy that has; all but the network stays.
 
         Raises:
             ConfigError: if the network has complex weights, as FNOs do, which have no such type.

@@ -38,7 +38,7 @@ def collected(value: T) -> list[T]:
         return [value]
     found: list[T | None] | None = [None] * world if rank == 0 else None
     distributed.gather_object(value, found)
-    return found or []  # type: ignore[return-value]
+    return found or []  # type: ignore[return-value]  # (likewise)
 
 
 def of_the_first(value: float, device: torch.device) -> float:
