@@ -53,7 +53,7 @@ def sized(count: int, shape: tuple[int, ...], device: str, threads: int, rounds:
 
 
 def _parts(made: Emulator, state: Particles, solid: torch.Tensor) -> dict[str, Callable[[], object]]:
-    cells, velocity, _ = made._in_cells(state)
+    cells, velocity, _ = made.in_cells(state)
     fields = torch.randn(1, FRAMES, state.position.shape[2], *made.grid.shape, device=cells.device)
 
     def carry() -> None:

@@ -7,15 +7,14 @@ Source: Rochman-Sharabi, Lewin & Louppe, A Neural Material Point Method for Part
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from nmpm.constraints import BOUNDS, Constraints, affordable, at_rest, energy, equal_shares, otherwise_if
-from nmpm.contact import Contact
+from nmpm.advection import Advection, Flight
+from nmpm.constraints import Constraints, energy, equal_shares
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
@@ -25,7 +24,6 @@ from nmpm.processors import GridLayout, Processor, UNet
 from nmpm.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.scene import Scene
 from nmpm.transfer import Linear, Transfer
-from nmpm.transfer.pieces import pieces
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a sound model is."""
@@ -42,23 +40,6 @@ class Bundle:
 
     position: Tensor
     velocity: Tensor
-
-
-@dataclass(frozen=True)
-class _Flight:
-    """What the frames of a bundle are advanced with, in grid units."""
-
-    cells: Tensor
-    carried: Tensor
-    gravity: Tensor
-    material: Tensor
-    fields: Tensor
-    share: Tensor
-
-    def part(self, piece: slice) -> _Flight:
-        """The same for a piece of the particles."""
-        own = {name: getattr(self, name)[:, piece] for name in ("cells", "carried", "material", "share")}
-        return dataclasses.replace(self, **own)
 
 
 class Emulator(nn.Module):
@@ -135,6 +116,11 @@ class Emulator(nn.Module):
         return torch.promote_types(self.input_mean.dtype, torch.float32)
 
     @property
+    def advection(self) -> Advection:
+        """What moves the particles once the network has spoken."""
+        return Advection(self.scene, self.grid, self.transfer, self.decoder, self.constraints, self.bounds, self.walls)
+
+    @property
     def network_precision(self) -> torch.dtype:
         """Of the network's weights; in which it computes, too, unless autocast says otherwise."""
         real = (weight.dtype for weight in self.processor.parameters() if weight.is_floating_point())
@@ -196,8 +182,8 @@ class Emulator(nn.Module):
         """The energy (B,) that a rollout from this state is held to; None where it is not."""
         if not self.constraints.energy or self.training:
             return None
-        cells, velocity, gravity = self._in_cells(particles)
-        return energy(*self._lengths(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
+        cells, velocity, gravity = self.in_cells(particles)
+        return energy(*self.grid.alike(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
 
     def normalised(self, state: Tensor) -> Tensor:
         """What the processor sees of a grid state (B, C_in, *S) in grid units."""
@@ -215,7 +201,7 @@ class Emulator(nn.Module):
         """
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
-            cells, velocity, gravity = self._in_cells(particles)
+            cells, velocity, gravity = self.in_cells(particles)
             state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)
             normalised = self.normalised(state)
             if self.training and self.grid_noise > 0:
@@ -223,14 +209,12 @@ class Emulator(nn.Module):
         output = self.processor(normalised.to(self.network_precision))
         with torch.autocast(device, enabled=False):
             fields = output.to(self.precision) * self.output_scale
-            smoothed = self._gather(state[:, : fields.shape[2]], cells, particles.material)
+            advection = self.advection
+            smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried(velocity, smoothed)
             share = equal_shares(particles.mask, cells.dtype)
-            flight = _Flight(cells, carried, gravity, particles.material, fields, share)
-            parts = [self._advect(flight.part(piece)) for piece in pieces(cells.shape[1], cells.device)]
-            path = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
-            if not self.training:
-                path = self._constrained(flight, path, solid, budget)
+            flight = Flight(cells, carried, gravity, particles.material, fields, share)
+            path = advection.free(flight) if self.training else advection.constrained(flight, solid, budget)
             steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
             precision = particles.position.dtype
             return Bundle(
@@ -238,76 +222,10 @@ class Emulator(nn.Module):
                 velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
             )
 
-    def _in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
+    def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
         return (
             self.grid.to_cells(particles.position, self.precision),
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
-
-    def _lengths(self, cells: Tensor, velocity: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The same in units of the first axis' cells: cells need not be square, energies need one unit."""
-        first, *others = self.grid.spacing
-        if all(abs(other / first - 1) < 1e-6 for other in others):
-            return cells, velocity, gravity
-        ratio = cells.new_tensor(self.grid.spacing) / first
-        return cells * ratio, velocity * ratio, gravity * ratio
-
-    def _advect(self, flight: _Flight, budget: Tensor | None = None) -> Tensor:
-        """(B, m, N, D) positions in cells, within an energy (B,) if one is given."""
-        cells, velocity, path = flight.cells, flight.carried, []
-        fields = flight.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
-        for frame, field in enumerate(fields, start=1):
-            known = self.decoder.known(flight.carried, velocity, flight.gravity, frame)
-            step = known + self._gather(field, cells, flight.material)
-            if budget is not None:
-                step = step * affordable(*self._lengths(cells, step, flight.gravity), flight.share, budget)
-            arrived = self._confine(cells + step)
-            velocity = arrived - cells
-            cells = arrived
-            path.append(cells)
-        return torch.stack(path, dim=1)
-
-    def _constrained(self, flight: _Flight, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
-        """The path (B, m, N, D) as the constraints let it be."""
-        path = self._clear(flight, path, solid)
-        if budget is not None:
-            steps = path.diff(dim=1, prepend=flight.cells.unsqueeze(1))
-            spent = energy(*self._lengths(path, steps, flight.gravity), flight.share)
-            # Seldom: then all frames once more, each within it.
-            excess = (spent > budget.unsqueeze(1)).any()
-            path = otherwise_if(excess, lambda: self._clear(flight, self._advect(flight, budget), solid), path)
-        if self.constraints.rest_speed:
-            still = at_rest(flight.cells, path, self.constraints.rest_speed)
-            path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
-        return path
-
-    def _clear(self, flight: _Flight, path: Tensor, solid: Tensor) -> Tensor:
-        """The path (B, m, N, D), clear of obstacles."""
-        if not (self.constraints.solids and self.scene.obstacles):
-            return path
-        room = 1 - self.walls
-        share = torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
-        return self._confine(Contact(share, self.grid).hold(flight.cells, path))
-
-    def _gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
-        """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
-        gathered = self.transfer.g2p(fields, cells, self.grid)
-        if len(self.scene.materials) == 1:
-            return gathered
-        split = gathered.unflatten(-1, (len(self.scene.materials), self.scene.dim))
-        chosen = material[..., None, None].expand(-1, -1, 1, self.scene.dim)
-        own: Tensor = split.gather(2, chosen).squeeze(2)
-        return own
-
-    def _confine(self, cells: Tensor) -> Tensor:
-        """Keep particles within the walls; periodic axes go on (positions there are unwrapped, transfers wrap)."""
-        if all(self.scene.periodic):
-            return cells
-        low, high = self.bounds
-        rule = BOUNDS[self.constraints.bounds]
-        if not any(self.scene.periodic):
-            return rule(cells, low, high)
-        wraps = torch.tensor(self.scene.periodic, device=cells.device)
-        return torch.where(wraps, cells, rule(torch.where(wraps, (low + high) / 2, cells), low, high))

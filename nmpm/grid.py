@@ -109,6 +109,14 @@ class Grid:
         """Displacements (..., D) in cells → domain length."""
         return per_axis(operator.mul, cells, self.spacing)
 
+    def alike(self, cells: Tensor, velocity: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same (..., D) in units of the first axis' cells: cells need not be square, energies need one unit."""
+        first, *others = self.spacing
+        if all(abs(other / first - 1) < 1e-6 for other in others):
+            return cells, velocity, gravity
+        ratio = cells.new_tensor(self.spacing) / first
+        return cells * ratio, velocity * ratio, gravity * ratio
+
     def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """Cell centres along an axis, (n,), in domain length."""
         return self.lower[axis] + (torch.arange(self.shape[axis], dtype=dtype) + 0.5) * self.spacing[axis]

@@ -45,7 +45,7 @@ class RolloutError(Metric):
         squared = (predicted.double() - target.double()).square().mean(-1) * mask.unsqueeze(1)
         per_frame = squared.sum(-1) / mask.sum(-1, keepdim=True)
         self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
-        self.lengths.append(  # type: ignore[union-attr]
+        self.lengths.append(  # type: ignore[union-attr]  # (likewise)
             torch.full((len(per_frame),), per_frame.shape[1], device=per_frame.device)
         )
 

@@ -36,7 +36,7 @@ class PredictionWriter(BasePredictionWriter):
         batch_idx: int,  # noqa: ARG002
         dataloader_idx: int,  # noqa: ARG002
     ) -> None:
-        scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]
+        scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
         source = f"{trainer.ckpt_path or 'the model'}"
         for index in range(len(prediction)):
             self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))

@@ -99,7 +99,7 @@ class Report(Callback):
     def _figures(
         self, trainer: Trainer, module: EmulatorModule, per_trajectory: Mapping[str, list[dict[str, float]]]
     ) -> dict[str, Any]:
-        datamodule = trainer.datamodule  # type: ignore[attr-defined]
+        datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         logged = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("test/")}
         return {
             "dataset": datamodule.description,

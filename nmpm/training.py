@@ -160,7 +160,7 @@ class EmulatorModule(LightningModule):
 
     def setup(self, stage: str) -> None:
         if stage == "fit" and not self.emulator.calibrated:
-            loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]
+            loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]  # (Lightning sets it)
             calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
         if stage == "fit" and self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
@@ -257,7 +257,7 @@ class EmulatorModule(LightningModule):
 
         By the clock of process 0: with rates of their own, the processes' weights would drift apart.
         """
-        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # (Lightning sets it)
             if isinstance(callback, Timer) and callback._duration:
                 over = min(callback.time_elapsed() / callback._duration, 1.0)
                 return of_the_first(over, self.trainer.strategy.root_device)

@@ -18,6 +18,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -39,6 +40,8 @@ from nmpm.specs import from_spec, to_spec
 from nmpm.starts import thrown_blocks
 from nmpm.transfer import Transfer
 
+NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
+"""What a pretrained network can run in, by name."""
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]*(/[a-z0-9][a-z0-9_-]*)?")
 
 
@@ -67,10 +70,11 @@ class Pretrained:
         """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16".
 
         Raises:
-            ConfigError: if the network cannot be that.
+            ConfigError: if there is no such precision, or the network cannot have it.
         """
-        wanted: torch.dtype = getattr(torch, precision)
-        return dataclasses.replace(self, emulator=self.emulator.with_network(wanted))
+        if precision not in NETWORK_PRECISIONS:
+            raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
+        return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
 
     def rollout(self, state: Particles, frames: int) -> Tensor:
         """Predict from a state: (B, frames, N, D) positions in domain length, the state's own frame not included."""

@@ -67,7 +67,7 @@ def test_a_rollout_of_an_untrained_network_gains_no_energy(seed):
     wild, tame = emulator_of(scene), emulator_of(scene, energy=True)
     for emulator in (wild, tame):
         emulator.output_scale.mul_(3.0)
-    start = wild._in_cells(particles)
+    start = wild.in_cells(particles)
 
     def gain(emulator: Emulator) -> float:
         path = emulator.grid.to_cells(rollout(emulator, particles, 40))

@@ -209,7 +209,7 @@ def test_calibration_measures_what_the_network_has_to_give():
     torch.testing.assert_close(emulator.output_scale.squeeze().mean(0), expected, rtol=0.05, atol=0)
     assert emulator.calibrated
     start = window.initial
-    cells, velocity, _ = emulator._in_cells(start)
+    cells, velocity, _ = emulator.in_cells(start)
     state = grid_state(scene, emulator.grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
     assert (state > emulator.input_low).all()
     assert (state < emulator.input_high).all()
@@ -298,7 +298,7 @@ def test_particles_a_piece_at_a_time_move_as_all_at_once(transfer, monkeypatch):
     emulator, particles = small(scene, transfer), cloud(scene)
     with torch.no_grad():
         whole = emulator(particles, emulator.solid(particles))
-        for module in ("nmpm.transfer.base", "nmpm.emulator"):
+        for module in ("nmpm.transfer.base", "nmpm.advection"):
             monkeypatch.setattr(f"{module}.pieces", in_sevens)
         cut = emulator(particles, emulator.solid(particles))
     torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)

@@ -50,6 +50,13 @@ def test_a_model_comes_back_as_it_was(root):
     assert torch.equal(model.rollout(state, 10), rollout(model.emulator, state, 10))
 
 
+def test_networks_run_in_known_precisions_only(root):
+    model = Zoo.load("small", root)
+    assert model.with_network("bfloat16").emulator.network_precision == torch.bfloat16
+    with pytest.raises(ConfigError, match="float32 or bfloat16, not in 'float61'"):
+        model.with_network("float61")
+
+
 @pytest.mark.parametrize("name", ["../small", "small/../small", "/etc", "a/b/c", "Small", "", ".", "small/"])
 def test_names_cannot_lead_out_of_the_zoo(root, name):
     with pytest.raises(ZooError, match="cannot name a model"):

@@ -139,7 +139,7 @@ class Recordings(Sequence[Recording]):
     def __len__(self) -> int:
         return len(self.split)
 
-    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]
+    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]  # (no slices)
         """Reads one trajectory.
 
         Raises:

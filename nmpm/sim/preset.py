@@ -67,12 +67,12 @@ class Preset(abc.ABC):
         Raises:
             ConfigError: if it is not a positive whole number.
         """
-        changed: Self = dataclasses.replace(self, frames=frames)  # type: ignore[type-var]
+        changed: Self = dataclasses.replace(self, frames=frames)  # type: ignore[type-var]  # (every preset is one)
         return changed
 
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]  # (likewise)
         return {"solver": self.solver} | {key: _plain(value) for key, value in own.items() if value is not None}
 
     @classmethod

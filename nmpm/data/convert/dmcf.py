@@ -176,5 +176,5 @@ def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:
             continue
         values = [frame.get(key) for frame in frames]
         same = all(isinstance(item, np.ndarray) and item.shape == value.shape for item in values)
-        fields[key] = np.stack(values) if same else value  # type: ignore[arg-type]
+        fields[key] = np.stack(values) if same else value  # type: ignore[arg-type]  # (`same`: all arrays)
     return fields
