@@ -128,6 +128,19 @@ class Scene:
             raise ConfigError(f"Material {name!r} is unknown to this scene, which has {', '.join(self.materials)}.")
         return self.materials.index(name)
 
+    def differences(self, other: Scene) -> tuple[str, ...]:
+        """The facts in which a model's scene and that of its data may not differ, and do.
+
+        Names of materials are only names; volumes of particles, which may be estimates, count beyond a twentieth.
+        """
+        facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles")
+        found = [name for name in facts if getattr(self, name) != getattr(other, name)]
+        if len(self.materials) != len(other.materials):
+            found.append("materials")
+        if not math.isclose(self.particle_volume, other.particle_volume, rel_tol=0.05):
+            found.append("particle_volume")
+        return tuple(found)
+
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers."""
         plain = dataclasses.asdict(self)

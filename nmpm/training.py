@@ -159,6 +159,14 @@ class EmulatorModule(LightningModule):
         return module
 
     def setup(self, stage: str) -> None:
+        """Check that the data are of the model's scene; for a training, calibrate and compile what is to be.
+
+        Raises:
+            ConfigError: if the data's scene is another.
+        """
+        theirs = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        if isinstance(theirs, Scene):
+            _check_same(self.emulator.scene, theirs)
         if stage == "fit" and not self.emulator.calibrated:
             loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]  # (Lightning sets it)
             calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
@@ -268,3 +276,13 @@ class EmulatorModule(LightningModule):
             return particles
         noise = self.position_noise * normal_like(particles.position)
         return particles.moved(particles.position + noise, particles.velocity)
+
+
+def _check_same(mine: Scene, theirs: Scene) -> None:
+    different = mine.differences(theirs)
+    if different:
+        facts = "; ".join(f"{name} = {getattr(mine, name)}, not {getattr(theirs, name)}" for name in different)
+        raise ConfigError(
+            f"The model was made for other scenes than the data's: {facts}. For another box, or other particles, take"
+            " EmulatorModule.of(emulator.over(data.scene)); what else differs needs a model of its own."
+        )

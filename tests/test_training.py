@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import lightning
@@ -124,6 +125,17 @@ def test_fine_tuning_starts_from_the_same_predictions(make_dataset, tmp_path):
     trainer_of(tmp_path, 2).fit(tuned, data)
     assert not torch.equal(rollout(tuned.emulator.eval(), window.initial, 6), before)
     assert torch.equal(rollout(pretrained, window.initial, 6), before)
+
+
+def test_data_of_another_scene_are_refused(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    for stage in ("fit", "test"):
+        model = EmulatorModule(replace(data.scene, obstacles=not data.scene.obstacles), cells=8, processor=TINY)
+        with pytest.raises(ConfigError, match=r"obstacles = (True|False), not (True|False).*over\(data.scene\)"):
+            getattr(trainer_of(tmp_path, 1), stage)(model, data)
+    renamed = replace(data.scene, materials=tuple(f"my {name}" for name in data.scene.materials))
+    assert data.scene.differences(renamed) == ()
+    assert renamed.differences(replace(renamed, dt=1.0, particle_volume=1.0)) == ("dt", "particle_volume")
 
 
 def test_bundles_grow_over_the_share_of_the_training_asked_for(make_dataset, tmp_path):
