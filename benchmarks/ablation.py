@@ -18,6 +18,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule
 
 _ROUNDS, _WARM_UP = 7, 2
+_PARTS = 100
 _COLUMNS = ("parameters", "gflop", "call_ms", "steps_per_s", "memory_mb", "steps", "mse@32", "mse")
 
 
@@ -113,11 +115,18 @@ class Probe:
         self.window: Window = next(iter(self.data.train_dataloader()))
         self.module = module_of(config, self.data.scene)
         calibrate(self.module.emulator, [self.window])
+        # Bundles that grow: how often each number of them comes in a training.
+        self.shares = Counter(self.module.bundles((part + 0.5) / _PARTS) for part in range(_PARTS))
+        self.module.unroll_growth = 0.0
         optimizer = config["model"]["optimizer"]
         self.optimizer = _named(optimizer["class_path"])(self.module.parameters(), **optimizer.get("init_args", {}))
 
     def step(self) -> float:
-        """Seconds of a training step."""
+        """Seconds of a training step, on the average over a training."""
+        return sum(share / _PARTS * self._step(bundles) for bundles, share in self.shares.items())
+
+    def _step(self, bundles: int) -> float:
+        self.module.unroll = bundles
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16):
             loss = self.module.training_step(self.window, 0)

@@ -38,6 +38,18 @@ def test_every_variant_makes_a_model(sweep, variant):
     assert bundle.position.isfinite().all()
 
 
+def test_steps_of_growing_bundles_are_weighed_by_how_often_they_come(make_dataset):
+    config = SWEEPS["paper"].whole("base")
+    config["data"] = {"path": str(make_dataset()), "batch_size": 2}
+    config["model"] |= {"cells": 16, "frames": 2, "unroll": 2, "unroll_growth": 0.6}
+    probe = ABLATION.Probe(config)
+    assert probe.shares == {1: 60, 2: 40}
+    taken = {1: 1.0, 2: 3.0}
+    assert probe.step() > 0
+    probe._step = taken.get
+    assert probe.step() == pytest.approx(1.8)
+
+
 def test_a_replaced_part_takes_none_of_the_old_arguments():
     config = SWEEPS["parts"].whole("fno")
     assert set(config["model"]["processor"]["init_args"]) == {"modes", "width", "layers"}
