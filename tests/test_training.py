@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
 from nmpm.errors import ConfigError, NmpmError
+from nmpm.optimizers import SOAP
 from nmpm.processors import UNet
 from nmpm.rollouts import rollout
 from nmpm.schedules import Schedule
@@ -80,16 +81,20 @@ def test_training_lowers_the_loss_and_reports_rollouts_beside_the_trivial_predic
             assert figures[f"valid/{kind}{name}"].isfinite()
 
 
-def test_a_resumed_training_ends_with_the_same_weights(make_dataset, tmp_path):
+@pytest.mark.parametrize("optimizer", [functools.partial(torch.optim.Adam, lr=1e-3), SOAP])
+def test_a_resumed_training_ends_with_the_same_weights(make_dataset, tmp_path, optimizer):
     folder = make_dataset()
-    data = data_of(folder)
-    whole = module_of(data)
-    trainer_of(tmp_path / "whole", 8).fit(whole, data)
-    trainer_of(tmp_path / "parts", 4).fit(module_of(data), data_of(folder))
-    resumed, again = module_of(data), data_of(folder)
-    trainer_of(tmp_path / "parts", 8).fit(resumed, again, ckpt_path=tmp_path / "parts" / "last.ckpt", weights_only=True)
-    for name, value in whole.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[name]), name
+
+    def made() -> tuple[EmulatorModule, TrajectoryDataModule]:
+        data = data_of(folder)
+        return module_of(data, optimizer=optimizer), data
+
+    whole, resumed = made(), made()
+    trainer_of(tmp_path / "whole", 16).fit(*whole)
+    trainer_of(tmp_path / "parts", 6).fit(*made())
+    trainer_of(tmp_path / "parts", 16).fit(*resumed, ckpt_path=tmp_path / "parts" / "last.ckpt", weights_only=True)
+    for name, value in whole[0].state_dict().items():
+        assert torch.equal(value, resumed[0].state_dict()[name]), name
 
 
 def test_a_checkpoint_stands_alone(make_dataset, tmp_path):

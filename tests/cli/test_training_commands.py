@@ -92,6 +92,14 @@ def test_every_part_can_be_swapped_by_class_name(make_dataset):
     assert not list(Path().rglob("events.out.tfevents.*"))
 
 
+def test_what_soap_cannot_train_is_refused_with_what_can(make_dataset, capsys):
+    words = ["fit", "--config", "waterdrop.yaml", *TINY, *source("waterdrop.yaml", make_dataset)]
+    fno = ["--model.processor", "nmpm.processors.FNO", "--model.processor.modes", "4", "--model.processor.width", "4"]
+    assert main([*words, *fno]) == 1
+    assert "complex weights, such as FNO's: --model.optimizer torch.optim.Adam" in capsys.readouterr().err
+    assert main([*words, *fno, "--model.optimizer", "torch.optim.Adam", "--model.optimizer.lr", "1.5e-3"]) == 0
+
+
 def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dataset, tmp_path, capsys):
     data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]) == 0
