@@ -42,6 +42,7 @@ def two(folder, tmp_path_factory) -> dict[str, list[dict]]:
     train(folder, root / "alone.ckpt", max_steps=5, data={**HELD, "batch_size": 3})
     runs = {
         "all": {"max_steps": 14, "data": {"batch_size": 2, "emphasis": 0.5}},
+        "soap": {"max_steps": 24, "data": {"batch_size": 2}, "soap": True},
         "begun": {"max_steps": 6, "data": {**HELD, "batch_size": 2}},
         "resumed": {"max_steps": 10, "data": {**HELD, "batch_size": 2}, "ckpt_path": str(root / "alone.ckpt")},
         "accumulated": {"max_steps": 7, "accumulate_grad_batches": 2, "data": {**HELD, "batch_size": 2}},
@@ -85,7 +86,13 @@ def test_two_processes_have_the_loss_curve_of_one_with_twice_the_batch(folder, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["all", "clock", "accumulated"])
+def test_soap_trains_two_processes_as_one(folder, two, tmp_path):
+    one = train(folder, tmp_path / "one.ckpt", max_steps=24, soap=True)
+    assert two["soap"][0]["losses"] == pytest.approx(one["losses"], rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["all", "clock", "accumulated", "soap"])
 def test_processes_stay_together(two, name):
     one, other = two[name]
     assert one["weights"] == other["weights"]

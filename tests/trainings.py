@@ -8,6 +8,7 @@ import lightning
 import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.optimizers import SOAP
 from nmpm.particles import Window
 from nmpm.processors import UNet
 from nmpm.schedules import Schedule
@@ -45,6 +46,8 @@ def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = N
     """Train, keep the last checkpoint in the file `last`, and give the diary."""
     module = data_of(folder, **options.pop("data", {}))
     model = {"unroll": 2, "position_noise": 1e-4, "grid_noise": 0.01, "mirror": (0,)} | options.pop("model", {})
+    if options.pop("soap", False):
+        model["optimizer"] = SOAP
     torch.manual_seed(0)
     schedule = Schedule(warmup=30)
     emulator = EmulatorModule(module.scene, cells=8, frames=2, processor=TINY, schedule=schedule, **model)
