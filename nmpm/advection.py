@@ -89,7 +89,7 @@ class Advection:
             excess = (spent > budget.unsqueeze(1)).any()
             path = otherwise_if(excess, lambda: self._clear(flight, self._path(flight, budget), solid), path)
         if self.constraints.rest_speed:
-            still = at_rest(flight.cells, path, self.constraints.rest_speed)
+            still = at_rest(flight.cells, path, self.constraints.rest_speed, flight.gravity)
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
         return path
 

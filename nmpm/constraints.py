@@ -23,6 +23,10 @@ MOST_GAIN = 0.01
 """Share of the initial energy, counted from `lowest_potential`, that may be gained where nothing is fed in."""
 
 
+FREELY = 0.8
+"""Share of gravity's acceleration from which on a particle counts as falling."""
+
+
 def stop(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """What gets beyond the bounds is stopped there."""
     return torch.maximum(torch.minimum(cells, high), low)
@@ -63,8 +67,8 @@ class Constraints:
     Args:
         energy: Kinetic and potential energy never exceed those of the rollout's first state: nothing feeds the scene,
             neither moving walls nor inlets, and its gravity is known.
-        rest_speed: What moves less than so many cells per frame, on average over a bundle, stays where it is. To be set
-            to the speed that the model sees in material that is at rest.
+        rest_speed: What moves less than so many cells per frame, on average over a bundle, and does not fall freely,
+            stays where it is. To be set to the speed that the model sees in material that is at rest.
         solids: Nobody gets into obstacles.
         bounds: What happens to what would leave the scene's bounds, one of `BOUNDS`; in training too.
 
@@ -147,19 +151,29 @@ def affordable(cells: Tensor, step: Tensor, gravity: Tensor, share: Tensor, budg
     return factor[:, None, None]
 
 
-def at_rest(start: Tensor, path: Tensor, speed: float) -> Tensor:
+def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tensor:
     """Which particles move too little in a bundle to be more than the model's error.
+
+    What falls freely is not at rest, however little it moves: at the top of its flight it would be held in the air.
 
     Args:
         start: (B, N, D) where the bundle starts.
         path: (B, m, N, D) its frames.
         speed: In cells per frame.
+        gravity: (B, 1, D), what a frame adds to the velocity in free fall; zero where it is not known.
 
     Returns:
         (B, N) bool.
     """
-    still: Tensor = (path[:, -1] - start).norm(dim=-1) < speed * path.shape[1]
-    return still
+    frames = path.shape[1]
+    still: Tensor = (path[:, -1] - start).norm(dim=-1) < speed * frames
+    if frames == 1:
+        return still
+    half = frames // 2
+    middle = path[:, half - 1]
+    gained = (path[:, -1] - middle) / (frames - half) - (middle - start) / half
+    falling = (gained * gravity).sum(-1) > FREELY * frames / 2 * gravity.square().sum(-1)
+    return still & ~falling
 
 
 def otherwise_if(condition: Tensor, otherwise: Callable[[], Tensor], path: Tensor) -> Tensor:

@@ -57,7 +57,29 @@ def test_what_moves_less_than_the_rest_speed_on_average_is_at_rest():
     start = torch.zeros(1, 3, 2)
     ends = torch.tensor([[0.0, 0.0], [0.0, 0.39], [0.41, 0.0]])
     path = torch.linspace(0.25, 1, 4)[None, :, None, None] * ends
-    assert at_rest(start, path, 0.1).tolist() == [[True, True, False]]
+    assert at_rest(start, path, 0.1, torch.zeros(1, 1, 2)).tolist() == [[True, True, False]]
+
+
+@pytest.mark.parametrize("frames", [2, 3, 8])
+def test_what_falls_freely_is_never_at_rest(frames):
+    gravity = torch.tensor([[[0.0, -0.004]]])
+    times = torch.arange(1.0, frames + 1)
+    top = -(frames + 1) / 2 * gravity  # the velocity with which it ends where it starts
+    thrown = times.view(1, -1, 1, 1) * top.unsqueeze(1) + (times * (times + 1) / 2).view(1, -1, 1, 1) * gravity
+    path = torch.cat([thrown, 0 * thrown], dim=2)
+    start = torch.zeros(1, 2, 2)
+    assert at_rest(start, path, 0.01, gravity).tolist() == [[False, True]]
+    assert at_rest(start, path, 0.01, 0 * gravity).tolist() == [[True, True]]
+
+
+def test_a_block_thrown_straight_up_does_not_hang_in_the_air():
+    scene = box()
+    emulator = emulator_of(scene, rest_speed=0.05)
+    emulator.output_scale.zero_()  # free fall
+    particles = dataclasses.replace(cloud(scene, speed=0.0), velocity=torch.tensor([0.0, 0.0012]).expand(1, 30, 2))
+    held = rollout(emulator, particles, 48)
+    emulator.constraints = Constraints()
+    assert torch.equal(held, rollout(emulator, particles, 48))
 
 
 @pytest.mark.parametrize("seed", range(3))
