@@ -52,11 +52,14 @@ class EmulatorCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
         config = self.config_init[self.subcommand]["trainer"]
+        configured = config.get("callbacks") or []
+        # What is given here replaces what is configured.
+        callbacks = list(configured) if isinstance(configured, list) else [configured]
         if config.get("logger") in (None, True):
             table = CSVLogger(config["default_root_dir"], name="logs")
             kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
-            kwargs.setdefault("callbacks", []).append(LearningRateMonitor("step"))
-        kwargs.setdefault("callbacks", []).extend([DivergenceGuard(), Report(), PredictionWriter()])
+            callbacks.append(LearningRateMonitor("step"))
+        kwargs["callbacks"] = [*callbacks, DivergenceGuard(), Report(), PredictionWriter()]
         return super().instantiate_trainer(**kwargs)
 
     def _parse_ckpt_path(self) -> None:

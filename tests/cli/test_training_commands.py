@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from lightning.pytorch import Callback
 from PIL import Image
 
 from nmpm.cli import main
@@ -90,6 +91,25 @@ def test_every_part_can_be_swapped_by_class_name(make_dataset):
     assert type(saved.emulator.decoder).__name__ == "Flip"
     assert list(Path("logs").rglob("metrics.csv"))
     assert not list(Path().rglob("events.out.tfevents.*"))
+
+
+class Counting(Callback):
+    """Counts the batches of all trainings."""
+
+    seen = 0
+
+    def on_train_batch_end(self, *_):
+        Counting.seen += 1
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_configured_callbacks_run(make_dataset, several):
+    Counting.seen = 0
+    one = {"class_path": f"{__name__}.Counting"}
+    Path("mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [one, one] if several else one}}))
+    words = ["fit", "--config", "waterdrop.yaml", "--config", "mine.yaml", *TINY]
+    assert main([*words, *source("waterdrop.yaml", make_dataset)]) == 0
+    assert Counting.seen == (4 if several else 2)
 
 
 def test_what_soap_cannot_train_is_refused_with_what_can(make_dataset, capsys):
