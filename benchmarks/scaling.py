@@ -25,7 +25,7 @@ from nmpm.rasterise import grid_state
 
 WIDTH = 32
 FLOAT = 4  # bytes
-WIDTHS = (10, 14, 28, 10, 8, 13, 8, 16)
+WIDTHS = (10, 14, 33, 10, 8, 13, 8, 16)
 
 
 def in_a_box(count: int, shape: tuple[int, ...]) -> tuple[Emulator, Particles]:
