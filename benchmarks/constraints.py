@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 
 import torch
+from turns import in_one_process, processor_time
 
 from nmpm.constraints import Constraints
 from nmpm.emulator import Bundle, Emulator
@@ -24,13 +25,6 @@ from nmpm.stress.subject import Subject
 from nmpm.zoo import Zoo
 
 FREE = Constraints(solids=False)
-
-
-def timed(action: Callable[[], object]) -> float:
-    """Seconds of the processor: what else runs on the machine counts less than in those of the clock."""
-    start = time.process_time()
-    action()
-    return time.process_time() - start
 
 
 class Timed(Monitor):
@@ -49,7 +43,7 @@ def watched(emulator: Emulator, state: Particles, frames: int, repeats: int) -> 
     shares = []
     for _ in range(repeats + 1):
         monitor = Timed(Policy.RECORD)
-        whole = timed(lambda monitor=monitor: rollout(emulator, state, frames, monitor))
+        whole = processor_time(lambda monitor=monitor: rollout(emulator, state, frames, monitor))
         shares.append(monitor.spent / (whole - monitor.spent))
     return shares[1:]
 
@@ -73,14 +67,11 @@ def measure(name: str, frames: int, repeats: int) -> None:
     forms["rest"] = form(dataclasses.replace(FREE, rest_speed=0.01))
     forms["solids"] = form(dataclasses.replace(FREE, solids=True))
     forms["all"] = form(held)
-    seconds: dict[str, list[float]] = {key: [] for key in forms}
-    for _ in range(repeats + 1):
-        for key, action in forms.items():
-            seconds[key].append(timed(action))
+    seconds = in_one_process(forms, repeats, processor_time)
     bundles = -(-frames // emulator.frames)
     for key, values in seconds.items():
-        ratios = [value / free for value, free in zip(values[1:], seconds["free"][1:], strict=True)]
-        call = 1e3 * statistics.median(values[1:]) / bundles
+        ratios = [value / free for value, free in zip(values, seconds["free"], strict=True)]
+        call = 1e3 * statistics.median(values) / bundles
         sys.stdout.write(
             f"{name:<12}{key:<16}{call:6.2f} ms/call   {statistics.median(ratios):.3f} of free"
             f" ({min(ratios):.3f}-{max(ratios):.3f})\n"

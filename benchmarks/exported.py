@@ -19,7 +19,7 @@ from pathlib import Path
 import onnxruntime
 import torch
 from torch import Tensor, _inductor
-from turns import write
+from turns import in_one_process, processor_time, write
 
 from nmpm.constraints import Constraints
 from nmpm.emulator import Emulator
@@ -51,17 +51,6 @@ def by_inductor(path: Path, inputs: dict[str, Tensor]) -> Call:
     model = _inductor.aoti_load_package(str(path))
     ordered = {name: value.contiguous() for name, value in inputs.items()}
     return lambda: model(**ordered)[0]
-
-
-def in_turns(calls: dict[str, Call], repeats: int) -> dict[str, list[float]]:
-    """Milliseconds of the processor of each, one after the other, the first round left out."""
-    spent: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats + 1):
-        for name, call in calls.items():
-            start = time.process_time()
-            call()
-            spent[name].append(1e3 * (time.process_time() - start))
-    return {name: values[1:] for name, values in spent.items()}
 
 
 EXPORTED = {"onnx": ("ONNX Runtime", by_onnx_runtime), "pt2": ("AOTInductor", by_inductor)}
@@ -104,17 +93,19 @@ def main() -> None:
         for label in chosen.forms:
             model.emulator.constraints = constraints[label]
             calls |= calls_of(model.emulator, state, Path(name), label, chosen.formats)
-        lines = report(calls, in_turns(calls, chosen.repeats), min(model.emulator.grid.spacing))
+        spent = in_one_process(calls, chosen.repeats, processor_time)
+        lines = report(calls, spent, min(model.emulator.grid.spacing))
     write(chosen.json, {"zoo": chosen.zoo, "particles": chosen.particles, "lines": lines})
 
 
 def report(calls: dict[str, Call], spent: dict[str, list[float]], cell: float) -> list[dict[str, object]]:
     """Print a line for each way, and give the same as plain data."""
     lines: list[dict[str, object]] = []
-    for name, values in spent.items():
+    milliseconds = {name: [1e3 * seconds for seconds in values] for name, values in spent.items()}
+    for name, values in milliseconds.items():
         own = f"{name.partition(',')[0]}, eager"
         gap = (calls[name]() - calls[own]()).abs().max().item() / cell
-        ratios = [mine / other for mine, other in zip(values, spent[own], strict=True)]
+        ratios = [mine / other for mine, other in zip(values, milliseconds[own], strict=True)]
         middle, share = statistics.median(values), statistics.median(ratios)
         sys.stdout.write(
             f"{name:<24}{middle:7.2f} ms ({min(values):.2f}-{max(values):.2f})   {share:.2f} of eager"

@@ -6,21 +6,15 @@ python benchmarks/first_frame.py --zoo goop --repeats 5
 from __future__ import annotations
 
 import argparse
-import statistics
 import subprocess
 import sys
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 
+from turns import Spread, in_one_process
+
 LIBRARY = "from nmpm import Zoo; model = Zoo.load({name!r}); model.rollout(model.example(), frames=8)"
-
-
-def seconds(words: list[str]) -> float:
-    """Of a command, from its start to its end."""
-    start = time.perf_counter()
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
-    return time.perf_counter() - start
 
 
 def main() -> None:
@@ -36,13 +30,13 @@ def main() -> None:
             "Zoo.load, first frames": [sys.executable, "-c", LIBRARY.format(name=chosen.zoo)],
             "nmpm rollout": [sys.executable, "-m", "nmpm", "rollout", chosen.zoo, "--frames", "8", "--out", out],
         }
-        runs: dict[str, list[float]] = {name: [] for name in commands}
-        for _ in range(chosen.repeats + 1):
-            for name, words in commands.items():
-                runs[name].append(seconds(words))
+        actions = {
+            name: partial(subprocess.run, words, check=True, stdout=subprocess.DEVNULL)
+            for name, words in commands.items()
+        }
+        runs = in_one_process(actions, chosen.repeats)
     for name, found in runs.items():
-        counted = found[1:]
-        sys.stdout.write(f"{name:<26}{statistics.median(counted):.2f} s ({min(counted):.2f}-{max(counted):.2f})\n")
+        sys.stdout.write(f"{name:<26}{Spread.of(found).shown(1.0)} s\n")
 
 
 if __name__ == "__main__":

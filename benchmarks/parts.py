@@ -11,6 +11,7 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Mapping
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import torch
 from ablation import Sweep, module_of
 from forms import PRESETS, scenes
-from turns import arguments, machine, timed, write
+from turns import arguments, in_one_process, machine, write
 
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles
@@ -49,16 +50,11 @@ def _emulator(config: dict[str, Any], scene: Scene, transfer: str, decoder: str)
 
 @torch.inference_mode()
 def milliseconds(emulators: Mapping[Key, Emulator], state: Particles, rounds: int) -> dict[Key, float]:
-    """Of a call, median over the rounds, in each of which every emulator has its turn; the first warms up."""
-    spent: dict[Key, list[float]] = {key: [] for key in emulators}
-    for turn in range(rounds + 1):
-        for key, emulator in emulators.items():
-            solid = emulator.solid(state)
-            with torch.autocast(state.position.device.type, torch.bfloat16):
-                seconds = timed(lambda called=emulator, walls=solid: called(state, walls))  # type: ignore[misc]
-            if turn:
-                spent[key].append(seconds)
-    return {key: 1e3 * statistics.median(times) for key, times in spent.items()}
+    """Of a call, median over the rounds, in each of which every emulator has its turn."""
+    calls = {key: partial(emulator, state, emulator.solid(state)) for key, emulator in emulators.items()}
+    with torch.autocast(state.position.device.type, torch.bfloat16):
+        spent = in_one_process(calls, rounds)
+    return {key: 1e3 * statistics.median(seconds) for key, seconds in spent.items()}
 
 
 def table(found: Mapping[Key, float]) -> str:

@@ -16,13 +16,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from nmpm.atomic import replacing
 
 Action = Callable[[], object]
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,26 @@ def timed(action: Action) -> float:
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter() - start
+
+
+def processor_time(action: Action) -> float:
+    """Seconds of the processor: what else runs on the machine counts less than in those of the clock."""
+    start = time.process_time()
+    action()
+    return time.process_time() - start
+
+
+def in_one_process(
+    actions: Mapping[K, Action], rounds: int, seconds: Callable[[Action], float] = timed
+) -> dict[K, list[float]]:
+    """Seconds of each action's runs, one run of each per round, all here; the first round is not counted."""
+    spent: dict[K, list[float]] = {key: [] for key in actions}
+    for turn in range(rounds + 1):
+        for key, action in actions.items():
+            found = seconds(action)
+            if turn:
+                spent[key].append(found)
+    return spent
 
 
 def most_held(action: Action, device: str) -> float:

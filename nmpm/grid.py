@@ -11,6 +11,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import torch
@@ -114,8 +115,8 @@ class Grid:
         first, *others = self.spacing
         if all(abs(other / first - 1) < 1e-6 for other in others):
             return cells, velocity, gravity
-        ratio = cells.new_tensor(self.spacing) / first
-        return cells * ratio, velocity * ratio, gravity * ratio
+        scaled = partial(per_axis, operator.mul, numbers=[spacing / first for spacing in self.spacing])
+        return scaled(cells), scaled(velocity), scaled(gravity)
 
     def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """Cell centres along an axis, (n,), in domain length."""

@@ -32,7 +32,7 @@ class _Batched:
         return self._mapped(lambda values: values[chosen])
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
-        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both are)
+        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both subclasses are dataclasses)
         return type(self)(**{name: change(getattr(self, name)) for name in names})
 
 

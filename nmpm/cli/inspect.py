@@ -71,7 +71,7 @@ def _origin(path: Path, options: Options) -> Folder:
     if options.types or options.static is not None or options.dt is not None:
         return Folder(native_folder(path, options))
     boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
-    return Folder(path, Stated(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]  # (of a parser)
+    return Folder(path, Stated(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]  # (argparse gives plain lists)
 
 
 def lines(found: Inspection) -> Iterator[str]:

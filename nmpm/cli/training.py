@@ -53,8 +53,8 @@ class EmulatorCLI(LightningCLI):
         """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
         config = self.config_init[self.subcommand]["trainer"]
         configured = config.get("callbacks") or []
-        # What is given here replaces what is configured.
-        callbacks = list(configured) if isinstance(configured, list) else [configured]
+        # What is given to Lightning's method replaces what is configured.
+        callbacks = [*(configured if isinstance(configured, list) else [configured]), *kwargs.get("callbacks", [])]
         if config.get("logger") in (None, True):
             table = CSVLogger(config["default_root_dir"], name="logs")
             kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]

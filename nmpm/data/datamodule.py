@@ -89,7 +89,7 @@ class TrajectoryDataModule(LightningDataModule):
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
-        self.origin = _origin(path, name, source, Stated(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (checked there)
+        self.origin = _origin(path, name, source, Stated(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
