@@ -31,12 +31,12 @@ import yaml
 from omegaconf import OmegaConf
 from torch.utils.flop_counter import FlopCounterMode
 
-from nmpm.atomic import replacing
-from nmpm.calibration import calibrate
+from nmpm._support.atomic import replacing
+from nmpm._support.plain_data import to_tuples
+from nmpm._support.shipped import find_config
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.emulator.calibration import calibrate
 from nmpm.particles import Window
-from nmpm.plain import tupled
-from nmpm.shipped import find_config
 from nmpm.training import EmulatorModule
 
 _ROUNDS, _WARM_UP = 7, 2
@@ -95,7 +95,7 @@ def module_of(config: Mapping[str, Any], scene: Any) -> EmulatorModule:
 
 def _made(spec: Mapping[str, Any]) -> Any:
     """The object of a class path and arguments, as the command line makes it."""
-    arguments = {key: tupled(value) for key, value in (spec.get("init_args") or {}).items()}
+    arguments = {key: to_tuples(value) for key, value in (spec.get("init_args") or {}).items()}
     return _named(spec["class_path"])(**arguments)
 
 

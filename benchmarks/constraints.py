@@ -15,13 +15,13 @@ from collections.abc import Callable
 import torch
 from turns import in_one_process, processor_time
 
-from nmpm.constraints import Constraints
-from nmpm.emulator import Bundle, Emulator
-from nmpm.monitor import Monitor, Policy
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.monitor import Monitor, Policy
+from nmpm.emulator.rollouts import rollout
+from nmpm.evaluation.stress.subject import Subject
 from nmpm.particles import Particles
-from nmpm.rollouts import rollout
 from nmpm.sim import load_preset
-from nmpm.stress.subject import Subject
 from nmpm.zoo import Zoo
 
 FREE = Constraints(solids=False)

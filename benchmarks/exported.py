@@ -21,11 +21,11 @@ import torch
 from torch import Tensor, _inductor
 from turns import in_one_process, processor_time, write
 
-from nmpm.constraints import Constraints
-from nmpm.emulator import Emulator
-from nmpm.export import FORMATS, Step
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.model import Emulator
 from nmpm.particles import Particles
 from nmpm.zoo import Zoo
+from nmpm.zoo.export import FORMATS, Step
 
 Call = Callable[[], Tensor]
 

@@ -19,16 +19,16 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from turns import arguments
 
-from nmpm.calibration import calibrate
-from nmpm.constraints import Constraints
+from nmpm.data.initial_states import thrown_blocks
 from nmpm.decoders import Absolute, Decoder, Residual
-from nmpm.emulator import Bundle, Emulator
-from nmpm.losses import position_error
+from nmpm.emulator.calibration import calibrate
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.model import Bundle, Emulator
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
 from nmpm.scene import Scene
 from nmpm.sim import load_preset
-from nmpm.starts import thrown_blocks
+from nmpm.training.losses import position_error
 from nmpm.transfer import Linear, Nearest, Transfer
 
 FREE = Constraints(solids=False)

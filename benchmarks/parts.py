@@ -21,7 +21,7 @@ from ablation import Sweep, module_of
 from forms import PRESETS, scenes
 from turns import arguments, in_one_process, machine, write
 
-from nmpm.emulator import Emulator
+from nmpm.emulator.model import Emulator
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 

@@ -19,9 +19,9 @@ import torch
 from forms import FORMS, FRAMES, PRESETS, SIZED, emulator, scenes
 from turns import Spread, alone, arguments, ceilings, machine, most_held, timed, write
 
-from nmpm.emulator import Emulator
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
-from nmpm.rasterise import grid_state
 
 WIDTH = 32
 FLOAT = 4  # bytes

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
 
 Action = Callable[[], object]
 K = TypeVar("K")

@@ -18,14 +18,14 @@ from pathlib import Path
 
 import torch
 
-from nmpm.comparison import Comparison
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import derived_seed, metadata_of
 from nmpm.data.progress import shown
 from nmpm.data.recording import Reader
 from nmpm.data.shelf import collate
-from nmpm.emulator import Emulator
-from nmpm.rollouts import rollout
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import rollout
+from nmpm.evaluation.comparison import Comparison
 from nmpm.sim import MpmPreset, load_preset
 from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo

@@ -6,31 +6,53 @@ The public names are imported when first used, so that `import nmpm` costs nothi
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from nmpm.version import __version__
+from nmpm._support.version import __version__
 
 if TYPE_CHECKING:
     from nmpm.data.convert.arrays import write_trajectories as write_trajectories
+    from nmpm.data.datamodule import TrajectoryDataModule as TrajectoryDataModule
     from nmpm.data.format import Trajectory as Trajectory
-    from nmpm.emulator import Emulator as Emulator
+    from nmpm.emulator import rollout as rollout
+    from nmpm.emulator.model import Emulator as Emulator
+    from nmpm.emulator.model import EmulatorRecipe as EmulatorRecipe
     from nmpm.particles import Particles as Particles
-    from nmpm.rollouts import rollout as rollout
     from nmpm.scene import Scene as Scene
-    from nmpm.zoo import Zoo as Zoo
+    from nmpm.training.module import EmulatorModule as EmulatorModule
+    from nmpm.zoo.registry import Zoo as Zoo
 
-__all__ = ["Emulator", "Particles", "Scene", "Trajectory", "Zoo", "__version__", "rollout", "write_trajectories"]
-
-_HOMES = {
+_MODULE_OF = {
     "Emulator": "nmpm.emulator",
+    "EmulatorModule": "nmpm.training",
+    "EmulatorRecipe": "nmpm.emulator",
     "Particles": "nmpm.particles",
     "Scene": "nmpm.scene",
     "Trajectory": "nmpm.data.format",
+    "TrajectoryDataModule": "nmpm.data.datamodule",
     "Zoo": "nmpm.zoo",
-    "rollout": "nmpm.rollouts",
+    "rollout": "nmpm.emulator",
     "write_trajectories": "nmpm.data.convert.arrays",
 }
 
+__all__ = [
+    "Emulator",
+    "EmulatorModule",
+    "EmulatorRecipe",
+    "Particles",
+    "Scene",
+    "Trajectory",
+    "TrajectoryDataModule",
+    "Zoo",
+    "__version__",
+    "rollout",
+    "write_trajectories",
+]
+
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'nmpm' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

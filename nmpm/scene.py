@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
+from nmpm._support.plain_data import to_lists, to_tuples
 from nmpm.errors import ConfigError
-from nmpm.plain import listed, tupled
 
 Boundary = Literal["wall", "periodic"]
 Interval = tuple[float, float]
@@ -144,7 +144,7 @@ class Scene:
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers."""
         plain = dataclasses.asdict(self)
-        return {key: listed(value) for key, value in plain.items()}
+        return {key: to_lists(value) for key, value in plain.items()}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
@@ -158,6 +158,6 @@ class Scene:
         if unknown:
             raise ConfigError(f"Scene has no key {', '.join(unknown)}; it has {', '.join(sorted(known))}.")
         try:
-            return cls(**{key: tupled(value) for key, value in plain.items()})
+            return cls(**{key: to_tuples(value) for key, value in plain.items()})
         except TypeError as error:
             raise ConfigError(f"Scene cannot be read: {error}.") from error

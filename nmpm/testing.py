@@ -14,9 +14,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from nmpm._support.specs import from_spec, to_spec
 from nmpm.grid import Grid
 from nmpm.processors import GridLayout, GridProcessor, Processor
-from nmpm.specs import from_spec, to_spec
 from nmpm.transfer import Transfer
 
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from nmpm import Particles, Zoo
-from nmpm.checkpoints import load_module
-from nmpm.constraints import Constraints
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import Emulator
-from nmpm.rollouts import rollout
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import rollout
+from nmpm.training.checkpoints import load_module
 
 GOLDEN = Path(__file__).parent / "golden"
 HELD = 2e-3  # domain lengths: how rollouts are held to their energy was changed on purpose

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from nmpm.cli import main
-from nmpm.comparison import Comparison
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.evaluation.comparison import Comparison
 
 
 def test_trivial_predictors_on_waterdrop_are_as_published_and_free_fall_is_exact_at_32(recorded):

@@ -11,8 +11,8 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.optimizers import SOAP
 from nmpm.particles import Window
 from nmpm.processors import UNet
-from nmpm.schedules import Schedule
 from nmpm.training import EmulatorModule
+from nmpm.training.schedules import Schedule
 
 TINY = UNet(width=4, depth=1, perceptron=(4,))
 

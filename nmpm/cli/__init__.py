@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
+from nmpm._support.version import __version__
 from nmpm.errors import NmpmError
-from nmpm.version import __version__
 
 COMMANDS = {
     "fit": ("nmpm.cli.training", "Train an emulator, then test the best checkpoint once."),
@@ -48,7 +48,7 @@ A --config that is not a file in the working directory is looked up among the sh
 
 def usage() -> str:
     """The top-level help."""
-    from nmpm.shipped import config_names
+    from nmpm._support.shipped import config_names
 
     lines = [f"  {name:<10} {summary}" for name, (_, summary) in COMMANDS.items()]
     return USAGE.format(commands="\n".join(lines), configs=", ".join(config_names()))

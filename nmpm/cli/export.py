@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from nmpm.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from nmpm.emulator import Emulator
-    from nmpm.export import Part
+    from nmpm.emulator.model import Emulator
+    from nmpm.zoo.export import Part
 
 DESCRIPTION = """Write a trained model as a file that runs without nmpm: ONNX, for ONNX Runtime, without torch; or
 a package of AOTInductor (.pt2), machine code for the processor that it is made on, for torch in Python or C++. Scenes
@@ -55,8 +55,8 @@ def run(words: list[str]) -> None:
 
 
 def _export(chosen: argparse.Namespace, out: Path) -> None:
-    from nmpm import export
-    from nmpm.constraints import Constraints
+    from nmpm.emulator.constraints import Constraints
+    from nmpm.zoo import export
 
     emulator, training_data = _model(chosen.model)
     if chosen.free:
@@ -91,10 +91,10 @@ def _model(name: str) -> tuple[Emulator, str]:
     """The emulator of that name or checkpoint, and what it was trained on."""
     path = Path(name)
     if path.suffix == ".ckpt" or path.is_file():
-        from nmpm.checkpoints import load_module
+        from nmpm.training.checkpoints import load_module
 
         return load_module(path).emulator, f"not told by the checkpoint {path.name}"
-    from nmpm.zoo import Zoo
+    from nmpm.zoo.registry import Zoo
 
     pretrained = Zoo.load(name)
     return pretrained.emulator, _data(pretrained.card)

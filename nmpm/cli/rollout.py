@@ -11,7 +11,7 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.particles import Particles
-    from nmpm.zoo import Pretrained
+    from nmpm.zoo.registry import Pretrained
 
 
 def run(words: list[str]) -> None:
@@ -45,7 +45,7 @@ def run(words: list[str]) -> None:
         raise ConfigError(f"--frames {chosen.frames}: ask for at least 1 frame.")
     if not chosen.out.parent.is_dir():
         raise ConfigError(f"--out {chosen.out}: the folder {chosen.out.parent} does not exist.")
-    from nmpm.zoo import Zoo
+    from nmpm.zoo.registry import Zoo
 
     model = Zoo.load(chosen.name).with_network(chosen.precision)
     if chosen.data is None:
@@ -85,9 +85,9 @@ def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> N
     from rich.progress import track
 
     from nmpm.data.format import write_split
-    from nmpm.monitor import Monitor, Policy
-    from nmpm.predicted import predicted_trajectory
-    from nmpm.rollouts import stream
+    from nmpm.data.predictions import predicted_trajectory
+    from nmpm.emulator.monitor import Monitor, Policy
+    from nmpm.emulator.rollouts import stream
 
     bundles, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
     made = stream(model.emulator, state, chosen.frames, monitor)

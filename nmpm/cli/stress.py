@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
+    from nmpm.evaluation.stress import Line, Size, Subject
     from nmpm.sim import Preset
-    from nmpm.stress import Line, Size, Subject
 
 DESCRIPTION = """Put a trained model through the extremes: long rollouts, fast and slow, many and few particles, other
 boxes and grids, precision, sensitivity, obstacles it never saw, poisoned input. One line for each, pass or fail by a
@@ -32,8 +32,8 @@ def run(words: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write stress.json, stress.md and stress.png there")
     chosen = parser.parse_args(words[1:])
-    from nmpm.constraints import Constraints
-    from nmpm.stress import FULL, GROUPS, QUICK
+    from nmpm.emulator.constraints import Constraints
+    from nmpm.evaluation.stress import FULL, GROUPS, QUICK
 
     unknown = sorted(set(chosen.groups or ()) - set(GROUPS))
     if unknown:
@@ -49,17 +49,17 @@ def run(words: list[str]) -> None:
 
 
 def _subject(model: str, preset: str | None, seed: int) -> Subject:
-    from nmpm.stress import Subject
+    from nmpm.evaluation.stress import Subject
 
     path = Path(model)
     if path.suffix == ".ckpt" or path.is_file():
-        from nmpm.checkpoints import load_module
+        from nmpm.training.checkpoints import load_module
 
         module = load_module(path)
         emulator, horizon = module.emulator, module.emulator.frames * module.unroll
         known = _preset(preset)
     else:
-        from nmpm.zoo import Zoo
+        from nmpm.zoo.registry import Zoo
 
         pretrained = Zoo.load(model)
         emulator = pretrained.emulator
@@ -86,7 +86,7 @@ def _measured(subject: Subject, size: Size, groups: list[str], quiet: bool) -> l
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from nmpm.stress import GROUPS, battery
+    from nmpm.evaluation.stress import GROUPS, battery
 
     columns = (
         TextColumn("{task.description}"),
@@ -108,7 +108,7 @@ def _measured(subject: Subject, size: Size, groups: list[str], quiet: bool) -> l
 def _hand_out(subject: Subject, lines: list[Line], size: str, seconds: float, chosen: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from nmpm.stress.report import as_json, summary, table, write
+    from nmpm.evaluation.stress.report import as_json, summary, table, write
 
     text = as_json(subject.name, size, seconds, lines)
     if chosen.json:

@@ -13,15 +13,15 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
-from nmpm.checkpoints import check_checkpoint
+from nmpm._support.plugins import load_plugins
+from nmpm._support.shipped import find_config
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.divergence import DivergenceGuard
 from nmpm.errors import ConfigError
-from nmpm.plugins import load_plugins
-from nmpm.prediction_writer import PredictionWriter
-from nmpm.report import Report
-from nmpm.shipped import find_config
-from nmpm.training import EmulatorModule
+from nmpm.training.callbacks.divergence import DivergenceGuard
+from nmpm.training.callbacks.prediction_writer import PredictionWriter
+from nmpm.training.callbacks.report import Report
+from nmpm.training.checkpoints import check_checkpoint
+from nmpm.training.module import EmulatorModule
 
 BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
 # A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best

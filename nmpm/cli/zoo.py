@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.shipped import shipped
+from nmpm._support.shipped import shipped
 
 
 def run(words: list[str]) -> None:
@@ -26,7 +26,7 @@ def run(words: list[str]) -> None:
 
 
 def _list(chosen: argparse.Namespace) -> None:
-    from nmpm.zoo import Zoo
+    from nmpm.zoo.registry import Zoo
 
     for name in Zoo.list(chosen.root):
         card = Zoo.card(name, chosen.root)
@@ -37,12 +37,12 @@ def _list(chosen: argparse.Namespace) -> None:
 def _card(chosen: argparse.Namespace) -> None:
     import yaml
 
-    from nmpm.zoo import Zoo
+    from nmpm.zoo.registry import Zoo
 
     sys.stdout.write(yaml.safe_dump(Zoo.card(chosen.name, chosen.root), sort_keys=False, allow_unicode=True))
 
 
 def _add(chosen: argparse.Namespace) -> None:
-    from nmpm.publish import add
+    from nmpm.zoo.publish import add
 
     sys.stdout.write(f"added {add(chosen.run, chosen.name, chosen.root, chosen.about)}\n")

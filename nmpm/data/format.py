@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
 from nmpm.data.metadata import read_metadata as read_metadata

@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
+from nmpm._support.version import __version__
 from nmpm.data.archives import DAMAGED_NPZ
 from nmpm.data.folder_lock import locked
 from nmpm.data.format import (
@@ -38,7 +39,6 @@ from nmpm.data.statistics import Statistics
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
-from nmpm.version import __version__
 
 _PARTS = ".parts"
 _REQUEST = "request.json"

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
 from nmpm.errors import DataError
 from nmpm.scene import Interval

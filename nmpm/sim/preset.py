@@ -7,8 +7,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
+from nmpm._support.plain_data import to_lists, to_tuples
 from nmpm.errors import ConfigError
-from nmpm.plain import listed, tupled
 from nmpm.scene import Scene
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
@@ -109,7 +109,7 @@ def built(kind: type[Any], plain: Any, where: str) -> Any:
     Raises:
         ConfigError: if a key is unknown or missing, or a value is wrong.
     """
-    entries = {key: tupled(value) for key, value in checked(kind, plain, where).items()}
+    entries = {key: to_tuples(value) for key, value in checked(kind, plain, where).items()}
     try:
         return kind(**entries)
     except (TypeError, ValueError) as error:
@@ -129,4 +129,4 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return listed(value)
+    return to_lists(value)

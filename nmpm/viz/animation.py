@@ -12,7 +12,7 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
 from nmpm.errors import ConfigError
 from nmpm.viz.exhibit import Exhibit
 from nmpm.viz.gif_palette import TRANSPARENT, GifPalette

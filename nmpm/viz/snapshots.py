@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import camera_for
 from nmpm.viz.captions import clock, unseen

@@ -36,7 +36,7 @@ def test_what_cannot_be_is_said(words, message, capsys):
 
 def test_a_failing_line_is_an_exit_status(monkeypatch, capsys):
     from nmpm.cli import stress
-    from nmpm.stress import Line
+    from nmpm.evaluation.stress import Line
 
     monkeypatch.setattr(stress, "_measured", lambda *_, **__: [Line("long", "one", False, {}, "nothing")])
     with pytest.raises(SystemExit) as exit_:

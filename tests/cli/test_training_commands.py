@@ -12,10 +12,10 @@ import yaml
 from lightning.pytorch import Callback
 from PIL import Image
 
+from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
-from nmpm.shipped import config_names, find_config
 from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
 

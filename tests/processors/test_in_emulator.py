@@ -4,9 +4,9 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.emulator import Emulator
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.processors import FFNO, FNO, TFNO, Axial, ConvNeXt, Identity, Pointwise, UNet, UNetModern
-from nmpm.rollouts import rollout, unroll
 
 SMALL = [
     UNet(width=4, depth=2, perceptron=(5,)),

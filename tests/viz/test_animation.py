@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from nmpm.atomic import replacing
+from nmpm._support.atomic import replacing
 from nmpm.errors import ConfigError
 from nmpm.viz import animation
 from nmpm.viz.colours import INTERIOR, PAGE, WALL, colour

@@ -1,0 +1,50 @@
+"""Predictions as trajectories in the native format, with all that is needed to draw or reuse them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm._support.version import __version__
+from nmpm.data.families import FAMILIES
+from nmpm.data.format import Trajectory
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+
+BOUNDARY = 3  # DeepMind's id of particles that do not move
+
+
+def predicted_trajectory(scene: Scene, state: Particles, predicted: Tensor, model: str, index: int = 0) -> Trajectory:
+    """One scene of a batch: the two frames that the rollout started from, then the prediction.
+
+    Args:
+        scene: The facts of the scenes; stored beside the positions.
+        state: The states that the rollouts started from.
+        predicted: (B, T, N, D) positions in domain length.
+        model: What predicted, in words.
+        index: Which scene of the batch.
+    """
+    real = state.mask[index]
+    start = torch.stack([state.position[index] - state.velocity[index], state.position[index]])
+    position = torch.cat([start, predicted[index]])[:, real].cpu().numpy()
+    obstacle = state.obstacle[index, state.obstacle_mask[index]].cpu().numpy()
+    resting = np.broadcast_to(obstacle, (len(position), *obstacle.shape))
+    types = _type_ids(scene)
+    moving = np.array(list(types), dtype=np.int64)[state.material[index, real].cpu().numpy()]
+    attributes = {
+        "generator": f"nmpm {__version__}, predicted by {model}",
+        "scene": json.dumps(scene.to_dict()),
+        "particle_types": json.dumps({**types, BOUNDARY: "boundary"}),
+        "static_types": np.array([BOUNDARY]),
+    }
+    ids = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
+    return Trajectory(np.concatenate([position, resting], axis=1), ids, attributes)
+
+
+def _type_ids(scene: Scene) -> dict[int, str]:
+    """DeepMind's id for each of the scene's materials, in order; beyond 100 for materials that it does not have."""
+    ids = {name: number for number, name in FAMILIES["deepmind"].types.items()}
+    return {ids.get(name, 100 + index): name for index, name in enumerate(scene.materials)}

@@ -1,0 +1,132 @@
+"""Normalisation statistics of an emulator, from a sample of the data that it will be trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nmpm._support.collectives import gathered
+from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.emulator.rasterise import grid_state
+from nmpm.particles import Window
+
+_LEEWAY = 0.5
+"""Of the range seen, on either side: what the network is shown beyond it, the sample being only a sample."""
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """The grid states of a sample: how many cells there are, and (C,) figures of what is in them."""
+
+    cells: int
+    mean: Tensor
+    std: Tensor
+    low: Tensor
+    high: Tensor
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    """What is left of the true velocities of one material: of how many particles, and (m, D) its mean square."""
+
+    particles: int
+    square: Tensor
+
+
+@torch.no_grad()
+def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
+    """Set the normalisation statistics from training windows of at least m + 2 frames.
+
+    Inputs get mean and standard deviation per channel over all cells, and the limits beyond which the network is shown
+    the limit; outputs the root mean square of what is left of the true velocities once the decoder's known part is
+    taken out, per frame of the bundle and component. Where several processes train together, all of them call this,
+    each with windows of its own, and get the statistics of all windows.
+
+    Raises:
+        ValueError: if there is no window or one is too short.
+    """
+    if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
+        raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
+    inputs = _pooled(gathered(_inputs(emulator, windows)))
+    emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
+    emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
+    # A channel that never varies in the sample may well do so elsewhere.
+    spread = inputs.high - inputs.low
+    leeway = torch.where(spread > 1e-12, _LEEWAY * spread, UNLIMITED)
+    emulator.input_low.copy_((inputs.low - leeway).reshape_as(emulator.input_low))
+    emulator.input_high.copy_((inputs.high + leeway).reshape_as(emulator.input_high))
+    materials = zip(*gathered(_unknowns(emulator, windows)), strict=True)
+    scale = torch.cat([_root_mean_square(parts) for parts in materials], dim=-1)
+    emulator.output_scale.copy_(_nonzero(scale).reshape_as(emulator.output_scale))
+    emulator.calibrated.fill_(True)
+
+
+def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:
+    state = torch.cat([_state(emulator, window) for window in windows])
+    axes = (0, *range(2, state.dim()))
+    cells = state.numel() // state.shape[1]
+    return _Inputs(cells, state.mean(axes), state.std(axes), state.amin(axes), state.amax(axes))
+
+
+def _pooled(parts: Sequence[_Inputs]) -> _Inputs:
+    """Several samples as one."""
+    if len(parts) == 1:
+        return parts[0]
+    cells = sum(part.cells for part in parts)
+    mean = torch.stack([part.mean.double() * (part.cells / cells) for part in parts]).sum(0)
+    squares = [part.std.double().square() * (part.cells - 1) for part in parts]
+    squares += [(part.mean - mean).square() * part.cells for part in parts]
+    return _Inputs(
+        cells,
+        mean.to(parts[0].mean),
+        (torch.stack(squares).sum(0) / (cells - 1)).sqrt().to(parts[0].std),
+        torch.stack([part.low for part in parts]).amin(0),
+        torch.stack([part.high for part in parts]).amax(0),
+    )
+
+
+def _state(emulator: Emulator, window: Window) -> Tensor:
+    start, grid = window.initial, emulator.grid
+    cells, velocity = grid.to_cells(start.position), grid.to_cell_displacement(start.velocity)
+    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
+
+
+def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
+    """For each material, the part of the velocity that the network has to give."""
+    unknown = [_unknown(emulator, window) for window in windows]
+    found = []
+    for index in range(len(emulator.scene.materials)):
+        chosen = [window.mask & (window.material == index) for window in windows]
+        values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(unknown, chosen, strict=True)])
+        found.append(_Unknowns(len(values), values.square().mean(0)))
+    return found
+
+
+def _root_mean_square(parts: Sequence[_Unknowns]) -> Tensor:
+    """(m, D) over all particles of the parts; 1 where there is none."""
+    some = [part for part in parts if part.particles] or parts[:1]
+    if len(some) == 1:
+        return some[0].square.sqrt().nan_to_num(1.0)
+    total = sum(part.particles for part in some)
+    square = torch.stack([part.square.double() * (part.particles / total) for part in some]).sum(0)
+    return square.sqrt().to(some[0].square)
+
+
+def _unknown(emulator: Emulator, window: Window) -> Tensor:
+    """(B, m, N, D) true velocities less what the decoder knows, in cells per frame."""
+    grid, decoder = emulator.grid, emulator.decoder
+    steps = grid.to_cell_displacement(window.frames[:, 1:].diff(dim=1))[:, : emulator.frames]
+    velocity = grid.to_cell_displacement(window.initial.velocity)
+    gravity = grid.to_cell_displacement(window.gravity).unsqueeze(1)
+    carried = decoder.carried(velocity, velocity)
+    before = [carried, *steps.unbind(1)]
+    known = [decoder.known(carried, before[i - 1], gravity, i) for i in range(1, emulator.frames + 1)]
+    return steps - torch.stack(known, dim=1)
+
+
+def _nonzero(scale: Tensor) -> Tensor:
+    """Scales that can be divided by: a channel that never varies is left as it is."""
+    return torch.where(scale > 1e-12, scale, torch.ones_like(scale))

@@ -1,0 +1,1 @@
+"""How good an emulator is: metrics, trivial predictors beside it, and the stress battery."""

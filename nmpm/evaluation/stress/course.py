@@ -1,0 +1,168 @@
+"""What happens along a rollout: energy, speed, escapes and volume, frame by frame, kept without the positions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator.constraints import MOST_GAIN, lowest_potential
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rasterise import volume_fraction
+from nmpm.emulator.rollouts import beyond_walls, stream
+from nmpm.grid import Grid
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+
+SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
+"""What `Course.sound` says, in words."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """The measures of a rollout of B scenes over T frames.
+
+    Args:
+        gain: (B, T) kinetic and potential energy above the start's, over the start's.
+        speed: (B, T) of the fastest particle, in cells per frame.
+        lost: (B, T) particles that are outside of the domain or nowhere.
+        filled: (B, V) volume that the particles fill over their own, at the V frames at which `follow` measures it.
+        last: (B, N, D) positions at the end.
+    """
+
+    gain: Tensor
+    speed: Tensor
+    lost: Tensor
+    filled: Tensor
+    last: Tensor
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.gain.shape[1]
+
+    @property
+    def failures(self) -> Tensor:
+        """(B, T): whether an invariant is broken: a particle lost, or more energy gained than `MOST_GAIN`."""
+        return (self.lost > 0) | (self.gain > MOST_GAIN) | self.gain.isnan()
+
+    @property
+    def sound(self) -> bool:
+        """Whether no invariant is ever broken."""
+        return not bool(self.failures.any())
+
+    def steps_to_failure(self) -> list[int]:
+        """For each scene the first frame, from 1, at which an invariant is broken; T + 1 where none is."""
+        first = self.failures.int().argmax(1) + 1
+        return torch.where(self.failures.any(1), first, self.frames + 1).tolist()
+
+    def figures(self) -> dict[str, float]:
+        """What a line of the battery reports."""
+        return {
+            "energy_gain_percent": 100 * float(self.gain.max()),
+            "lost": float(self.lost.max()),
+            "cfl": float(self.speed.max()),
+        }
+
+
+def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], every: int = 0) -> Course:
+    """Measure a rollout as it is made.
+
+    Args:
+        emulator: Gives scene and grid.
+        start: The state it started from.
+        bundles: (B, m, N, D) positions, one after the other.
+        every: Frames between two measures of the volume, rounded up to bundles; 0 for none.
+    """
+    scene, real = emulator.scene, start.mask
+    begun = energy_above_lowest(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
+    spacing = start.position.new_tensor(emulator.grid.spacing)
+    gains, speeds, losses, volumes = [], [], [], []
+    last, frame = start.position, 0
+    for bundle in bundles:
+        path = torch.cat([last.unsqueeze(1), bundle], dim=1)
+        steps = path.diff(dim=1)
+        gains.append((energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
+        speeds.append(_largest((steps / spacing).norm(dim=-1), real))
+        losses.append((outside(scene, bundle) & real.unsqueeze(1)).sum(-1))
+        last = bundle[:, -1]
+        if every and (frame + bundle.shape[1]) // every > frame // every:
+            volumes.append(filled(emulator, start, last))
+        frame += bundle.shape[1]
+    none = start.position.new_zeros(len(real), 0)
+    gain, speed, lost = (torch.cat(parts, dim=1) if parts else none for parts in (gains, speeds, losses))
+    volume = torch.stack(volumes, dim=1) if volumes else none
+    return Course(gain, speed, lost, volume, last)
+
+
+def run(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Course:
+    """Roll out, keeping no positions but the last, and measure as `follow` does."""
+    return follow(emulator, start, stream(emulator, start, frames), every)
+
+
+def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
+    """Kinetic and potential energy per mass, all particles of a mass, the potential from the bounds' lowest corner.
+
+    Counted from there particle by particle: in a sum of large potentials, far from the origin, digits would be lost.
+
+    Args:
+        scene: Gives the bounds.
+        start: Gives gravity and which particles are real.
+        position: (B, T, N, D).
+        velocity: (B, T, N, D) in length per frame.
+
+    Returns:
+        (B, T) in length² per frame².
+    """
+    gravity = start.gravity[:, None, None]
+    lowest = lowest_potential(scene, start.gravity)[:, None, None]
+    each = velocity.square().sum(-1) / 2 - lowest - (position * gravity).sum(-1)
+    real = start.mask.unsqueeze(1)
+    return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)
+
+
+def outside(scene: Scene, position: Tensor) -> Tensor:
+    """Whether positions (..., D) are beyond the domain's walls, or not finite."""
+    return beyond_walls(scene, position) | ~position.isfinite().all(-1)
+
+
+def apart(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Root mean square distance of the same particles in two rollouts, over all scenes.
+
+    Args:
+        grid: Gives the cells.
+        mask: (B, N) bool, which particles are real.
+        one: (B, T, N, D) positions.
+        other: (B, T, N, D) positions.
+
+    Returns:
+        (T,) in cells.
+    """
+    squared = ((one - other) / one.new_tensor(grid.spacing)).square().sum(-1)
+    return (torch.where(mask.unsqueeze(1), squared, 0.0).sum((0, 2)) / mask.sum()).sqrt()
+
+
+def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
+    """(B,) volume of what the particles fill over their own volume: less than at the start where they clump.
+
+    A cell counts with the share of it that particles fill, and a crowded one as full.
+    """
+    grid, scene = emulator.grid, emulator.scene
+    cells = grid.to_cells(torch.where(start.mask.unsqueeze(-1), position, position.new_tensor(scene.domain).mean(1)))
+    fraction = volume_fraction(scene, grid, emulator.transfer, start.mask, cells)
+    own = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
+    return fraction.clamp(max=1.0).flatten(1).sum(1) / own
+
+
+def _largest(values: Tensor, real: Tensor) -> Tensor:
+    """(B, T): largest of (B, T, N) over real particles, 0 where there are none."""
+    if not values.shape[-1]:
+        return values.new_zeros(values.shape[:2])
+    return torch.where(real.unsqueeze(1), values, 0.0).amax(-1)
+
+
+def _tiny(scene: Scene) -> float:
+    """An energy that nobody would see: of a speed of a millionth of the domain per frame."""
+    return 0.5 * (1e-6 * max(high - low for low, high in scene.domain)) ** 2

@@ -1,0 +1,167 @@
+"""Unseen scenes: floors, a hole, a moving bar, an inlet, fast particles against a wall one cell thick.
+
+Obstacles are put only into scenes whose model sees walls or obstacles at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from nmpm.data.initial_states import lattice, resting
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import unroll
+from nmpm.evaluation.stress.course import outside
+from nmpm.evaluation.stress.lines import Line, Size
+from nmpm.evaluation.stress.subject import Subject
+from nmpm.particles import Particles
+from nmpm.scene import Interval, Scene
+
+Forbidden = Callable[[Tensor, int], Tensor]
+"""Given (N, D) positions and the number of the bundle: which particles are where nobody may be, (N,) bool."""
+
+Change = Callable[[Particles, int], Particles]
+"""Given a state and the number of the bundle to come: the state with what changes from outside."""
+
+_GROUP = "unseen scenes"
+_DEEP = 0.5  # cells: how far into a solid a particle's centre may be seen
+
+
+def obstacles(subject: Subject, size: Size) -> Iterator[Line]:
+    """Walls, obstacles and sources added to a model that never saw them."""
+    scene = subject.emulator.scene
+    bundles = max(1, size.compared // subject.emulator.frames)
+    if scene.walled and scene.dim > 1 and not any(scene.periodic):
+        emulator = subject.emulator.over(dataclasses.replace(scene, obstacles=True))
+        for cells in (3, 1):
+            yield _floor(emulator, f"a floor {cells} cells thick", cells, 0.0, bundles)
+        yield _floor(emulator, "2 cells per frame against one cell", 1, 2.0, bundles)
+        yield _hole(emulator, bundles)
+        yield _moving(emulator, bundles)
+    yield _inlet(subject.emulator, bundles)
+
+
+def _floor(emulator: Emulator, name: str, cells: int, speed: float, bundles: int) -> Line:
+    """A block falls onto a slab from wall to wall."""
+    scene, slab = emulator.scene, _slab(emulator, cells)
+    state = _block(emulator, slab, speed, bar(scene, slab))
+    low, high = slab[1]
+    deep = high - _DEEP * emulator.grid.spacing[1]
+    most = _most(emulator, state, bundles, lambda position, _: position[:, 1] < deep)
+    below = _most(emulator, state, bundles, lambda position, _: position[:, 1] < low)
+    figures = {"in_or_below": most, "below": below, "of": state.position.shape[1]}
+    return Line(_GROUP, name, most == 0, _floats(figures), "nobody half a cell deep in it, nobody below")
+
+
+def _hole(emulator: Emulator, bundles: int) -> Line:
+    """The slab has a hole eight cells wide under the block."""
+    scene, slab = emulator.scene, _slab(emulator, 3)
+    (left, right), (low, high), *rest = slab
+    middle, half = (left + right) / 2, 4 * emulator.grid.spacing[0]
+    sides = [((left, middle - half), (low, high), *rest), ((middle + half, right), (low, high), *rest)]
+    state = _block(emulator, slab, 0.0, torch.cat([bar(scene, side) for side in sides]))
+    deep = [_DEEP * h for h in emulator.grid.spacing]
+
+    def within(position: Tensor, _: int) -> Tensor:
+        upright = (position[:, 1] < high - deep[1]) & (position[:, 1] > low + deep[1])
+        return upright & ((position[:, 0] - middle).abs() > half + deep[0])
+
+    most = _most(emulator, state, bundles, within)
+    passed = _most(emulator, state, bundles, lambda position, _: position[:, 1] < low)
+    figures = {"in_the_floor": most, "through_the_hole": passed, "of": state.position.shape[1]}
+    return Line(_GROUP, "a hole in the floor", most == 0, _floats(figures), "nobody half a cell deep in the floor")
+
+
+def _moving(emulator: Emulator, bundles: int) -> Line:
+    """A bar three cells thick and half as high as the box sweeps from the left, 0.4 cells per bundle."""
+    scene, h = emulator.scene, emulator.grid.spacing[0]
+    (left, right), (low, high), *rest = scene.bounds
+    first = (left, left + 3 * h)
+    still = bar(scene, (first, (low, (low + high) / 2), *rest))
+    block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), scene.particle_spacing)
+    state = resting(scene, block, still)
+
+    def place(bundle: int) -> float:
+        return min(0.4 * bundle * h, (right - left) / 2)
+
+    def swept(state: Particles, bundle: int) -> Particles:
+        shift = still.new_tensor([place(bundle)] + [0.0] * (scene.dim - 1))
+        return dataclasses.replace(state, obstacle=(still + shift)[None])
+
+    def within(position: Tensor, bundle: int) -> Tensor:
+        along = (position[:, 0] - place(bundle) - sum(first) / 2).abs() < (1.5 - 2 * _DEEP) * h
+        return along & (position[:, 1] < (low + high) / 2 - h)
+
+    most = _most(emulator, state, bundles, within, swept)
+    figures = {"in_the_bar": most, "of": state.position.shape[1]}
+    return Line(_GROUP, "a bar that moves", most == 0, _floats(figures), "nobody a cell deep in it")
+
+
+def _inlet(emulator: Emulator, bundles: int) -> Line:
+    """Every fifth bundle a small block enters at the top."""
+    scene, h = emulator.scene, emulator.grid.spacing
+    sides = [
+        ((low + high) / 2 - 3 * step, (low + high) / 2 + 3 * step)
+        for (low, high), step in zip(scene.bounds, h, strict=True)
+    ]
+    if scene.dim > 1:
+        sides[1] = (scene.bounds[1][1] - 8 * h[1], scene.bounds[1][1] - 2 * h[1])
+    fresh = resting(scene, lattice(tuple(sides), scene.particle_spacing))
+
+    def fed(state: Particles, bundle: int) -> Particles:
+        return joined(state, fresh) if bundle % 5 == 0 and bundle else state
+
+    most = _most(emulator, fresh, bundles, lambda position, _: outside(scene, position), fed)
+    return Line(_GROUP, "an inlet", most == 0, {"lost": float(most)}, "nobody lost")
+
+
+def joined(one: Particles, other: Particles) -> Particles:
+    """The particles of both, among the obstacles of the first."""
+    names = ("position", "velocity", "material", "mask")
+    both = {name: torch.cat([getattr(one, name), getattr(other, name)], dim=1) for name in names}
+    return dataclasses.replace(one, **both)
+
+
+def bar(scene: Scene, box: tuple[Interval, ...]) -> Tensor:
+    """(M, D) obstacle particles that fill a box."""
+    return lattice(box, scene.particle_spacing)
+
+
+def _most(
+    emulator: Emulator, state: Particles, bundles: int, forbidden: Forbidden, change: Change | None = None
+) -> int:
+    """The most particles at a time, over all frames, that are where nobody may be, or not finite."""
+    most = 0
+    with torch.no_grad():
+        for bundle in range(bundles):
+            state = change(state, bundle) if change else state
+            (made,) = unroll(emulator, state, 1)
+            for position in made.position[0]:
+                bad = forbidden(position, bundle) | ~position.isfinite().all(-1)
+                most = max(most, int(bad.sum()))
+            state = state.moved(made.position[:, -1], made.velocity)
+    return most
+
+
+def _slab(emulator: Emulator, cells: int) -> tuple[Interval, ...]:
+    """A slab from wall to wall, its top in the middle of the box."""
+    bounds, step = emulator.scene.bounds, emulator.grid.spacing[1]
+    top = (bounds[1][0] + bounds[1][1]) / 2
+    return (emulator.scene.domain[0], (top - cells * step, top), *emulator.scene.domain[2:])
+
+
+def _block(emulator: Emulator, slab: tuple[Interval, ...], speed: float, solid: Tensor) -> Particles:
+    """A block above the middle of a slab, thrown down, in cells per frame."""
+    scene, h = emulator.scene, emulator.grid.spacing
+    box = [(low + (high - low) / 3, high - (high - low) / 3) for low, high in scene.bounds]
+    box[1] = (slab[1][1] + 2 * h[1], slab[1][1] + 16 * h[1])
+    state = resting(scene, lattice(tuple(box), scene.particle_spacing), solid)
+    down = state.velocity.new_tensor([0.0, -speed * h[1]] + [0.0] * (scene.dim - 2))
+    return state.moved(state.position, state.velocity + down)
+
+
+def _floats(figures: dict[str, int]) -> dict[str, float]:
+    return {key: float(value) for key, value in figures.items()}

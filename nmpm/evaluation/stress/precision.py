@@ -1,0 +1,118 @@
+"""Precision and sensitivity: what rounding does, beside what a nudge of a millionth does; gradients of long unrolls."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import rollout, unroll
+from nmpm.evaluation.stress.course import SOUND, apart, follow
+from nmpm.evaluation.stress.lines import Line, Size
+from nmpm.evaluation.stress.subject import Subject
+from nmpm.particles import Particles
+from nmpm.sim import MpmPreset
+from nmpm.sim.gravity import turned
+from nmpm.sim.mpm import draw_scene, simulate_from
+
+NUDGE = 1e-6
+"""Of the domain's longest side: standard deviation of a nudge to the initial positions."""
+
+_GROUP = "precision and sensitivity"
+
+
+def precision(subject: Subject, size: Size) -> Iterator[Line]:
+    """Rollouts in other precisions, beside the model's own sensitivity."""
+    state, frames = subject.starts(size.scenes), 4 * subject.horizon
+    emulator = subject.emulator
+    plain = rollout(emulator, state, frames)
+    nudged = rollout(emulator, nudge(subject, state), frames)
+    double = rollout(copy.deepcopy(emulator).double(), state.double(), frames)
+    own = apart(emulator.grid, state.mask, plain, nudged)
+    rounding = apart(emulator.grid, state.mask, plain, double.to(plain.dtype))
+    yield Line(
+        _GROUP, "float32 beside float64", bool(rounding[-1] <= 10 * own[-1]), _at(subject, rounding, own),
+        "no further apart than ten nudges of a millionth of the domain",
+    )  # fmt: skip
+    for dtype in (torch.bfloat16, torch.float16):
+        with torch.autocast(state.position.device.type, dtype):
+            half = rollout(emulator, state, frames)
+        course = follow(emulator, state, [half])
+        figures = _at(subject, apart(emulator.grid, state.mask, plain, half), own) | course.figures()
+        name = f"{str(dtype).removeprefix('torch.')} network beside float32"
+        yield Line(_GROUP, name, course.sound, figures, SOUND)
+
+
+def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
+    """How fast a nudge grows, in the emulator and in the simulator; gradients through more and more bundles."""
+    state, frames = subject.starts(size.scenes), 4 * subject.horizon
+    emulator = subject.emulator
+    pair = rollout(emulator, state, frames), rollout(emulator, nudge(subject, state), frames)
+    figures = {"growth_per_100_frames": growth(apart(emulator.grid, state.mask, *pair))}
+    if subject.simulator is not None:
+        figures["simulator_growth_per_100_frames"] = _simulator_growth(subject, subject.simulator, frames, size)
+    yield Line(_GROUP, "growth of a nudge (exponent)", None, figures)
+    norms = _gradients(emulator, state.scenes(slice(1)), size.bundles)
+    yield Line(
+        _GROUP, "gradients through unrolled bundles", all(math.isfinite(norm) for norm in norms.values()),
+        {f"norm_K{bundles}": norm for bundles, norm in norms.items()}, "finite",
+    )  # fmt: skip
+
+
+def nudge(subject: Subject, state: Particles) -> Particles:
+    """The state with every position nudged, the velocities left."""
+    generator = torch.Generator().manual_seed(subject.seed)
+    side = max(high - low for low, high in subject.emulator.scene.domain)
+    noise = torch.randn(state.position.shape, generator=generator).to(state.position)
+    low, high = state.position.new_tensor(subject.emulator.scene.bounds).T
+    return state.moved((state.position + NUDGE * side * noise).clamp(low, high), state.velocity)
+
+
+def growth(distance: Tensor) -> float:
+    """Slope of the logarithm of a (T,) distance, per 100 frames: an estimate of the largest Lyapunov exponent."""
+    frames = torch.arange(len(distance), dtype=torch.float64)
+    logs = distance.double().clamp(min=1e-30).log()
+    centred = frames - frames.mean()
+    return 100 * float((centred * logs).sum() / centred.square().sum())
+
+
+def _simulator_growth(subject: Subject, preset: MpmPreset, frames: int, size: Size) -> float:
+    rng, slopes = np.random.default_rng(subject.seed), []
+    side = max(high - low for low, high in preset.domain)
+    for seed in subject.seeds(size.scenes):
+        draw = np.random.default_rng(seed)
+        gravity = turned(preset.gravity, preset.gravity_turn, draw)
+        start, ramps = draw_scene(preset, draw)
+        runs = [
+            simulate_from(preset, position, start.velocity, frames, start.counts, None, gravity, ramps).position[1:]
+            for position in (start.position, start.position + NUDGE * side * rng.standard_normal(start.position.shape))
+        ]
+        distance = np.sqrt(np.square(runs[0] - runs[1]).sum(-1).mean(-1))
+        slopes.append(growth(torch.from_numpy(distance)))
+    return float(np.mean(slopes))
+
+
+def _gradients(emulator: Emulator, state: Particles, most: int) -> dict[int, float]:
+    """Norm of the gradient of the final mean position with respect to the initial velocities, for K = 1, 2, 4, …"""
+    norms = {}
+    for bundles in (2**power for power in range(most.bit_length()) if 2**power <= most):
+        velocity = state.velocity.clone().requires_grad_()
+        with torch.enable_grad():
+            *_, last = unroll(emulator, state.moved(state.position, velocity), bundles)
+            (gradient,) = torch.autograd.grad(last.position[:, -1].mean(), velocity)
+        norms[bundles] = float(gradient.norm())
+    return norms
+
+
+def _at(subject: Subject, distance: Tensor, own: Tensor) -> dict[str, float]:
+    first, last = subject.horizon, len(distance)
+    return {
+        f"apart_cells_at_{first}": float(distance[first - 1]),
+        f"apart_cells_at_{last}": float(distance[-1]),
+        f"nudged_cells_at_{last}": float(own[-1]),
+    }

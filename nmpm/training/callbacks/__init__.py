@@ -1,0 +1,1 @@
+"""Lightning callbacks of the command line's trainer, one per file."""

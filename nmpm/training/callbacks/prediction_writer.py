@@ -1,0 +1,50 @@
+"""The callback behind `nmpm predict`; apart from `nmpm.data.predictions`, as Lightning takes seconds to import."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
+
+from nmpm._support.collectives import collected
+from nmpm.data.format import Trajectory, write_split
+from nmpm.data.predictions import predicted_trajectory
+from nmpm.particles import Window
+from nmpm.scene import Scene
+
+
+class PredictionWriter(BasePredictionWriter):
+    """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder.
+
+    Of several processes, the first writes what all have made, in the order in which one alone would.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(write_interval="batch")
+        self._made: list[Trajectory] = []
+
+    def write_on_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        prediction: Any,
+        batch_indices: Any,  # noqa: ARG002
+        batch: Window,
+        batch_idx: int,  # noqa: ARG002
+        dataloader_idx: int,  # noqa: ARG002
+    ) -> None:
+        scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
+        source = f"{trainer.ckpt_path or 'the model'}"
+        for index in range(len(prediction)):
+            self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        dealt = collected(self._made)
+        if trainer.is_global_zero:
+            turns = zip_longest(*dealt)  # trajectories are dealt in turn, so the last turn may be short
+            made = [trajectory for turn in turns for trajectory in turn if trajectory is not None]
+            write_split(Path(trainer.default_root_dir) / "predictions.h5", made)
+        self._made = []

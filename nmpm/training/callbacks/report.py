@@ -1,0 +1,178 @@
+"""What a test leaves behind: a table on the screen, the figures as JSON and CSV, a picture and an animation."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from nmpm._support.atomic import replacing
+from nmpm._support.version import __version__
+from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
+from nmpm.evaluation.metrics import RolloutError
+from nmpm.particles import Window
+from nmpm.training.module import EmulatorModule
+from nmpm.viz import Exhibit, animation, snapshots
+
+
+class Report(Callback):
+    """Keeps the time that training took, and writes the report when a test ends.
+
+    Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions), `errors.csv`
+    (error against frame), `rollout.png` and `rollout.gif` (the first test trajectory beside its prediction).
+    """
+
+    def __init__(self) -> None:
+        self.trained_seconds = 0.0
+        self.trained_steps = 0
+        self._since: float | None = None
+        self._trained = False
+        self._exhibit: tuple[Window, Tensor] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if self._trained:
+            return  # the test after a fit loads the best checkpoint, which is often older than the training's end
+        self.trained_seconds = float(state_dict["trained_seconds"])
+        self.trained_steps = int(state_dict.get("trained_steps", 0))
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        self._since, self._trained = time.monotonic(), True
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,  # noqa: ARG002
+        batch: Any,  # noqa: ARG002
+        batch_idx: int,  # noqa: ARG002
+    ) -> None:
+        self.trained_steps = trainer.global_step
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        self.trained_seconds, self._since = self._elapsed(), None
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,  # noqa: ARG002
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,
+        batch: Window,
+        batch_idx: int,
+        dataloader_idx: int = 0,  # noqa: ARG002
+    ) -> None:
+        if batch_idx == 0:
+            self._exhibit = (batch.to("cpu"), outputs.cpu())
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not isinstance(pl_module, EmulatorModule):
+            return
+        judged = {kind: _gathered(metric) for kind, metric in pl_module.test_errors.errors.items()}
+        if not trainer.is_global_zero:
+            return
+        folder = Path(trainer.default_root_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in judged.items()})
+        with replacing(folder / "report.json") as part:
+            part.write_text(json.dumps(figures, indent=1) + "\n")
+        _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in judged.items()})
+        if self._exhibit is not None:
+            exhibit = exhibit_of(pl_module, *self._exhibit)
+            snapshots(exhibit, folder / "rollout.png")
+            animation(exhibit, folder / "rollout.gif")
+        _print_table(figures, folder)
+
+    def _elapsed(self) -> float:
+        return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
+
+    def _figures(
+        self, trainer: Trainer, module: EmulatorModule, per_trajectory: Mapping[str, list[dict[str, float]]]
+    ) -> dict[str, Any]:
+        datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
+        logged = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("test/")}
+        return {
+            "dataset": datamodule.description,
+            "test": {key.removeprefix("test/"): value for key, value in sorted(logged.items())},
+            "per_trajectory": dict(per_trajectory),
+            "training": {
+                "steps": self.trained_steps,
+                "horizon": module.emulator.frames * module.unroll,
+                "seconds": round(self.trained_seconds, 1),
+                "precision": str(trainer.precision),
+                "devices": trainer.world_size,
+                "hardware": hardware(),
+                "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
+            },
+            "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
+        }
+
+
+def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exhibit:
+    """The first trajectory of a batch beside its prediction, as something to draw.
+
+    Both start with the two frames that the prediction started from; both end where the prediction is not finite.
+    """
+    scene, real = module.emulator.scene, window.mask[0]
+    truth = window.frames[0][:, real]
+    prediction = torch.cat([truth[:2], predicted[0][:, real]])
+    broken = ~prediction.isfinite().flatten(1).all(1)
+    frames = int(broken.int().argmax()) if broken.any() else len(prediction)
+    rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
+    obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
+    title = f"The prediction is not finite from frame {frames} on" if broken.any() else ""
+    return Exhibit.of_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
+
+
+def hardware() -> str:
+    """What this process computes on, in words."""
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name()
+    return f"{_processor()}, {torch.get_num_threads()} threads"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _gathered(metric: RolloutError) -> tuple[list[dict[str, float]], list[Tensor]]:
+    """MSE per trajectory and curves, from all processes."""
+    with metric.sync_context():
+        return metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]
+
+
+def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
+    """Mean over trajectories of the squared error at each frame that all of them reach, a column per predictor."""
+    frames = min(len(curve) for rows in curves.values() for curve in rows)
+    means = torch.stack([torch.stack([curve[:frames] for curve in rows]).mean(0) for rows in curves.values()], dim=1)
+    lines = [["frame", *curves], *([str(frame), *map(str, row)] for frame, row in enumerate(means.tolist(), 1))]
+    with replacing(path) as part:
+        part.write_text("".join(",".join(line) + "\n" for line in lines))
+
+
+def _print_table(figures: Mapping[str, Any], folder: Path) -> None:
+    test = figures["test"]
+    names = figure_names(test)
+    table = Table(title=f"{figures['dataset']}: test error ×10⁻³ (MSE in length², EMD in length)")
+    table.add_column("predictor")
+    for name in names:
+        table.add_column(name, justify="right")
+    for kind, label in PREDICTORS.items():
+        table.add_row(label, *table_row(test, kind))
+    console = Console()
+    console.print(table)
+    console.print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")

@@ -1,0 +1,73 @@
+"""Packages of AOTInductor (.pt2): machine code for the processor they were made on, run by torch from Python or C++.
+
+They take contiguous tensors, and take others for such without a word: call `contiguous()` on what goes in.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from nmpm._support.atomic import replacing
+from nmpm.errors import ConfigError
+from nmpm.zoo.export.parts import Part
+from nmpm.zoo.export.program import first_line, program
+
+
+def write_compiled(part: Part, about: Mapping[str, str], path: Path) -> None:
+    """Write a part as a package of AOTInductor.
+
+    Args:
+        part: What to write.
+        about: Kept in the package as its metadata.
+        path: The file; its name must end in .pt2.
+
+    Raises:
+        ConfigError: if there is no C++ compiler, it fails, or torch.export cannot follow the network.
+    """
+    from torch import _inductor
+
+    check_compiler()
+    exported = program(part)
+    settings = {"aot_inductor.metadata": dict(about)}
+    with replacing(path) as temporary:
+        try:
+            with torch.no_grad():
+                _inductor.aoti_compile_and_package(exported, package_path=str(temporary), inductor_configs=settings)
+        except Exception as error:  # the compiler's own among them
+            recipe = type(part.emulator.recipe).__name__
+            raise ConfigError(
+                f"AOTInductor cannot compile the model with its {recipe} ({type(error).__name__}: {first_line(error)})."
+                " --format onnx needs no compiler."
+            ) from error
+
+
+def run_compiled(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+    """The outputs of a package."""
+    from torch import _inductor
+
+    # Machine code reads memory in the order in which it was made, and does not look whether an input has that.
+    ordered = {name: value.contiguous() for name, value in inputs.items()}
+    with torch.no_grad():
+        outputs: tuple[Tensor, ...] = _inductor.aoti_load_package(str(path))(**ordered)
+    return tuple(outputs)
+
+
+def check_compiler() -> None:
+    """Make sure that there is a C++ compiler.
+
+    Raises:
+        ConfigError: naming the one that is looked for.
+    """
+    from torch._inductor import config
+
+    names = [name for name in config.cpp.cxx if name]
+    if not any(map(shutil.which, names)):
+        raise ConfigError(
+            f"--format pt2 compiles the model, and there is no C++ compiler {' or '.join(names)}: install g++ or clang,"
+            " or name yours in the environment variable CXX. --format onnx needs none."
+        )

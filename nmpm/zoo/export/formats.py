@@ -1,0 +1,58 @@
+"""The formats of exported files, by the suffix that names them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from torch import Tensor
+
+from nmpm.zoo.export.compiled import run_compiled, write_compiled
+from nmpm.zoo.export.onnx_file import run_onnx, write_onnx
+from nmpm.zoo.export.parts import Part
+
+Write = Callable[[Part, Mapping[str, str], Path], None]
+Run = Callable[[Path, Mapping[str, Tensor]], tuple[Tensor, ...]]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of exported files.
+
+    Args:
+        write: Writes a part with what the file is to say of itself.
+        run: The outputs of a file for inputs by name.
+    """
+
+    write: Write
+    run: Run
+
+    def difference(self, part: Part, path: Path, batch: int, count: int, seed: int = 0) -> float:
+        """By how much a written file differs from the part itself on made-up inputs.
+
+        Args:
+            part: What was written.
+            path: The file.
+            batch: Scenes.
+            count: Particles.
+            seed: Of the inputs.
+
+        Returns:
+            The largest difference in any output: in cells for the step, the processor's own units else; inf if one of
+            them is no number where the other is.
+        """
+        inputs = part.example(batch, count, seed)
+        found, expected = self.run(path, inputs), part(**inputs)
+        worst = 0.0
+        for value, one, other in zip(part.outputs, found, expected, strict=True):
+            gap = (one - other).abs().nan_to_num(nan=float("inf")).max().item() if other.numel() else 0.0
+            worst = max(worst, gap / part.scale(value.name))
+        return worst
+
+
+FORMATS: Mapping[str, Format] = MappingProxyType(
+    {"onnx": Format(write_onnx, run_onnx), "pt2": Format(write_compiled, run_compiled)}
+)
+"""Writers and runners by the files' suffix."""

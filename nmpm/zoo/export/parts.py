@@ -1,0 +1,231 @@
+"""Parts of an emulator as functions of plain tensors, which `torch.export` can follow.
+
+Their numbers are the emulator's own: they call it. Only what a program cannot decide as it runs is decided here: that
+all particles are real, that the sums are torch's own, and that nothing is trained.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from nmpm.emulator.model import Emulator
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+
+VARYING = {"B": 2, "N": 7, "M": 7}
+"""Sizes that an exported part leaves open: scenes, particles, obstacle particles. Examples have so many, and neither 0
+nor 1, which torch.export takes for constants."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """A tensor that goes in or comes out.
+
+    Args:
+        name: What it is called in the file.
+        shape: Its sizes, those that vary by their name in `VARYING`.
+        about: What it holds, with its unit.
+        dtype: Its numbers.
+    """
+
+    name: str
+    shape: tuple[str | int, ...]
+    about: str
+    dtype: torch.dtype = torch.float32
+
+
+class Part(nn.Module, ABC):
+    """What is exported: a function of named float32 tensors, with a copy of the emulator, on the CPU.
+
+    Args:
+        emulator: Where it is from.
+    """
+
+    inputs: tuple[Value, ...]
+    outputs: tuple[Value, ...]
+
+    def __init__(self, emulator: Emulator) -> None:
+        super().__init__()
+        self.emulator = copy.deepcopy(emulator).cpu().float().eval().requires_grad_(False)
+
+    @abstractmethod
+    def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
+        """Made-up inputs: for tracing, and to compare programs with the emulator.
+
+        Args:
+            batch: Scenes.
+            count: Particles, of obstacles too.
+            seed: Of the numbers.
+        """
+
+    def scale(self, output: str) -> float:  # noqa: ARG002 (outputs in cells, or without a unit, are as they are)
+        """What an output is divided by to be in cells."""
+        return 1.0
+
+
+class Step(Part):
+    """One call of the emulator: from a state to the next m frames and the state after them.
+
+    Raises:
+        ConfigError: if the emulator is held to what a program cannot decide: contact with obstacles, or bounds beyond
+            which there is an error.
+    """
+
+    def __init__(self, emulator: Emulator) -> None:
+        super().__init__(emulator)
+        _check_constraints(emulator)
+        scene, shape = emulator.scene, emulator.grid.shape
+        state: tuple[str | int, ...] = ("B", "N", scene.dim)
+        names = ", ".join(f"{index} {name}" for index, name in enumerate(scene.materials))
+        budget = "energy per mass not to be exceeded, in cells and frames; nan for that of this state, inf for no limit"
+        possible = {
+            "position": Value("position", state, "domain length"),
+            "velocity": Value("velocity", state, "domain length per frame"),
+            "material": Value("material", ("B", "N"), f"index of each particle's material: {names}", torch.int64),
+            "gravity": Value("gravity", ("B", scene.dim), "domain length per frame squared"),
+            "solid": Value("solid", ("B", 1, *shape), "share of each cell that is wall or obstacle, from 0 to 1"),
+            "budget": Value("budget", ("B",), budget),
+        }
+        needed = {
+            "material": len(scene.materials) > 1,
+            "gravity": scene.gravity_varies,
+            "solid": scene.obstacles,
+            "budget": emulator.constraints.energy,
+        }
+        self.inputs = tuple(value for name, value in possible.items() if needed.get(name, True))
+        positions = Value("positions", ("B", emulator.frames, "N", scene.dim), "the next frames, in domain length")
+        velocity = Value("next_velocity", state, "at the last frame, in domain length per frame: the next call's")
+        held = Value("next_budget", ("B",), "the budget that was kept: the next call's")
+        self.outputs = (positions, velocity, held) if emulator.constraints.energy else (positions, velocity)
+        known = torch.tensor(scene.gravity or (0.0,) * scene.dim) * scene.dt**2
+        self.register_buffer("known_gravity", known, persistent=False)
+
+    known_gravity: Tensor
+
+    def forward(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        material: Tensor | None = None,
+        gravity: Tensor | None = None,
+        solid: Tensor | None = None,
+        budget: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """The outputs, of the inputs that this emulator has."""
+        state = self._state(position, velocity, material, gravity)
+        solid = self.emulator.solid(state) if solid is None else solid
+        own = self.emulator.budget(state)
+        if own is None or budget is None:
+            bundle = self.emulator(state, solid)
+            return bundle.position, bundle.velocity
+        held = torch.where(budget.isnan(), own, budget)
+        bundle = self.emulator(state, solid, held)
+        return bundle.position, bundle.velocity, held
+
+    def _state(self, position: Tensor, velocity: Tensor, material: Tensor | None, gravity: Tensor | None) -> Particles:
+        batch, count, dim = position.shape
+        one = torch.zeros(batch, count, dtype=torch.int64, device=position.device)
+        return Particles(
+            position=position,
+            velocity=velocity,
+            material=one if material is None else material,
+            mask=torch.ones(batch, count, dtype=torch.bool, device=position.device),
+            obstacle=position.new_zeros(batch, 0, dim),
+            obstacle_mask=torch.ones(batch, 0, dtype=torch.bool, device=position.device),
+            gravity=self.known_gravity.expand(batch, dim) if gravity is None else gravity,
+        )
+
+    def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
+        random = torch.Generator().manual_seed(seed)
+        scene, grid = self.emulator.scene, self.emulator.grid
+        low, high = torch.tensor(scene.bounds).T
+        spread = 0.5 * torch.tensor(grid.spacing)
+        made = {
+            "position": low + (high - low) * torch.rand(batch, count, scene.dim, generator=random),
+            "velocity": spread * torch.randn(batch, count, scene.dim, generator=random),
+            "material": torch.randint(len(scene.materials), (batch, count), generator=random),
+            "gravity": self.known_gravity.repeat(batch, 1),
+            "solid": self.emulator.walls.expand(batch, 1, *grid.shape).clone(),
+            "budget": torch.full((batch,), float("nan")),
+        }
+        return {value.name: made[value.name] for value in self.inputs}
+
+    def scale(self, output: str) -> float:
+        return 1.0 if output == "next_budget" else min(self.emulator.grid.spacing)
+
+
+class Network(Part):
+    """The network between the transfers with its normalisation: from a grid state to m grid velocity fields."""
+
+    def __init__(self, emulator: Emulator) -> None:
+        super().__init__(emulator)
+        scene, shape = emulator.scene, emulator.grid.shape
+        seen, said = ", ".join(scene.input_channels), ", ".join(scene.output_channels)
+        about = f"channels {seen}; velocities in cells per frame, volumes and solids as shares of a cell"
+        decoder = type(emulator.decoder).__name__
+        self.inputs = (Value("grid", ("B", len(scene.input_channels), *shape), about),)
+        out: tuple[str | int, ...] = ("B", emulator.frames, len(scene.output_channels), *shape)
+        self.outputs = (Value("fields", out, f"channels {said}, in cells per frame, for the decoder {decoder}"),)
+
+    def forward(self, grid: Tensor) -> tuple[Tensor]:
+        """(B, C_in, *S) → (B, m, C_out, *S)."""
+        fields: Tensor = self.emulator.processor(self.emulator.normalised(grid)) * self.emulator.output_scale
+        return (fields,)
+
+    def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:  # noqa: ARG002 (no particles here)
+        emulator = self.emulator
+        shape = (batch, len(emulator.scene.input_channels), *emulator.grid.shape)
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        return {"grid": emulator.input_mean + emulator.input_std * noise}
+
+
+class Solid(Part):
+    """From the particles that obstacles are made of to the solid fraction that the step sees.
+
+    Raises:
+        ConfigError: if the scene has no obstacles.
+    """
+
+    def __init__(self, emulator: Emulator) -> None:
+        super().__init__(emulator)
+        scene = emulator.scene
+        if not scene.obstacles:
+            raise ConfigError("The model's scene has no obstacles: export its step, which needs nothing else.")
+        about = f"particles that fill the obstacles, each of volume {scene.particle_volume:g}, in domain length"
+        self.inputs = (Value("obstacle", ("B", "M", scene.dim), about),)
+        share = "share of each cell that is wall or obstacle, from 0 to 1"
+        self.outputs = (Value("solid", ("B", 1, *emulator.grid.shape), share),)
+
+    def forward(self, obstacle: Tensor) -> tuple[Tensor]:
+        """(B, M, D) → (B, 1, *S)."""
+        batch, count, dim = obstacle.shape
+        none = obstacle.new_zeros(batch, 0, dim)
+        empty = torch.zeros(batch, 0, dtype=torch.bool, device=obstacle.device)
+        real = torch.ones(batch, count, dtype=torch.bool, device=obstacle.device)
+        gravity = obstacle.new_zeros(batch, dim)
+        return (self.emulator.solid(Particles(none, none, empty.long(), empty, obstacle, real, gravity)),)
+
+    def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
+        scene, random = self.emulator.scene, torch.Generator().manual_seed(seed)
+        low, high = torch.tensor(scene.bounds).T
+        return {"obstacle": low + (high - low) * torch.rand(batch, count, scene.dim, generator=random)}
+
+
+def _check_constraints(emulator: Emulator) -> None:
+    held = emulator.constraints
+    if held.solids and emulator.scene.obstacles:
+        raise ConfigError(
+            "constraints.solids cannot be exported: contact with obstacles looks at paths in as many pieces as the"
+            " fastest particle needs, and a program has a fixed number. Export with --free (constraints: solids: false,"
+            " as `nmpm.Constraints(solids=False)`), or roll out in Python."
+        )
+    if held.bounds == "error":
+        raise ConfigError(
+            "constraints.bounds = error cannot be exported, as a program cannot raise errors: export with --free, or"
+            " train with stop or reflect."
+        )

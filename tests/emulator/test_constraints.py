@@ -1,0 +1,225 @@
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import box, cloud
+
+from nmpm.decoders import Absolute, Residual
+from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, equal_shares, lowest_potential
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import rollout, unroll
+from nmpm.errors import ConfigError, DataError
+from nmpm.processors import Pointwise, UNet
+from nmpm.zoo import Zoo
+
+
+def emulator_of(scene, processor=None, decoder=None, cells=16, frames=4, **constraints) -> Emulator:
+    torch.manual_seed(0)
+    recipe = processor or Pointwise(hidden=(8,))
+    return Emulator(
+        scene, cells, frames, processor=recipe, decoder=decoder, constraints=Constraints(**constraints)
+    ).eval()
+
+
+def shares(count: int) -> torch.Tensor:
+    return torch.full((1, count, 1), 1 / count, dtype=torch.float64)
+
+
+def test_energy_of_a_particle_that_falls_is_kept():
+    gravity = torch.tensor([[[0.0, -0.01]]], dtype=torch.float64)
+    times = torch.arange(5, dtype=torch.float64)
+    # Exact ballistics: the speed at a time, and the place.
+    velocity = torch.stack([torch.full((5,), 0.3), 0.2 - 0.01 * times], dim=-1)[None, :, None]
+    cells = torch.stack([0.3 * times, 0.2 * times - 0.005 * times**2], dim=-1)[None, :, None]
+    values = energy(cells, velocity, gravity, shares(1))
+    torch.testing.assert_close(values, values[:, :1].expand_as(values), rtol=1e-12, atol=0)
+    assert values[0, 0].item() == pytest.approx((0.3**2 + 0.2**2) / 2)
+
+
+@given(seed=st.integers(0, 10_000), fall=st.floats(-0.1, 0.1), allowed=st.floats(0, 2))
+@settings(max_examples=100, deadline=None)
+def test_steps_stay_within_the_budget_and_are_left_alone_below_it(seed, fall, allowed):
+    generator = torch.Generator().manual_seed(seed)
+    cells = 10 * torch.rand(1, 7, 2, generator=generator, dtype=torch.float64)
+    step = torch.randn(1, 7, 2, generator=generator, dtype=torch.float64)
+    gravity, share = torch.tensor([[[0.3 * fall, fall]]], dtype=torch.float64), shares(7)
+    budget = energy(cells, torch.zeros_like(cells), gravity, share) + allowed
+    held = step * affordable(cells, step, gravity, share, budget)
+    proposed = energy(cells + step, step, gravity, share)
+    assert (energy(cells + held, held, gravity, share) <= budget + 1e-9).all()
+    if (proposed <= budget).all():
+        torch.testing.assert_close(held, step)
+
+
+def test_what_moves_less_than_the_rest_speed_on_average_is_at_rest():
+    start = torch.zeros(1, 3, 2)
+    ends = torch.tensor([[0.0, 0.0], [0.0, 0.39], [0.41, 0.0]])
+    path = torch.linspace(0.25, 1, 4)[None, :, None, None] * ends
+    assert at_rest(start, path, 0.1, torch.zeros(1, 1, 2)).tolist() == [[True, True, False]]
+
+
+@pytest.mark.parametrize("frames", [2, 3, 8])
+def test_what_falls_freely_is_never_at_rest(frames):
+    gravity = torch.tensor([[[0.0, -0.004]]])
+    times = torch.arange(1.0, frames + 1)
+    top = -(frames + 1) / 2 * gravity  # the velocity with which it ends where it starts
+    thrown = times.view(1, -1, 1, 1) * top.unsqueeze(1) + (times * (times + 1) / 2).view(1, -1, 1, 1) * gravity
+    path = torch.cat([thrown, 0 * thrown], dim=2)
+    start = torch.zeros(1, 2, 2)
+    assert at_rest(start, path, 0.01, gravity).tolist() == [[False, True]]
+    assert at_rest(start, path, 0.01, 0 * gravity).tolist() == [[True, True]]
+
+
+def test_a_block_thrown_straight_up_does_not_hang_in_the_air():
+    scene = box()
+    emulator = emulator_of(scene, rest_speed=0.05)
+    emulator.output_scale.zero_()  # free fall
+    particles = dataclasses.replace(cloud(scene, speed=0.0), velocity=torch.tensor([0.0, 0.0012]).expand(1, 30, 2))
+    held = rollout(emulator, particles, 48)
+    emulator.constraints = Constraints()
+    assert torch.equal(held, rollout(emulator, particles, 48))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rollout_of_an_untrained_network_gains_no_energy(seed):
+    scene = box()
+    particles = cloud(scene, seed=seed, batch=2)
+    wild, tame = emulator_of(scene), emulator_of(scene, energy=True)
+    for emulator in (wild, tame):
+        emulator.output_scale.mul_(3.0)
+    start = wild.in_cells(particles)
+
+    def gain(emulator: Emulator) -> float:
+        path = emulator.grid.to_cells(rollout(emulator, particles, 40))
+        steps = path.diff(dim=1, prepend=start[0].unsqueeze(1))
+        share = torch.full((2, 30, 1), 1 / 30)
+        return (energy(path, steps, start[2], share) - energy(*start, share).unsqueeze(1)).max().item()
+
+    assert gain(wild) > 1e-2
+    assert gain(tame) < 1e-5
+
+
+def test_energy_is_counted_from_the_start_of_the_rollout_not_of_a_bundle():
+    scene = box()
+    emulator = emulator_of(scene, energy=True)
+    particles = cloud(scene)
+    budget = emulator.budget(particles)
+    bundles = list(unroll(emulator, particles, 3))
+    assert budget is not None
+    torch.testing.assert_close(emulator.budget(particles), budget)
+    assert len(bundles) == 3
+
+
+def test_what_rests_stays_to_the_bit():
+    scene = box(gravity=(0.0, 0.0))
+    particles = cloud(scene, speed=0.0)
+    restless, resting = emulator_of(scene), emulator_of(scene, rest_speed=0.05)
+    for emulator in (restless, resting):
+        emulator.output_scale.fill_(0.01)
+    assert not torch.equal(rollout(restless, particles, 8)[:, -1], particles.position)
+    predicted = rollout(resting, particles, 8)
+    torch.testing.assert_close(predicted, particles.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-6)
+
+
+def test_what_moves_is_left_alone_to_the_bit():
+    scene = box()
+    particles = cloud(scene, speed=0.02)
+    free = emulator_of(scene, processor=UNet(width=4, depth=1))
+    held = emulator_of(scene, processor=UNet(width=4, depth=1), rest_speed=1e-9)
+    assert torch.equal(rollout(free, particles, 8), rollout(held, particles, 8))
+
+
+def test_nothing_is_held_in_training():
+    scene = box()
+    particles = cloud(scene)
+    free, held = emulator_of(scene), emulator_of(scene, energy=True, rest_speed=1.0)
+    results = [next(unroll(e.train(), particles, 1)).position for e in (free, held)]
+    assert torch.equal(*results)
+    assert held.budget(particles) is None
+
+
+def test_energy_needs_known_gravity():
+    with pytest.raises(ConfigError, match="gravity is known"):
+        emulator_of(box(gravity=None), energy=True)
+
+
+def test_a_negative_rest_speed_is_refused():
+    with pytest.raises(ConfigError, match="rest_speed = -1"):
+        Constraints(rest_speed=-1)
+
+
+def test_a_network_is_shown_no_more_than_the_calibration_saw():
+    scene = box(gravity=(0.0, 0.0))
+    emulator = emulator_of(scene, decoder=Absolute())
+    emulator.input_high.fill_(0.5)
+    emulator.input_low.fill_(-0.5)
+    crowded = cloud(scene, count=400, speed=0.0)
+    centre = torch.full_like(crowded.position, 0.505)
+    packed = crowded.moved(centre, crowded.velocity)
+    denser = dataclasses.replace(
+        packed, **{f.name: torch.cat([getattr(packed, f.name)] * 2, dim=1) for f in dataclasses.fields(packed)
+                   if f.name in ("position", "velocity", "material", "mask")},
+    )  # fmt: skip
+    one, two = rollout(emulator, packed, 4)[:, -1, 0], rollout(emulator, denser, 4)[:, -1, 0]
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("where", ["processor", "output_scale"])
+def test_a_weight_or_statistic_that_is_no_number_is_named(where):
+    scene = box()
+    emulator = emulator_of(scene)
+    values = next(emulator.processor.parameters()).data if where == "processor" else emulator.output_scale
+    values[(0,) * values.dim()] = float("nan")
+    with pytest.raises(DataError, match=f"The emulator's {where}.* not finite"):
+        rollout(emulator, cloud(scene), 1)
+
+
+def test_constraints_travel_with_the_model():
+    emulator = emulator_of(box(), energy=True, rest_speed=0.02)
+    assert emulator.over(box()).constraints == emulator.constraints
+    assert Zoo.load("goop").emulator.constraints == Constraints(energy=True, rest_speed=0.01)
+
+
+def test_float64_is_computed_in_float64():
+    scene = box()
+    particles = cloud(scene)
+    doubled = particles.double()
+    single, double = emulator_of(scene, decoder=Residual()), emulator_of(scene, decoder=Residual()).double()
+    exact = rollout(double, doubled, 8)
+    assert exact.dtype == torch.float64
+    apart = (rollout(single, particles, 8) - exact).abs().max().item()
+    assert 0 < apart < 1e-5
+    finer = rollout(double, dataclasses.replace(doubled, position=doubled.position + 1e-12), 8)
+    assert 0 < (finer - exact).abs().max().item() < 1e-10  # lost in float32
+
+
+def test_energies_of_cells_that_are_not_square_are_counted_in_lengths():
+    scene = box()
+    square, oblong = emulator_of(scene, cells=16, energy=True), emulator_of(scene, cells=(16, 8), energy=True)
+    particles = cloud(scene)
+    fall = particles.moved(particles.position - torch.tensor([0.0, 0.1]), particles.velocity)
+    along = particles.moved(particles.position - torch.tensor([0.1, 0.0]), particles.velocity)
+    gains = [(e.budget(fall) - e.budget(particles)).item() for e in (square, oblong)]
+    assert gains[0] == pytest.approx(gains[1], rel=1e-4)  # both in units of the first axis' cells
+    assert oblong.budget(along).item() == pytest.approx(oblong.budget(particles).item(), rel=1e-4)
+
+
+def test_shares_are_of_real_particles():
+    mask = torch.tensor([[True, True, False], [True, True, True], [False, False, False]])
+    expected = torch.tensor([[0.5, 0.5, 0.0], [1 / 3] * 3, [0.0] * 3]).unsqueeze(-1)
+    torch.testing.assert_close(equal_shares(mask, torch.float32), expected)
+
+
+@pytest.mark.parametrize("bounds", [((0.1, 0.9),), ((0.1, 0.9), (-0.2, 0.4)), ((0.1, 0.9), (-0.2, 0.4), (0.0, 2.0))])
+def test_nowhere_within_the_bounds_is_the_potential_lower(bounds):
+    generator = torch.Generator().manual_seed(0)
+    scene = box(dim=len(bounds), bounds=bounds, domain=bounds)
+    low, high = torch.tensor(bounds).T
+    gravity = torch.randn(4, scene.dim, generator=generator)
+    places = low + (high - low) * torch.rand(1000, scene.dim, generator=generator)
+    lowest = lowest_potential(scene, gravity)
+    assert (-(gravity @ places.T) >= lowest.unsqueeze(1)).all()
+    corner = torch.where(gravity > 0, high, low)
+    torch.testing.assert_close(lowest, -(gravity * corner).sum(-1))

@@ -1,0 +1,120 @@
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import box, cloud
+
+from nmpm.data.initial_states import lattice
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.contact import SURFACE, Contact
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import rollout
+from nmpm.grid import Grid
+from nmpm.processors import Pointwise
+
+GRID = Grid((20, 20), (0.0, 0.0), (1.0, 1.0), (False, False))
+
+
+def floor(top: int = 10, thick: int = 3) -> Contact:
+    """A slab whose upper face is at y = top."""
+    solid = torch.zeros(1, 1, 20, 20)
+    solid[..., top - thick : top] = 1.0
+    return Contact(solid, GRID)
+
+
+def straight(start: list[float], step: list[float], frames: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
+    begin = torch.tensor([[start]])
+    return begin, begin.unsqueeze(1) + torch.arange(1, frames + 1)[:, None, None] * torch.tensor(step)
+
+
+def test_a_path_clear_of_obstacles_is_the_same_tensor():
+    begin, path = straight([5.0, 15.0], [0.3, -0.2])
+    assert floor().hold(begin, path) is path
+
+
+def test_a_fall_onto_the_floor_ends_at_its_surface():
+    begin, path = straight([5.0, 12.0], [0.0, -0.7])
+    held = floor().hold(begin, path)
+    # Interpolated between the nodes at 9.5 (solid) and 10.5 (free): the surface is at 10.5 - SURFACE.
+    assert held[0, -1, 0, 1].item() == pytest.approx(10.5 - SURFACE, abs=0.5)
+    assert held[0, -1, 0, 1] >= 10.5 - SURFACE - 1e-5
+    assert held[0, :, 0, 0].tolist() == pytest.approx([5.0] * 4)
+    assert torch.equal(held[:, :2], path[:, :2])  # until it touches
+
+
+def test_what_comes_at_a_slant_slides_along():
+    begin, path = straight([5.0, 10.6], [0.5, -0.5])
+    held = floor().hold(begin, path)
+    assert held[0, -1, 0, 0].item() == pytest.approx(7.0, abs=0.3)
+    assert held[0, :, 0, 1].min() >= 10.5 - SURFACE - 1e-5
+
+
+def test_what_is_inside_is_pushed_out():
+    begin, path = straight([5.0, 9.6], [0.0, 0.0])
+    held = floor().hold(begin, path)
+    assert held[0, -1, 0, 1].item() > 10.5 - SURFACE
+    assert (held[0, :, 0, 1].diff() >= 0).all()
+
+
+@given(
+    speed=st.floats(0.01, 12), angle=st.floats(-3.1, 3.1), x=st.floats(1, 19), y=st.floats(10.6, 19),
+    offset=st.floats(0, 1),
+)  # fmt: skip
+@settings(max_examples=200, deadline=None)
+def test_nobody_gets_through_one_cell_however_it_lies_and_however_fast(speed, angle, x, y, offset):
+    solid = torch.zeros(1, 1, 20, 20)
+    solid[..., 8], solid[..., 9] = 1 - offset, offset  # a wall of one cell, its lower face at 8 + offset
+    direction = torch.tensor([angle]).cos().item(), torch.tensor([angle]).sin().item()
+    begin, path = straight([x, y], [speed * direction[0], speed * direction[1]], frames=8)
+    held = Contact(solid, GRID).hold(begin, path)
+    assert held.isfinite().all()
+    assert (held[..., 1] > 8 + offset).all()
+
+
+def test_scenes_of_a_batch_have_their_own_obstacles():
+    solid = torch.cat([floor().solid, torch.zeros(1, 1, 20, 20)])
+    begin, path = straight([5.0, 12.0], [0.0, -0.7])
+    held = Contact(solid, GRID).hold(begin.repeat(2, 1, 1), path.repeat(2, 1, 1, 1))
+    assert torch.equal(held[1], path[0])
+    torch.testing.assert_close(held[:1], floor().hold(begin, path))
+
+
+def test_in_three_dimensions():
+    grid = Grid((8, 8, 8), (0.0,) * 3, (1.0,) * 3, (False,) * 3)
+    solid = torch.zeros(1, 1, 8, 8, 8)
+    solid[:, :, :, :4] = 1.0
+    begin, path = straight([4.0, 6.0, 4.0], [0.1, -1.3, 0.2])
+    held = Contact(solid, grid).hold(begin, path)
+    assert held[0, :, 0, 1].min() >= 4.5 - SURFACE - 1e-5
+    assert held[0, -1, 0, 2] > 4.3
+
+
+def falling(solids: bool) -> torch.Tensor:
+    """Lowest particle, after a block fell onto a slab, under a network that knows nothing."""
+    scene = box(obstacles=True, particle_volume=0.01**2)
+    torch.manual_seed(0)
+    emulator = Emulator(scene, 32, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=solids)).eval()
+    emulator.output_scale.fill_(1e-3)
+    particles = cloud(scene)
+    slab = lattice(((0.08, 0.92), (0.1, 0.2)), 0.01)[None]
+    state = dataclasses.replace(particles, obstacle=slab, obstacle_mask=torch.ones(1, slab.shape[1], dtype=torch.bool))
+    return rollout(emulator, state, 200)[..., 1].min()
+
+
+def test_a_rollout_does_not_sink_into_an_obstacle():
+    assert falling(solids=False) < 0.12
+    assert falling(solids=True) > 0.19
+
+
+def test_a_model_without_obstacles_pays_nothing_and_is_the_same():
+    scene = box()
+    particles = cloud(scene)
+    torch.manual_seed(0)
+    with_, without = (
+        Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=on)).eval()
+        for on in (True, False)
+    )
+    without.load_state_dict(with_.state_dict())
+    assert torch.equal(rollout(with_, particles, 8), rollout(without, particles, 8))

@@ -1,0 +1,323 @@
+import dataclasses
+
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
+from nmpm.emulator.calibration import calibrate
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rasterise import grid_state
+from nmpm.emulator.rollouts import rollout, stream, unroll
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles, Window
+from nmpm.processors import FNO, Pointwise, UNet
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic
+
+SMALL = UNet(width=4, depth=1, perceptron=(4,))
+TRANSFERS = (Nearest(), Linear(), Quadratic(), Affine())
+DECODERS = (Absolute(), Residual(), Flip(), Blend(), Acceleration())
+CASES = [(t, d) for t in TRANSFERS for d in DECODERS]
+
+
+def small(scene, transfer=None, decoder=None, processor=SMALL, frames=3, cells=16):
+    torch.manual_seed(0)
+    return Emulator(scene, cells, frames, transfer, processor, decoder).eval()
+
+
+def silenced(emulator):
+    """The emulator with a network that always says zero."""
+    for parameter in emulator.processor.parameters():
+        torch.nn.init.zeros_(parameter)
+    return emulator
+
+
+@pytest.mark.parametrize(("transfer", "decoder"), CASES)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_every_combination_predicts_finite_bundles_within_the_walls(transfer, decoder, dim):
+    scene = box(dim, ("water", "sand"))
+    particles = cloud(scene, batch=2, speed=0.05)
+    emulator = small(scene, transfer, decoder, cells=8)
+    bundle = emulator(particles, emulator.solid(particles))
+    assert bundle.position.shape == (2, 3, 30, dim)
+    assert bundle.velocity.shape == (2, 30, dim)
+    assert bundle.position.min() >= 0.1 - 1e-6
+    assert bundle.position.max() <= 0.9 + 1e-6
+    torch.testing.assert_close(bundle.velocity, bundle.position[:, -1] - bundle.position[:, -2], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("transfer", [Linear(), Quadratic(), Affine()])
+@pytest.mark.parametrize("decoder", [Residual(), Flip(), Blend(), Acceleration()])
+def test_free_fall_of_a_block_is_exact_where_gravity_is_known(transfer, decoder):
+    scene = box()
+    particles = cloud(scene)
+    particles = particles.moved(particles.position, torch.zeros_like(particles.velocity) + 1e-3)
+    path = rollout(silenced(small(scene, transfer, decoder, frames=4)), particles, 20)
+    steps = torch.arange(1, 21).view(1, -1, 1, 1)
+    exact = particles.position[:, None] + 1e-3 * steps + particles.gravity[:, None, None] * steps * (steps + 1) / 2
+    torch.testing.assert_close(path, exact, atol=6e-6, rtol=0)
+
+
+def test_what_the_decoders_hold():
+    scene = box(gravity=None)
+    particles = cloud(scene, speed=0.003)
+    still = silenced(small(scene, decoder=Absolute()))
+    assert torch.allclose(rollout(still, particles, 3), particles.position[:, None].expand(-1, 3, -1, -1), atol=1e-6)
+    own = silenced(small(scene, decoder=Flip()))
+    expected = particles.position + 3 * particles.velocity
+    assert torch.allclose(rollout(own, particles, 3)[:, -1], expected, atol=1e-6)
+    smoothed = rollout(silenced(small(scene, decoder=Residual())), particles, 3)[:, -1] - particles.position
+    assert smoothed.var() < (3 * particles.velocity).var()
+
+
+@pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic()])
+def test_padding_changes_nothing_to_the_bit(transfer):
+    scene = box()
+    particles = cloud(scene, count=20)
+    padded = Particles(
+        position=torch.cat([particles.position, torch.full((1, 7, 2), 0.5)], 1),
+        velocity=torch.cat([particles.velocity, torch.full((1, 7, 2), 0.3)], 1),
+        material=torch.cat([particles.material, torch.zeros(1, 7, dtype=torch.long)], 1),
+        mask=torch.cat([particles.mask, torch.zeros(1, 7, dtype=torch.bool)], 1),
+        obstacle=torch.full((1, 3, 2), 0.5),
+        obstacle_mask=torch.zeros(1, 3, dtype=torch.bool),
+        gravity=particles.gravity,
+    )
+    emulator = small(scene, transfer)
+    assert torch.equal(rollout(emulator, padded, 9)[:, :, :20], rollout(emulator, particles, 9))
+
+
+def test_order_of_particles_only_reorders_the_prediction():
+    scene = box(materials=("water", "sand"))
+    particles = cloud(scene)
+    order = torch.randperm(30)
+    shuffled = dataclasses.replace(
+        particles,
+        position=particles.position[:, order],
+        velocity=particles.velocity[:, order],
+        material=particles.material[:, order],
+    )
+    emulator = small(scene)
+    torch.testing.assert_close(
+        rollout(emulator, shuffled, 6), rollout(emulator, particles, 6)[:, :, order], atol=1e-5, rtol=0
+    )
+
+
+@pytest.mark.parametrize(("factor", "offset"), [(1000.0, 0.0), (1.0, 50.0), (0.01, -3.0)])
+def test_neither_origin_nor_unit_of_length_matters(factor, offset):
+    scene = box(gravity=None)
+    moved = dataclasses.replace(
+        scene,
+        bounds=tuple((a * factor + offset, b * factor + offset) for a, b in scene.bounds),
+        domain=tuple((a * factor + offset, b * factor + offset) for a, b in scene.domain),
+        particle_volume=scene.particle_volume * factor**2,
+    )
+    particles = cloud(scene)
+    there = particles.moved(particles.position.double() * factor + offset, particles.velocity.double() * factor)
+    here = rollout(small(scene), particles, 6)
+    back = (rollout(small(moved), there, 6).double() - offset) / factor
+    torch.testing.assert_close(back.float(), here, atol=2e-5 * max(1, abs(offset)), rtol=0)
+
+
+def test_float64_positions_far_from_the_origin_stay_precise():
+    scene = box(gravity=None)
+    far = dataclasses.replace(
+        scene,
+        bounds=tuple((a + 1e8, b + 1e8) for a, b in scene.bounds),
+        domain=tuple((a + 1e8, b + 1e8) for a, b in scene.domain),
+    )
+    particles = cloud(scene)
+    there = particles.moved(particles.position.double() + 1e8, particles.velocity.double())
+    back = rollout(small(far), there, 6) - 1e8
+    torch.testing.assert_close(back.float(), rollout(small(scene), particles, 6), atol=1e-5, rtol=0)
+
+
+def test_each_material_follows_its_own_velocity_field():
+    scene = box(materials=("water", "sand"), gravity=None)
+    particles = cloud(scene)
+    emulator = silenced(small(scene, processor=Pointwise(), frames=1, decoder=Absolute()))
+    final = emulator.processor.perceptron[-1]
+    with torch.no_grad():
+        final.bias.copy_(torch.tensor([1.0, 0.0, 0.0, 2.0]))  # water to the right, sand upwards, in cells per frame
+    moved = emulator.grid.to_cell_displacement(rollout(emulator, particles, 1)[:, 0] - particles.position)
+    expected = torch.tensor([[1.0, 0.0], [0.0, 2.0]])[particles.material]
+    torch.testing.assert_close(moved, expected, atol=1e-4, rtol=0)
+
+
+def test_obstacles_reach_the_network_and_only_through_the_solid_channel():
+    scene = box(obstacles=True)
+    particles = cloud(scene, statics=12)
+    emulator = small(scene)
+    solid = emulator.solid(particles)
+    assert solid.shape == (1, 1, 16, 16)
+    assert 0 <= solid.min() <= solid.max() <= 1
+    without = dataclasses.replace(particles, obstacle_mask=torch.zeros_like(particles.obstacle_mask))
+    assert solid.sum() > emulator.solid(without).sum()
+    assert not torch.equal(rollout(emulator, particles, 3), rollout(emulator, without, 3))
+
+
+def test_walls_fill_the_share_of_the_domain_beyond_the_bounds():
+    scene = box()
+    emulator = small(scene, cells=64)
+    solid = emulator.solid(cloud(scene))
+    assert solid.mean().item() == pytest.approx(1 - (0.8 / 0.84) ** 2, rel=1e-5)
+
+
+def test_periodic_axes_wrap_and_walls_do_not():
+    scene = box(boundary=("periodic", "wall"), bounds=((0.0, 1.0), (0.1, 0.9)), domain=((0.0, 1.0), (0.08, 0.92)))
+    particles = cloud(scene)
+    elsewhere = particles.moved(particles.position + torch.tensor([2.0, 0.0]), particles.velocity)
+    emulator = small(scene)
+    torch.testing.assert_close(
+        rollout(emulator, elsewhere, 6) - torch.tensor([2.0, 0.0]), rollout(emulator, particles, 6), atol=1e-5, rtol=0
+    )
+
+
+def test_transfers_stay_in_float32_under_autocast():
+    scene = box()
+    particles = cloud(scene)
+    emulator = silenced(small(scene))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        low = rollout(emulator, particles, 6)
+    assert low.dtype == torch.float32
+    assert torch.equal(low, rollout(emulator, particles, 6))
+
+
+def test_gradients_through_several_bundles_are_finite_and_reach_the_first_state():
+    scene = box()
+    particles = cloud(scene)
+    position = particles.position.clone().requires_grad_()
+    emulator = small(scene)
+    last = list(unroll(emulator, particles.moved(position, particles.velocity), 3))[-1]
+    last.position.square().sum().backward()
+    assert position.grad.isfinite().all()
+    assert position.grad.abs().sum() > 0
+    assert all(p.grad.isfinite().all() for p in emulator.processor.parameters())
+
+
+def test_calibration_measures_what_the_network_has_to_give():
+    scene = box(gravity=None)
+    particles = cloud(scene, count=50, batch=4)
+    generator = torch.Generator().manual_seed(1)
+    steps = 0.002 + 0.001 * torch.randn(4, 6, 50, 2, generator=generator)
+    frames = particles.position[:, None] + steps.cumsum(1)
+    rest = (particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
+    window = Window(frames, *rest)
+    emulator = small(scene, decoder=Absolute())
+    calibrate(emulator, [window])
+    expected = emulator.grid.to_cell_displacement(steps[:, 2:]).square().mean((0, 1, 2)).sqrt()
+    torch.testing.assert_close(emulator.output_scale.squeeze().mean(0), expected, rtol=0.05, atol=0)
+    assert emulator.calibrated
+    start = window.initial
+    cells, velocity, _ = emulator.in_cells(start)
+    state = grid_state(scene, emulator.grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
+    assert (state > emulator.input_low).all()
+    assert (state < emulator.input_high).all()
+    normalised = (state - emulator.input_mean) / emulator.input_std
+    assert normalised.mean((0, 2, 3)).abs().max() < 1e-4
+    with pytest.raises(ValueError, match="at least 5 frames"):
+        calibrate(emulator, [dataclasses.replace(window, frames=frames[:, :4])])
+
+
+def test_rollouts_are_cut_to_the_frames_asked_for():
+    scene = box()
+    particles, emulator = cloud(scene), small(scene, frames=3)
+    whole = rollout(emulator, particles, 9)
+    for frames in (0, 1, 3, 7):
+        assert torch.equal(rollout(emulator, particles, frames), whole[:, :frames])
+    assert [len(part[0]) for part in stream(emulator, particles, 7)] == [3, 3, 1]
+    with pytest.raises(ValueError, match="not -1"):
+        rollout(emulator, particles, -1)
+
+
+def test_streaming_leaves_the_gradient_mode_alone():
+    scene = box()
+    for _ in stream(small(scene), cloud(scene), 6):
+        assert torch.is_grad_enabled()
+
+
+def test_scenes_without_particles_are_fine():
+    scene = box()
+    emulator = small(scene)
+    assert rollout(emulator, cloud(scene, count=0), 3).shape == (1, 3, 0, 2)
+    assert rollout(emulator, cloud(scene, count=1), 3).isfinite().all()
+
+
+WIDE = {"bounds": ((0.1, 1.74), (0.1, 0.9)), "domain": ((0.08, 1.76), (0.08, 0.92))}
+
+
+def test_over_the_same_scene_it_is_the_same():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    torch.testing.assert_close(rollout(emulator.over(scene), particles, 6), rollout(emulator, particles, 6))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_over_a_wider_box_what_is_far_from_the_walls_moves_as_before(dim):
+    scene = box(dim)
+    wide = box(dim, **{key: (*value, *value[1:] * (dim - 2)) for key, value in WIDE.items()})
+    emulator, particles = small(scene, processor=Pointwise(hidden=(4,))), cloud(scene)
+    other = emulator.over(wide)
+    assert other.grid.shape == (32,) + (16,) * (dim - 1)
+    torch.testing.assert_close(rollout(other, particles, 5), rollout(emulator, particles, 5), atol=1e-6, rtol=0)
+    shifted = particles.moved(particles.position + torch.tensor([0.84] + [0.0] * (dim - 1)), particles.velocity)
+    moved = rollout(other, shifted, 5) - torch.tensor([0.84] + [0.0] * (dim - 1))
+    torch.testing.assert_close(moved, rollout(emulator, particles, 5), atol=1e-5, rtol=0)
+
+
+def test_over_finer_particles_of_the_same_material_it_moves_as_before():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    finer = emulator.over(box(particle_volume=scene.particle_volume / 2))
+    names = ("position", "velocity", "material", "mask")
+    doubled = dataclasses.replace(particles, **{n: torch.cat([getattr(particles, n)] * 2, dim=1) for n in names})
+    expected = torch.cat([rollout(emulator, particles, 6)] * 2, dim=2)
+    torch.testing.assert_close(rollout(finer, doubled, 6), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dt": 0.01}, "made for dt = 0.0025; the other scene has 0.01"),
+        ({"materials": ("sand",)}, "input_channels"),
+        ({"domain": ((0.08, 0.95), (0.08, 0.92))}, "whole numbers are needed"),
+    ],
+)
+def test_over_another_kind_of_scene_is_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        small(box()).over(box(**changes))
+
+
+def in_sevens(count, device):
+    return [slice(first, first + 7) for first in range(0, count, 7)]
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_particles_a_piece_at_a_time_move_as_all_at_once(transfer, monkeypatch):
+    scene = box(materials=("water", "sand"))
+    emulator, particles = small(scene, transfer), cloud(scene)
+    with torch.no_grad():
+        whole = emulator(particles, emulator.solid(particles))
+        for module in ("nmpm.transfer.base", "nmpm.emulator.advection"):
+            monkeypatch.setattr(f"{module}.pieces", in_sevens)
+        cut = emulator(particles, emulator.solid(particles))
+    torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)
+    torch.testing.assert_close(cut.velocity, whole.velocity, rtol=0, atol=1e-6)
+
+
+def test_a_network_in_bfloat16_moves_particles_in_float32():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    quick = emulator.with_network(torch.bfloat16)
+    solid = emulator.solid(particles)
+    with torch.no_grad():
+        exact, rough = emulator(particles, solid), quick(particles, solid)
+    assert quick.network_precision == torch.bfloat16
+    assert emulator.network_precision == rough.position.dtype == torch.float32
+    assert 0 < (exact.position - rough.position).abs().max() < 1e-3
+
+
+def test_complex_weights_have_no_other_precision():
+    emulator = small(box(), processor=FNO(modes=4, width=4, layers=1))
+    with pytest.raises(ConfigError, match=r"FNO has complex weights.*autocast"):
+        emulator.with_network(torch.bfloat16)

@@ -1,0 +1,84 @@
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.evaluation.baselines import free_fall, still
+from nmpm.evaluation.metrics import EarthMover, RolloutError, earth_mover
+from nmpm.grid import Grid
+from nmpm.training.losses import position_error
+
+
+def test_mse_at_h_is_the_mean_up_to_h_over_particles_and_dimensions():
+    target = torch.zeros(2, 40, 5, 2)
+    predicted = torch.arange(1, 41).view(1, -1, 1, 1).expand(2, 40, 5, 2).sqrt()  # squared error at frame i is i
+    metric = RolloutError((1, 8, 32, 100))
+    metric.update(predicted, target, torch.ones(2, 5, dtype=torch.bool))
+    found = {name: value.item() for name, value in metric.compute().items()}
+    assert found == pytest.approx({"mse@1": 1.0, "mse@8": 4.5, "mse@32": 16.5, "mse": 20.5}, rel=1e-6)
+
+
+def test_padding_does_not_count_and_trajectories_of_any_length_do():
+    metric = RolloutError((2,))
+    mask = torch.tensor([[True, True, False]])
+    predicted = torch.zeros(1, 4, 3, 2)
+    predicted[:, :, 2] = 1e6
+    metric.update(predicted, torch.zeros_like(predicted), mask)
+    metric.update(torch.ones(1, 6, 1, 2), torch.zeros(1, 6, 1, 2), torch.ones(1, 1, dtype=torch.bool))
+    assert [len(curve) for curve in metric.curves()] == [4, 6]
+    assert [row["mse"] for row in metric.per_trajectory()] == [0.0, 1.0]
+    assert metric.compute()["mse"] == 0.5
+
+
+def test_earth_mover_of_a_shift_is_its_length_and_ignores_order():
+    cloud_ = torch.rand(1, 30, 2)
+    moved = cloud_[:, torch.randperm(30)] + torch.tensor([0.3, 0.4])
+    assert earth_mover(cloud_, cloud_[:, torch.randperm(30)]) == pytest.approx(0, abs=1e-12)
+    assert earth_mover(cloud_, moved) == pytest.approx(0.5, rel=1e-6)
+
+
+def test_earth_mover_keeps_materials_apart():
+    metric = EarthMover(every=1)
+    ours = torch.tensor([[[[0.0, 0.0], [1.0, 0.0]]]])
+    theirs = ours.flip(2)
+    everyone = torch.ones(1, 2, dtype=torch.bool)
+    metric.update(ours, theirs, everyone, torch.tensor([[0, 0]]))
+    assert metric.compute()["emd"] == 0
+    metric.reset()
+    metric.update(ours, theirs, everyone, torch.tensor([[0, 1]]))
+    assert metric.compute()["emd"] == 1
+
+
+def test_loss_is_in_cells_whatever_the_unit_of_length():
+    for factor in (1.0, 1e3):
+        grid = Grid((10, 20), (0.0, 0.0), (0.1 * factor, 0.2 * factor), (False, False))
+        target = torch.rand(2, 3, 4, 2) * factor
+        moved = target + torch.tensor([0.1, 0.4]) * factor
+        loss = position_error(moved, target, torch.ones(2, 4, dtype=torch.bool), grid)
+        assert loss.item() == pytest.approx((1 + 4) / 2, rel=1e-3)
+
+
+def test_loss_ignores_padding_and_is_no_number_for_an_empty_batch():
+    grid = Grid((10, 10), (0.0, 0.0), (0.1, 0.1), (False, False))
+    target, mask = torch.zeros(1, 2, 3, 2), torch.tensor([[True, True, False]])
+    predicted = target.clone()
+    predicted[..., 2, :] = 7
+    assert position_error(predicted, target, mask, grid) == 0
+    assert position_error(predicted, target, torch.zeros_like(mask), grid).isnan()
+
+
+def test_free_fall_is_the_parabola_and_stops_at_the_first_wall():
+    scene = box()
+    particles = cloud(scene, speed=0.0)
+    path = free_fall(scene, particles, 400)
+    early = torch.arange(1, 11).view(1, -1, 1)
+    fallen = particles.position[:, None, :, 1] + particles.gravity[0, 1] * early * (early + 1) / 2
+    torch.testing.assert_close(path[:, :10, :, 1], fallen, atol=1e-6, rtol=0)
+    torch.testing.assert_close(path[:, -1, :, 1], torch.full((1, 30), 0.1))
+    thrown = particles.moved(particles.position, torch.tensor([0.0, 0.02]).expand_as(particles.position))
+    assert (free_fall(scene, thrown, 400)[:, -1, :, 1] == torch.tensor(0.9)).all()
+
+
+def test_still_is_still():
+    scene = box()
+    particles = cloud(scene)
+    assert (still(particles, 7) == particles.position[:, None]).all()

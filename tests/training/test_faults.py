@@ -1,0 +1,178 @@
+"""Things that go wrong from outside, by really doing them."""
+
+import hashlib
+import json
+import os
+import pickle
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from nmpm._support.shipped import shipped
+from nmpm.cli import main
+from nmpm.errors import DataError, ZooError
+from nmpm.training.checkpoints import load_module
+from nmpm.zoo import Zoo
+
+FIT = [
+    *("fit", "--config", "waterdrop.yaml", "--model.unroll", "1", "--model.processor.width", "4"),
+    *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--trainer.precision", "32-true"),
+    *("--data.batch_size", "2", "--resume.every_n_train_steps", "1", "--trainer.default_root_dir", "run"),
+]
+
+
+class Payload:
+    def __reduce__(self):
+        return (os.system, ("touch ran",))
+
+
+@pytest.fixture
+def data(make_dataset, tmp_path, monkeypatch) -> list[str]:
+    monkeypatch.chdir(tmp_path)
+    sizes = ((40, 9),) * 2
+    return ["--data.path", str(make_dataset(train=sizes, valid=sizes, test=sizes))]
+
+
+@pytest.fixture
+def run(data) -> list[str]:
+    assert main([*FIT, *data, "--trainer.max_steps", "2", "--trainer.val_check_interval", "2"]) == 0
+    return data
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "payload", "not a checkpoint"])
+@pytest.mark.parametrize("command", ["fit", "test"])
+def test_a_bad_checkpoint_is_refused_by_name_and_not_run(run, command, damage, capsys):
+    path = Path("run/checkpoints/last.ckpt")
+    whole = path.read_bytes()
+    if damage == "payload":
+        torch.save({"state_dict": {}, "trap": Payload()}, path)
+    elif damage == "not a checkpoint":
+        torch.save({"weights": torch.zeros(1)}, path)
+    else:
+        path.write_bytes(whole[: len(whole) // 2] if damage == "truncated" else b"")
+    words = [command, *FIT[1:], *run, "--ckpt_path", str(path)]
+    assert main(words) == 1
+    assert str(path) in capsys.readouterr().err
+    assert not Path("ran").exists()
+    with pytest.raises(DataError, match=r"last\.ckpt"):
+        load_module(path)
+
+
+def test_a_bare_pickle_is_not_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("evil.ckpt").write_bytes(pickle.dumps(Payload()))
+    with pytest.raises(DataError, match=r"evil\.ckpt"):
+        load_module(Path("evil.ckpt"))
+    assert not Path("ran").exists()
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_the_run_and_keeps_the_last_checkpoint(run, tmp_path):
+    """The operating system refuses files as large as a checkpoint, as a full disk does."""
+    path = Path("run/checkpoints/last.ckpt")
+    before = path.read_bytes()
+    limit = len(before) // 2
+    words = [*FIT, *run, "--trainer.max_steps", "6", "--ckpt_path", "last"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "nmpm", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    assert ended.returncode != 0
+    assert path.read_bytes() == before
+    assert main([*words]) == 0
+    assert torch.load(path, weights_only=True)["global_step"] == 6
+
+
+@pytest.mark.slow
+def test_a_lost_process_ends_the_others_and_the_run_goes_on_with_fewer(data):
+    words = [*FIT, *data, "--trainer.max_steps", "100000", "--trainer.max_time", "00:00:05:00"]
+    spread = ["--trainer.devices", "2", "--trainer.strategy", "ddp", "--trainer.val_check_interval", "100000"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    first = subprocess.Popen(
+        [sys.executable, "-m", "nmpm", *words, *spread],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    last = Path("run/checkpoints/last.ckpt")
+    try:
+        wait_for(last.exists, first)
+        (second,) = children(first.pid)
+        os.kill(second, signal.SIGKILL)
+        assert first.wait(timeout=120) != 0
+    finally:
+        if first.poll() is None:
+            os.killpg(first.pid, signal.SIGKILL)
+    steps = torch.load(last, weights_only=True)["global_step"]
+    assert steps > 0
+    more = ["--trainer.max_steps", str(steps + 2), "--trainer.max_time", "null", "--trainer.val_check_interval", "1"]
+    assert main([*FIT, *data, *more, "--ckpt_path", "last"]) == 0
+    assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == steps + 2
+
+
+def wait_for(condition, process, seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, "it ended too soon"
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
+
+
+def children(pid: int) -> list[int]:
+    """Its Python processes that run nmpm."""
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    own = [int(word) for word in text.split()]
+    return [child for child in own if b"nmpm" in Path(f"/proc/{child}/cmdline").read_bytes()]
+
+
+class TestZoo:
+    @pytest.fixture
+    def root(self, tmp_path) -> Path:
+        target = tmp_path / "zoo" / "goop"
+        target.mkdir(parents=True)
+        for path in (shipped("zoo") / "goop").iterdir():
+            (target / path.name).write_bytes(path.read_bytes())
+        return tmp_path / "zoo"
+
+    def weigh(self, root: Path, content: bytes) -> None:
+        """Put other weights into the entry, and their hash into its card, as somebody who means harm would."""
+        (root / "goop" / "model.safetensors").write_bytes(content)
+        card = yaml.safe_load((root / "goop" / "card.yaml").read_text())
+        card["sha256"] = hashlib.sha256(content).hexdigest()
+        (root / "goop" / "card.yaml").write_text(yaml.safe_dump(card))
+
+    @pytest.mark.parametrize("size", [2**40, 2**63, 2**64 - 1])
+    def test_an_oversized_header_is_refused(self, root, size):
+        self.weigh(root, struct.pack("<Q", size) + b"{}")
+        with pytest.raises(ZooError, match="not a file of tensors"):
+            Zoo.load("goop", root)
+
+    def test_offsets_beyond_the_file_are_refused(self, root):
+        header = json.dumps({"w": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}).encode()
+        self.weigh(root, struct.pack("<Q", len(header)) + header)
+        with pytest.raises(ZooError, match="not a file of tensors"):
+            Zoo.load("goop", root)
+
+    def test_a_pickle_in_its_place_is_refused(self, root, monkeypatch, tmp_path):
+        monkeypatch.chdir(tmp_path)
+        self.weigh(root, pickle.dumps(Payload()))
+        with pytest.raises(ZooError, match="not a file of tensors"):
+            Zoo.load("goop", root)
+        assert not Path("ran").exists()
+
+    @pytest.mark.parametrize("name", ["../goop", "/etc", "goop/../../etc", "goop/..", "GOOP", "goop\0", ""])
+    def test_names_that_lead_elsewhere_are_refused(self, root, name):
+        with pytest.raises(ZooError):
+            Zoo.load(name, root)

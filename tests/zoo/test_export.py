@@ -1,0 +1,270 @@
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.cli import main
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.rollouts import unroll
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+from nmpm.processors import GridLayout, GridProcessor, Pointwise, Processor
+from nmpm.scene import Scene
+from nmpm.transfer import Affine, Linear, Nearest
+from nmpm.zoo.export import FORMATS, Network, Solid, Step, description
+
+RUNNER = Path(__file__).parents[2] / "docs" / "run_onnx.py"
+FREE = Constraints(solids=False)
+
+
+def emulator_of(scene: Scene, constraints: Constraints = FREE, processor=None, transfer=None, gain=0.05) -> Emulator:
+    torch.manual_seed(0)
+    recipe = processor or Pointwise(hidden=(8,))
+    cells = 12 if scene.dim == 2 else 6
+    emulator = Emulator(
+        scene, cells, frames=2, transfer=transfer or Linear(), processor=recipe, constraints=constraints
+    ).eval()
+    emulator.output_scale.mul_(gain)
+    return emulator.requires_grad_(False)
+
+
+def inputs_of(step: Step, particles: Particles) -> dict[str, torch.Tensor]:
+    known = {
+        "position": particles.position,
+        "velocity": particles.velocity,
+        "material": particles.material,
+        "gravity": particles.gravity,
+        "solid": step.emulator.solid(particles),
+        "budget": torch.full((particles.position.shape[0],), float("nan")),
+    }
+    return {value.name: known[value.name] for value in step.inputs}
+
+
+def rolled_out(session: onnxruntime.InferenceSession, inputs: dict[str, torch.Tensor], bundles: int) -> torch.Tensor:
+    state = {name: value.numpy() for name, value in inputs.items()}
+    frames = []
+    for _ in range(bundles):
+        positions, *following = session.run(None, state)
+        frames.append(torch.from_numpy(positions))
+        state |= {"position": positions[:, -1]} | dict(zip(("velocity", "budget"), following, strict=False))
+    return torch.cat(frames, dim=1)
+
+
+def apart(emulator: Emulator, one: torch.Tensor, other: torch.Tensor) -> float:
+    """The largest difference of two paths, in cells."""
+    return (one - other).abs().max().item() / min(emulator.grid.spacing)
+
+
+EMULATORS = {
+    "2-D": lambda: emulator_of(box()),
+    "two materials, a periodic axis": lambda: emulator_of(
+        box(materials=("water", "sand"), boundary=("periodic", "wall"), bounds=((0.08, 0.92), (0.1, 0.9))),
+        transfer=Nearest(),
+    ),
+    "3-D, gravity varies, obstacles": lambda: emulator_of(box(dim=3, gravity_varies=True, obstacles=True)),
+    "held": lambda: emulator_of(box(), Constraints(energy=True, rest_speed=0.02), gain=1.0),
+}
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> Callable[[str], tuple[Emulator, Path]]:
+    """The emulator of that name and its step as an ONNX file, written once."""
+    folder = tmp_path_factory.mktemp("exported")
+
+    def export(name: str) -> tuple[Emulator, Path]:
+        path, emulator = folder / f"{name}.onnx", EMULATORS[name]()
+        if not path.exists():
+            part = Step(emulator)
+            FORMATS["onnx"].write(part, description(part, "mine", "made up"), path)
+        return emulator, path
+
+    return export
+
+
+def session_of(path: Path) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+@pytest.mark.parametrize("name", ["2-D", "two materials, a periodic axis", "3-D, gravity varies, obstacles"])
+def test_an_onnx_step_is_the_emulator_for_any_number_of_scenes_and_particles(name, exported):
+    emulator, path = exported(name)
+    scene, step, session = emulator.scene, Step(emulator), session_of(path)
+    for batch, count in ((1, 1), (1, 40), (3, 25)):
+        particles = cloud(scene, count=count, batch=batch, seed=count, statics=9 if scene.obstacles else 0)
+        expected = torch.cat([bundle.position for bundle in unroll(emulator, particles, 10)], dim=1)
+        found = rolled_out(session, inputs_of(step, particles), 10)
+        assert apart(emulator, found[:, :2], expected[:, :2]) < 1e-5
+        assert apart(emulator, found, expected) < 1e-4
+
+
+def test_an_onnx_step_holds_rollouts_to_energy_and_rest_as_the_emulator_does(exported):
+    emulator, path = exported("held")
+    scene, step, session = emulator.scene, Step(emulator), session_of(path)
+    free = emulator_of(scene, gain=1.0)
+    particles = cloud(scene, count=40, batch=2)
+    expected = torch.cat([bundle.position for bundle in unroll(emulator, particles, 10)], dim=1)
+    loose = torch.cat([bundle.position for bundle in unroll(free, particles, 10)], dim=1)
+    found = rolled_out(session, inputs_of(step, particles), 10)
+    assert apart(emulator, expected, loose) > 0.1
+    assert apart(emulator, found, expected) < 1e-4
+    for budget in (-1.0, 1e3):
+        given = inputs_of(step, particles) | {"budget": torch.full((2,), budget)}
+        _, _, kept = session.run(None, {key: value.numpy() for key, value in given.items()})
+        assert kept.tolist() == [budget] * 2
+    (bundle,) = unroll(emulator, particles, 1)
+    _, velocity, own = session.run(None, {key: value.numpy() for key, value in inputs_of(step, particles).items()})
+    torch.testing.assert_close(torch.from_numpy(velocity), bundle.velocity, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(torch.from_numpy(own), emulator.budget(particles))
+
+
+def test_the_network_and_the_solid_fraction_by_themselves(tmp_path):
+    emulator = emulator_of(box(obstacles=True), gain=1.0)
+    emulator.input_std.mul_(0.3)
+    form = FORMATS["onnx"]
+    for part in (Network(emulator), Solid(emulator)):
+        path = tmp_path / "part.onnx"
+        form.write(part, description(part, "mine", "made up"), path)
+        assert form.difference(part, path, batch=3, count=11) < 1e-5
+
+
+def test_a_file_says_what_it_is(exported):
+    emulator, path = exported("two materials, a periodic axis")
+    scene, session = emulator.scene, session_of(path)
+    about = session.get_modelmeta().custom_metadata_map
+    assert about["model"] == "mine"
+    assert about["training_data"] == "made up"
+    assert Scene.from_dict(json.loads(about["scene"])) == scene
+    assert (about["frames"], float(about["dt"])) == ("2", scene.dt)
+    assert json.loads(about["constraints"])["energy"] is False
+    assert json.loads(about["inputs"])["material"]["about"].endswith("0 water, 1 sand")
+    assert [value.shape for value in session.get_inputs()] == [["B", "N", 2], ["B", "N", 2], ["B", "N"]]
+    assert session.get_outputs()[0].shape == ["B", 2, "N", 2]
+    model = onnx.load(path)
+    assert model.graph.input[0].doc_string == "('B', 'N', 2) domain length"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # a C++ compiler at work
+def test_a_compiled_package_is_the_emulator(tmp_path):
+    emulator = EMULATORS["held"]()
+    part, form, path = Step(emulator), FORMATS["pt2"], tmp_path / "step.pt2"
+    form.write(part, description(part, "mine", "made up"), path)
+    for batch, count in ((1, 40), (3, 25)):
+        assert form.difference(part, path, batch, count) < 1e-5
+    inputs = part.example(1, 40)
+    strided = inputs | {"position": inputs["position"].mT.contiguous().mT}  # the same numbers, otherwise laid out
+    for one, other in zip(form.run(path, inputs), form.run(path, strided), strict=True):
+        assert torch.equal(one, other)
+    about = torch._inductor.aoti_load_package(str(path)).get_metadata()
+    assert json.loads(about["scene"])["materials"] == ["goop"]
+
+
+def test_numpy_and_onnxruntime_are_enough(exported, tmp_path):
+    emulator, path = exported("held")
+    scene = emulator.scene
+    script = f"""
+import runpy, sys
+
+class Refused:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "nmpm"):
+            raise ImportError(name)
+
+sys.meta_path.insert(0, Refused())
+sys.argv = ["run_onnx.py", {str(path)!r}, "out.npy"]
+runpy.run_path({str(RUNNER)!r})
+assert not {{"torch", "nmpm"}} & set(sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
+    found = torch.from_numpy(np.load(tmp_path / "out.npy"))
+    axis = torch.from_numpy(np.linspace(0.4, 0.6, 28).astype(np.float32))
+    start = torch.cartesian_prod(axis, axis).flip(-1)
+    gravity = torch.tensor(scene.gravity) * scene.dt**2
+    particles = dataclasses.replace(
+        cloud(scene, count=len(start)),
+        position=start[None],
+        velocity=torch.zeros(1, len(start), 2),
+        gravity=gravity[None],
+    )
+    expected = torch.cat([bundle.position for bundle in unroll(emulator, particles, 50)], dim=1)
+    assert found.shape == expected.shape
+    assert apart(emulator, found[:, :20], expected[:, :20]) < 1e-4
+
+
+def test_the_snippet_is_short():
+    assert len([line for line in RUNNER.read_text().splitlines()[1:] if line.strip()]) <= 20
+
+
+@dataclass(frozen=True)
+class Deciding(Processor):
+    """A network that decides by its data."""
+
+    def build(self, layout: GridLayout) -> GridProcessor:
+        inner = Pointwise(hidden=(4,)).build(layout)
+
+        class Decides(GridProcessor):
+            def forward(self, grid):
+                return inner(grid) if grid.sum() > 0 else inner(-grid)
+
+        return Decides()
+
+
+def test_what_cannot_be_exported_is_said(tmp_path):
+    with pytest.raises(ConfigError, match=r"constraints.solids cannot be exported.*--free"):
+        Step(emulator_of(box(obstacles=True), Constraints()))
+    with pytest.raises(ConfigError, match=r"constraints.bounds = error cannot be exported"):
+        Step(emulator_of(box(), Constraints(bounds="error")))
+    with pytest.raises(ConfigError, match="has no obstacles"):
+        Solid(emulator_of(box()))
+    write = FORMATS["onnx"].write
+    with pytest.raises(ConfigError, match=r"torch\.export cannot follow Deciding"):
+        write(Network(emulator_of(box(), processor=Deciding())), {}, tmp_path / "no.onnx")
+    with pytest.raises(ConfigError, match=r"cannot be written as ONNX.*--format pt2"):
+        write(Step(emulator_of(box(), transfer=Affine())), {}, tmp_path / "no.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_missing_is_said(tmp_path, monkeypatch):
+    part = Network(emulator_of(box()))
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ConfigError, match=r"pip install nmpm\[export\]"):
+        FORMATS["onnx"].write(part, {}, tmp_path / "no.onnx")
+    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "no-such-compiler"))
+    with pytest.raises(ConfigError, match=r"no C\+\+ compiler no-such-compiler.*--format onnx"):
+        FORMATS["pt2"].write(part, {}, tmp_path / "no.pt2")
+
+
+def test_a_zoo_model_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "goop", "--processor"]) == 0
+    assert "wrote goop-processor.onnx; largest difference" in capsys.readouterr().out
+    about = onnxruntime.InferenceSession("goop-processor.onnx").get_modelmeta().custom_metadata_map
+    assert (about["model"], about["part"]) == ("goop", "network")
+    assert "simulated by nmpm" in about["training_data"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["export", "nothing"], "holds no model 'nothing'"),
+        (["export", "nothing.ckpt"], "there is no such checkpoint"),
+        (["export", "goop", "--format", "pt2", "--out", "goop.onnx"], "ends in .pt2"),
+        (["export", "goop", "--out", "nowhere/goop.onnx"], "the folder nowhere does not exist"),
+        (["export", "waterramps"], "Export with --free"),
+    ],
+)
+def test_a_wrong_call_is_said(words, message, capsys):
+    assert main(words) == 1
+    assert message in capsys.readouterr().err
