@@ -141,10 +141,10 @@ class Probe:
         """Seconds of a call at batch 1: the next m frames of one scene."""
         emulator = self.module.emulator.eval()
         state = self.window.initial.scenes(slice(1))
-        solid = emulator.solid(state)
+        context = emulator.context(state)
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16):
-            emulator(state, solid)
+            emulator(state, context)
         seconds = time.perf_counter() - start
         self.module.train()
         return seconds

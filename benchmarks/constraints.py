@@ -11,6 +11,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from turns import in_one_process, processor_time
@@ -55,11 +56,7 @@ def measure(name: str, frames: int, repeats: int) -> None:
     forms: dict[str, Callable[[], object]] = {}
 
     def form(constraints: Constraints) -> Callable[[], object]:
-        def action() -> object:
-            emulator.constraints = constraints
-            return rollout(emulator, state, frames)
-
-        return action
+        return partial(rollout, emulator.with_constraints(constraints), state, frames)
 
     held = dataclasses.replace(FREE, energy=True, rest_speed=0.01, solids=True)
     forms["free"] = form(FREE)

@@ -31,9 +31,9 @@ Call = Callable[[], Tensor]
 
 
 def eager(emulator: Emulator, state: Particles) -> Call:
-    """The emulator's own call; solid fraction and budget are a rollout's, made once."""
-    solid, budget = emulator.solid(state), emulator.budget(state)
-    return lambda: emulator(state, solid, budget).position
+    """The emulator's own call; the context is a rollout's, computed once."""
+    context = emulator.context(state)
+    return lambda: emulator(state, context).position
 
 
 def by_onnx_runtime(path: Path, inputs: dict[str, Tensor]) -> Call:
@@ -91,8 +91,8 @@ def main() -> None:
         calls: dict[str, Call] = {}
         constraints = {"held": model.emulator.constraints, "free": Constraints(solids=False)}
         for label in chosen.forms:
-            model.emulator.constraints = constraints[label]
-            calls |= calls_of(model.emulator, state, Path(name), label, chosen.formats)
+            emulator = model.emulator.with_constraints(constraints[label])
+            calls |= calls_of(emulator, state, Path(name), label, chosen.formats)
         spent = in_one_process(calls, chosen.repeats, processor_time)
         lines = report(calls, spent, min(model.emulator.grid.spacing))
     write(chosen.json, {"zoo": chosen.zoo, "particles": chosen.particles, "lines": lines})

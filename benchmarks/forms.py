@@ -21,9 +21,9 @@ from turns import arguments
 
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.decoders import Absolute, Decoder, Residual
+from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Bundle, Emulator
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
 from nmpm.scene import Scene
@@ -100,7 +100,7 @@ def emulator(form: Form, scene: Scene, width: int, cells: int | Sequence[int] = 
     torch.manual_seed(0)
     width = round(width * form.share)
     processor = UNet(width=width, depth=DEPTH, perceptron=(width,) * form.perceptron)
-    made = Emulator(scene, cells, FRAMES, form.transfer, processor, form.decoder, constraints=FREE)
+    made = EmulatorRecipe(scene, cells, FRAMES, form.transfer, processor, form.decoder, constraints=FREE).build()
     if form.paper:
         made.processor = ChannelsFirst(made.processor)  # type: ignore[assignment]
     return made
@@ -148,19 +148,19 @@ class Training:
     def predicted(self) -> Tensor:
         """(B, K m, N, D)."""
         particles, bundles = self.window.initial, []
-        solid = self.emulator.solid(particles)
+        context = self.emulator.context(particles)
         for _ in range(self.unroll):
             if self.form.paper:
-                solid = self.emulator.solid(particles)
-            bundle = self._bundle(particles, solid)
+                context = self.emulator.context(particles)
+            bundle = self._bundle(particles, context)
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)
             bundles.append(bundle.position)
         return torch.cat(bundles, dim=1)
 
-    def _bundle(self, particles: Particles, solid: Tensor) -> Bundle:
+    def _bundle(self, particles: Particles, context: RolloutContext) -> Bundle:
         if not self.recompute:
-            return self.emulator(particles, solid)
-        return checkpoint(self.emulator, particles, solid, use_reentrant=False)
+            return self.emulator(particles, context)
+        return checkpoint(self.emulator, particles, context, use_reentrant=False)
 
 
 class Rolling:
@@ -178,14 +178,14 @@ class Rolling:
             made.processor.to(form.precision)
         self.form, self.calls = form, options.get("calls", 10)
         self.emulator, self.state = made.to(options["device"]), state.to(options["device"])
-        self.solid = self.emulator.solid(self.state)
+        self.context = self.emulator.context(self.state)
 
     @torch.inference_mode()
     def __call__(self) -> None:
         """So many calls, from the start."""
-        particles, solid = self.state, self.solid
+        particles, context = self.state, self.context
         for _ in range(self.calls):
             if self.form.paper:
-                solid = self.emulator.solid(particles)
-            bundle = self.emulator(particles, solid)
+                context = self.emulator.context(particles)
+            bundle = self.emulator(particles, context)
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)

@@ -51,7 +51,7 @@ def _emulator(config: dict[str, Any], scene: Scene, transfer: str, decoder: str)
 @torch.inference_mode()
 def milliseconds(emulators: Mapping[Key, Emulator], state: Particles, rounds: int) -> dict[Key, float]:
     """Of a call, median over the rounds, in each of which every emulator has its turn."""
-    calls = {key: partial(emulator, state, emulator.solid(state)) for key, emulator in emulators.items()}
+    calls = {key: partial(emulator, state, emulator.context(state)) for key, emulator in emulators.items()}
     with torch.autocast(state.position.device.type, torch.bfloat16):
         spent = in_one_process(calls, rounds)
     return {key: 1e3 * statistics.median(seconds) for key, seconds in spent.items()}

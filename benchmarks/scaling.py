@@ -19,7 +19,7 @@ import torch
 from forms import FORMS, FRAMES, PRESETS, SIZED, emulator, scenes
 from turns import Spread, alone, arguments, ceilings, machine, most_held, timed, write
 
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import Emulator, RolloutContext
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
 
@@ -41,8 +41,7 @@ def sized(count: int, shape: tuple[int, ...], device: str, threads: int, rounds:
     torch.set_num_threads(threads)
     made, state = in_a_box(count, shape)
     made, state = made.to(device), state.to(device)
-    solid = made.solid(state)
-    actions = _parts(made, state, solid)
+    actions = _parts(made, state, made.context(state))
     with torch.inference_mode():
         used = most_held(actions["call"], device)
     parts = {name: _repeated(action, rounds) for name, action in actions.items()}
@@ -52,7 +51,7 @@ def sized(count: int, shape: tuple[int, ...], device: str, threads: int, rounds:
     return {"particles": n, "grid": shape, "bytes_per_particle": used / n, **parts, **rates}
 
 
-def _parts(made: Emulator, state: Particles, solid: torch.Tensor) -> dict[str, Callable[[], object]]:
+def _parts(made: Emulator, state: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:
     cells, velocity, _ = made.in_cells(state)
     fields = torch.randn(1, FRAMES, state.position.shape[2], *made.grid.shape, device=cells.device)
 
@@ -62,8 +61,8 @@ def _parts(made: Emulator, state: Particles, solid: torch.Tensor) -> dict[str, C
             moving = moving + 0.01 * made.transfer.g2p(field, moving, made.grid)
 
     return {
-        "call": lambda: made(state, solid),
-        "p2g": lambda: grid_state(made.scene, made.grid, made.transfer, state, cells, velocity, solid),
+        "call": lambda: made(state, context),
+        "p2g": lambda: grid_state(made.scene, made.grid, made.transfer, state, cells, velocity, context.solid),
         "g2p": carry,
     }
 

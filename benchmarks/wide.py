@@ -26,6 +26,7 @@ from nmpm.data.shelf import collate
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.comparison import Comparison
+from nmpm.metrics import MSE
 from nmpm.sim import MpmPreset, load_preset
 from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
@@ -38,7 +39,7 @@ def error(emulator: Emulator, preset: MpmPreset, seeds: list[int], workers: int)
     scene = preset.scene
     emulator = emulator.over(scene).eval()
     reader = Reader(metadata_of(preset), scene)
-    comparison = Comparison(scene, HORIZONS)
+    comparison = Comparison(scene, [MSE(HORIZONS)])
     with ThreadPoolExecutor(workers) as pool, shown(f"{preset.name} box", len(seeds)) as advance:
         for made in pool.map(preset.simulate, seeds):
             window = collate([reader.recording(Trajectory(made.position, made.particle_type), preset.name)], scene)

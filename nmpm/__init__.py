@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from nmpm.data.convert.arrays import write_trajectories as write_trajectories
     from nmpm.data.datamodule import TrajectoryDataModule as TrajectoryDataModule
     from nmpm.data.format import Trajectory as Trajectory
+    from nmpm.emulator import Emulator as Emulator
+    from nmpm.emulator import EmulatorRecipe as EmulatorRecipe
     from nmpm.emulator import rollout as rollout
-    from nmpm.emulator.model import Emulator as Emulator
-    from nmpm.emulator.model import EmulatorRecipe as EmulatorRecipe
     from nmpm.particles import Particles as Particles
     from nmpm.scene import Scene as Scene
     from nmpm.training.module import EmulatorModule as EmulatorModule

@@ -33,7 +33,7 @@ def test_every_variant_makes_a_model(sweep, variant):
     scene = catalog.scene("goop")
     emulator = ABLATION.module_of(config, scene).emulator.eval()
     with torch.no_grad():
-        bundle = emulator(particles := cloud(scene), emulator.solid(particles))
+        bundle = emulator(cloud(scene))
     assert bundle.position.shape == (1, config["model"]["frames"], 30, 2)
     assert bundle.position.isfinite().all()
 

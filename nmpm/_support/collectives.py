@@ -1,6 +1,6 @@
-"""What the processes of a training tell each other, so that together they do what one would with all of the batch.
+"""Collectives: operations over all processes (ranks) of a training, so that W ranks train as one with W batches.
 
-Alone, a process tells nothing to anybody. Everything here that tells must be called by all processes, in one order.
+In a single process they are no-ops. In several, every rank must call them, in the same order.
 """
 
 from __future__ import annotations
@@ -14,61 +14,75 @@ from torch import Tensor, distributed
 T = TypeVar("T")
 
 
-def place() -> tuple[int, int]:
-    """This process's number, and how many there are."""
+def rank_and_world_size() -> tuple[int, int]:
+    """This process's rank, and how many processes there are; (0, 1) where nothing is distributed."""
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()
     return 0, 1
 
 
-def gathered(value: T) -> list[T]:
-    """Everybody's values, in the order of their numbers, for everybody."""
-    _, world = place()
+def all_gather(value: T) -> list[T]:
+    """The values of all ranks, in the order of ranks, on every rank (`all_gather_object`)."""
+    _, world = rank_and_world_size()
     if world == 1:
         return [value]
-    found: list[T | None] = [None] * world
-    distributed.all_gather_object(found, value)
-    return found  # type: ignore[return-value]  # (all are there now)
+    values: list[T | None] = [None] * world
+    distributed.all_gather_object(values, value)
+    return values  # type: ignore[return-value]  # (every rank has set its own)
 
 
-def collected(value: T) -> list[T]:
-    """Everybody's values, in the order of their numbers, for process 0; nothing for the others."""
-    rank, world = place()
+def gather_to_rank0(value: T) -> list[T]:
+    """The values of all ranks, in the order of ranks, on rank 0; an empty list elsewhere (`gather_object`)."""
+    rank, world = rank_and_world_size()
     if world == 1:
         return [value]
-    found: list[T | None] | None = [None] * world if rank == 0 else None
-    distributed.gather_object(value, found)
-    return found or []  # type: ignore[return-value]  # (likewise)
+    values: list[T | None] | None = [None] * world if rank == 0 else None
+    distributed.gather_object(value, values)
+    return values or []  # type: ignore[return-value]  # (likewise)
 
 
-def of_the_first(value: float, device: torch.device) -> float:
-    """The value of process 0.
+def broadcast_from_rank0(value: float, device: torch.device) -> float:
+    """Rank 0's value, on every rank; reads it back from the device.
 
     Args:
-        value: This process's own.
-        device: Where processes exchange tensors.
+        value: This rank's own.
+        device: Where the process group exchanges tensors.
     """
-    if place()[1] == 1:
+    if rank_and_world_size()[1] == 1:
         return value
-    told = torch.tensor(value, dtype=torch.float64, device=device)
-    distributed.broadcast(told, src=0)
-    return float(told)
+    message = torch.tensor(value, dtype=torch.float32, device=device)
+    distributed.broadcast(message, src=0)
+    return float(message)
 
 
-def of_all(mean: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """A mean over some particles of each process, as part of the mean over the particles of all processes.
-
-    Nothing waits for the answer, so that a GPU is kept busy.
+def any_rank(condition: bool, device: torch.device) -> bool:
+    """Whether the condition holds on any rank (`all_reduce`); reads the answer back from the device.
 
     Args:
-        mean: () over this process's particles.
-        count: () how many those are.
+        condition: This rank's own.
+        device: Where the process group exchanges tensors.
+    """
+    if rank_and_world_size()[1] == 1:
+        return condition
+    count = torch.tensor(int(condition), device=device)
+    distributed.all_reduce(count)
+    return bool(count)
+
+
+def global_mean(mean: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """A mean over this rank's particles as part of the mean over the particles of all ranks (`all_reduce`).
+
+    Nothing is read back from the device.
+
+    Args:
+        mean: () over this rank's particles.
+        count: () their number.
 
     Returns:
-        () this process's part, in which gradients flow, and () the mean over the particles of all. The processes' parts
-        have that as their mean, whatever their counts.
+        () this rank's part, in which gradients flow, and () the mean over the particles of all ranks. The parts' mean
+        over ranks is the latter, whatever the counts.
     """
-    _, world = place()
+    _, world = rank_and_world_size()
     if world == 1:
         return mean, mean.detach()
     total = torch.stack([mean.detach().float() * count, count.float()])
@@ -76,25 +90,25 @@ def of_all(mean: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     return mean * (world * count / total[1]), total[0] / total[1]
 
 
-def share_of(draw: Callable[[int], Tensor], rows: int) -> Tensor:
-    """This process's rows of random numbers that are drawn for all, which have the same random state and as many rows.
+def rank_slice(draw: Callable[[int], Tensor], rows: int) -> Tensor:
+    """This rank's rows of random numbers that are drawn for all ranks, which share a random state and a batch size.
 
-    Every process draws all of them, which costs little beside a step, and takes its own: one process with all of the
-    rows would draw the same.
+    Every rank draws the numbers of all, which costs little beside a step, so that one process with all rows would draw
+    the same.
 
     Args:
         draw: Draws so many rows.
-        rows: Rows of one process.
+        rows: Rows of one rank.
     """
-    rank, world = place()
+    rank, world = rank_and_world_size()
     return draw(world * rows)[rank * rows : (rank + 1) * rows]
 
 
 def normal_like(values: Tensor) -> Tensor:
-    """Normally distributed numbers for (B, …) values: this process's share of them, as `share_of` says."""
-    _, world = place()
+    """Normally distributed numbers for (B, …) values: this rank's rows of those drawn for all ranks."""
+    _, world = rank_and_world_size()
     if world == 1:
         return torch.randn_like(values)
-    # Without memory of its own: the order in memory, and with it that of the numbers, is what counts.
+    # A meta tensor has no memory, but a memory order, which decides the order of the numbers drawn.
     layout = torch.cat([values.to("meta")] * world)
-    return share_of(lambda _: torch.randn_like(layout, device=values.device), len(values))
+    return rank_slice(lambda _: torch.randn_like(layout, device=values.device), len(values))

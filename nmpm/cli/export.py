@@ -55,12 +55,11 @@ def run(words: list[str]) -> None:
 
 
 def _export(chosen: argparse.Namespace, out: Path) -> None:
-    from nmpm.emulator.constraints import Constraints
     from nmpm.zoo import export
 
     emulator, training_data = _model(chosen.model)
     if chosen.free:
-        emulator.constraints = Constraints(solids=False)
+        emulator = emulator.unconstrained()
     kinds: Mapping[str, type[Part]] = {kind.__name__: kind for kind in (export.Step, export.Network, export.Solid)}
     part = kinds[chosen.part](emulator)
     form = export.FORMATS[chosen.format]

@@ -32,7 +32,6 @@ def run(words: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write stress.json, stress.md and stress.png there")
     chosen = parser.parse_args(words[1:])
-    from nmpm.emulator.constraints import Constraints
     from nmpm.evaluation.stress import FULL, GROUPS, QUICK
 
     unknown = sorted(set(chosen.groups or ()) - set(GROUPS))
@@ -40,7 +39,7 @@ def run(words: list[str]) -> None:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
     subject = _subject(chosen.model, chosen.preset, chosen.seed)
     if chosen.free:
-        subject.emulator.constraints = Constraints(solids=False)
+        subject = subject.over(subject.emulator.unconstrained())
     start = time.monotonic()
     lines = _measured(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS), quiet=chosen.json)
     _hand_out(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)

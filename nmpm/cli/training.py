@@ -20,7 +20,7 @@ from nmpm.errors import ConfigError
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from nmpm.training.callbacks.report import Report
-from nmpm.training.checkpoints import check_checkpoint
+from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.module import EmulatorModule
 
 BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
@@ -72,7 +72,7 @@ class EmulatorCLI(LightningCLI):
             ConfigError: if the folder holds a run and no checkpoint is to be continued.
             DataError: if the checkpoint cannot be read.
         """
-        self._check_checkpoint()
+        self._read_checkpoint()
         folder = Path(self.trainer.default_root_dir)
         if not self.config_init[self.subcommand].get("ckpt_path") and (folder / "checkpoints" / "last.ckpt").exists():
             raise ConfigError(
@@ -81,15 +81,15 @@ class EmulatorCLI(LightningCLI):
             )
 
     def before_validate(self) -> None:
-        self._check_checkpoint()
+        self._read_checkpoint()
 
     def before_test(self) -> None:
-        self._check_checkpoint()
+        self._read_checkpoint()
 
     def before_predict(self) -> None:
-        self._check_checkpoint()
+        self._read_checkpoint()
 
-    def _check_checkpoint(self) -> None:
+    def _read_checkpoint(self) -> None:
         given = self.config_init[self.subcommand].get("ckpt_path")
         if not given:
             return
@@ -98,7 +98,7 @@ class EmulatorCLI(LightningCLI):
         }
         path = names.get(str(given), Path(given))
         if given not in names or path.is_file():  # (Lightning says where it looked for those)
-            check_checkpoint(path)
+            read_checkpoint(path)
 
     def after_fit(self) -> None:
         """Judge the last weights too, if no validation has, and test the best ones, once."""

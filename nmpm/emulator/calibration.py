@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nmpm._support.collectives import gathered
+from nmpm._support.collectives import all_gather
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Window
@@ -50,7 +50,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     """
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
-    inputs = _pooled(gathered(_inputs(emulator, windows)))
+    inputs = _pooled(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
@@ -58,7 +58,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     leeway = torch.where(spread > 1e-12, _LEEWAY * spread, UNLIMITED)
     emulator.input_low.copy_((inputs.low - leeway).reshape_as(emulator.input_low))
     emulator.input_high.copy_((inputs.high + leeway).reshape_as(emulator.input_high))
-    materials = zip(*gathered(_unknowns(emulator, windows)), strict=True)
+    materials = zip(*all_gather(_unknowns(emulator, windows)), strict=True)
     scale = torch.cat([_root_mean_square(parts) for parts in materials], dim=-1)
     emulator.output_scale.copy_(_nonzero(scale).reshape_as(emulator.output_scale))
     emulator.calibrated.fill_(True)

@@ -7,26 +7,30 @@ Source: Rochman-Sharabi, Lewin & Louppe, A Neural Material Point Method for Part
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from nmpm._support.collectives import normal_like
-from nmpm.decoders import Decoder, Residual
+from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection, Flight
 from nmpm.emulator.constraints import Constraints, energy, equal_shares
 from nmpm.emulator.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Particles
-from nmpm.processors import GridLayout, Processor, UNet
+from nmpm.processors import GridLayout
 from nmpm.scene import Scene
-from nmpm.transfer import Linear, Transfer
+from nmpm.transfer import Transfer
+
+if TYPE_CHECKING:
+    from nmpm.emulator.recipe import EmulatorRecipe
 
 UNLIMITED = 1e30
-"""Stands for no limit, finite so that every statistic of a sound model is."""
+"""Stands for no limit, finite so that every statistic of a valid model is."""
 
 
 @dataclass(frozen=True)
@@ -42,21 +46,24 @@ class Bundle:
     velocity: Tensor
 
 
+@dataclass(frozen=True)
+class RolloutContext:
+    """What stays the same from bundle to bundle of a rollout, computed once from its first state.
+
+    Args:
+        solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
+        budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
+    """
+
+    solid: Tensor
+    budget: Tensor | None
+
+
 class Emulator(nn.Module):
     """A learned simulator of one family of scenes.
 
     Args:
-        scene: The facts of the scenes; decides channels and dimension.
-        cells: Grid cells along the longest axis, or along each.
-        frames: m, frames predicted by one call.
-        transfer: How particles and grid see each other.
-        processor: Recipe of the network between.
-        decoder: What the network's output means.
-        grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training mode only.
-        constraints: What it is held to.
-
-    Raises:
-        ConfigError: if grid and processor do not suit each other.
+        recipe: Its form.
     """
 
     input_mean: Tensor
@@ -68,35 +75,15 @@ class Emulator(nn.Module):
     walls: Tensor
     calibrated: Tensor
 
-    def __init__(
-        self,
-        scene: Scene,
-        cells: int | Sequence[int] = 64,
-        frames: int = 8,
-        transfer: Transfer | None = None,
-        processor: Processor | None = None,
-        decoder: Decoder | None = None,
-        grid_noise: float = 0.0,
-        constraints: Constraints | None = None,
-    ) -> None:
+    def __init__(self, recipe: EmulatorRecipe) -> None:
         super().__init__()
-        self.scene = scene
-        self.constraints = constraints or Constraints()
-        if self.constraints.energy and not scene.gravity_known:
-            raise ConfigError(
-                "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
-            )
-        self.frames = frames
-        self.grid_noise = grid_noise
-        self.grid = Grid.of(scene, cells)
-        self.transfer = transfer or Linear()
-        self.decoder = decoder or Residual()
-        self.recipe = processor or UNet()
-        self.recipe.check_grid(self.grid)
+        self.recipe = recipe
+        self.grid = recipe.grid
+        scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
-        self.processor = self.recipe.build(GridLayout(inputs, outputs, frames, scene.periodic))
+        self.processor = recipe.processor.build(GridLayout(inputs, outputs, frames, scene.periodic))
         if scene.dim == 2:
-            # The layout in which p2g's output comes; twice as fast on a CPU.
+            # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
             self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
         column = (1,) * scene.dim
         self.register_buffer("input_mean", torch.zeros(inputs, *column))
@@ -105,29 +92,57 @@ class Emulator(nn.Module):
         self.register_buffer("input_high", torch.full((inputs, *column), UNLIMITED))
         self.register_buffer("output_scale", torch.ones(frames, outputs, *column))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
-        limits = torch.tensor(scene.bounds, dtype=torch.float64)
-        lower, spacing = torch.tensor(self.grid.lower).double(), torch.tensor(self.grid.spacing).double()
-        self.register_buffer("bounds", ((limits.T - lower) / spacing).float(), persistent=False)
+        self.register_buffer("bounds", _bounds_in_cells(scene, self.grid), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
 
     @property
+    def scene(self) -> Scene:
+        """The facts of the scenes."""
+        return self.recipe.scene
+
+    @property
+    def frames(self) -> int:
+        """m, frames predicted by one call."""
+        return self.recipe.frames
+
+    @property
+    def transfer(self) -> Transfer:
+        """How particles and grid see each other."""
+        return self.recipe.transfer
+
+    @property
+    def decoder(self) -> Decoder:
+        """What the network's output means."""
+        return self.recipe.decoder
+
+    @property
+    def constraints(self) -> Constraints:
+        """Facts that rollouts are held to."""
+        return self.recipe.constraints
+
+    @property
+    def device(self) -> torch.device:
+        """Where weights and statistics are."""
+        return self.input_mean.device
+
+    @property
     def precision(self) -> torch.dtype:
-        """In which transfers and advection are computed: float32, or float64 after `double()`."""
+        """Type in which transfers and advection are computed: float32, or float64 after `double()`."""
         return torch.promote_types(self.input_mean.dtype, torch.float32)
 
     @property
     def advection(self) -> Advection:
-        """What moves the particles once the network has spoken."""
+        """The advection step of this emulator."""
         return Advection(self.scene, self.grid, self.transfer, self.decoder, self.constraints, self.bounds, self.walls)
 
     @property
     def network_precision(self) -> torch.dtype:
-        """Of the network's weights; in which it computes, too, unless autocast says otherwise."""
+        """Type of the network's weights, in which it computes unless autocast says otherwise."""
         real = (weight.dtype for weight in self.processor.parameters() if weight.is_floating_point())
         return next(real, self.precision)
 
     def with_network(self, precision: torch.dtype) -> Emulator:
-        """This emulator if its network has weights of this type, else a copy that has; all but the network stays.
+        """This emulator if its network has weights of this type, else a copy with the network's weights converted.
 
         Raises:
             ConfigError: if the network has complex weights, as FNOs do, which have no such type.
@@ -136,76 +151,75 @@ class Emulator(nn.Module):
             return self
         if any(weight.is_complex() for weight in self.processor.parameters()):
             raise ConfigError(
-                f"{type(self.recipe).__name__} has complex weights, which cannot be {precision}: use torch.autocast."
+                f"{type(self.recipe.processor).__name__} has complex weights, which cannot be {precision}: use"
+                " torch.autocast."
             )
         other = copy.deepcopy(self)
         other.processor.to(precision)
         return other
 
-    def over(self, scene: Scene) -> Emulator:
-        """The same emulator in another box: a copy of weights and statistics, on a grid with cells of the same size.
+    def with_constraints(self, constraints: Constraints) -> Emulator:
+        """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
+        other = copy.copy(self)
+        other.recipe = dataclasses.replace(self.recipe, constraints=constraints)
+        return other
 
-        Args:
-            scene: Other bounds and domain, finer or coarser particles, perhaps obstacles where there were walls
-                already; all else must be the same.
+    def unconstrained(self) -> Emulator:
+        """This emulator without its constraints but the scene's bounds: the network alone."""
+        return self.with_constraints(Constraints(solids=False))
+
+    def over(self, scene: Scene) -> Emulator:
+        """A copy of weights and statistics for another scene, see `EmulatorRecipe.over`.
 
         Raises:
-            ConfigError: if channels, time step or gravity differ, the domain is not a whole number of cells, or the
-                processor cannot take the grid.
+            ConfigError: if the emulator cannot take the scene.
         """
-        mine = self.scene
-        for name in ("input_channels", "dt", "boundary", "gravity"):
-            if getattr(scene, name) != getattr(mine, name):
-                raise ConfigError(
-                    f"The emulator was made for {name} = {getattr(mine, name)}; the other scene has"
-                    f" {getattr(scene, name)}."
-                )
-        sides = [(high - low) / h for (low, high), h in zip(scene.domain, self.grid.spacing, strict=True)]
-        if any(abs(side - round(side)) > 1e-4 for side in sides):
-            raise ConfigError(
-                f"The domain {scene.domain} is {[round(side, 4) for side in sides]} cells of the emulator's grid"
-                f" {self.grid.spacing}; whole numbers are needed."
-            )
-        cells = [round(side) for side in sides]
-        other = Emulator(
-            scene, cells, self.frames, self.transfer, self.recipe, self.decoder, self.grid_noise, self.constraints
-        )
+        return self.rebuilt(self.recipe.over(scene))
+
+    def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
+        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
+        other = recipe.build().to(self.device)
+        if other.network_precision != self.network_precision:
+            other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
-        other.to(self.calibrated.device)
         return other.train(self.training)
 
+    def context(self, particles: Particles) -> RolloutContext:
+        """What stays the same through a rollout from this state: solids and, if constrained, its energy."""
+        return RolloutContext(self.solid(particles), self.budget(particles))
+
     def solid(self, particles: Particles) -> Tensor:
-        """What of each cell is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1. Once per scene, not per step."""
+        """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
         return solid_fraction(self.scene, self.grid, self.transfer, particles, self.walls)
 
     def budget(self, particles: Particles) -> Tensor | None:
-        """The energy (B,) that a rollout from this state is held to; None where it is not."""
+        """Energy per mass (B,) of a state, in grid units; None where it is not constrained, as in training."""
         if not self.constraints.energy or self.training:
             return None
         cells, velocity, gravity = self.in_cells(particles)
         return energy(*self.grid.alike(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
 
     def normalised(self, state: Tensor) -> Tensor:
-        """What the processor sees of a grid state (B, C_in, *S) in grid units."""
-        # Beyond what training saw, a network's answers are arbitrary and may be huge.
-        seen = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
-        return (seen - self.input_mean) / self.input_std
+        """The processor's input for a grid state (B, C_in, *S) in grid units."""
+        # Inputs are clipped to the calibrated range: outputs for others are arbitrary and may be huge.
+        clipped = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
+        return (clipped - self.input_mean) / self.input_std
 
-    def forward(self, particles: Particles, solid: Tensor, budget: Tensor | None = None) -> Bundle:
+    def forward(self, particles: Particles, context: RolloutContext | None = None) -> Bundle:
         """Predict the next m frames.
 
         Args:
             particles: The state to start from.
-            solid: (B, C_solid, *S), from `solid`.
-            budget: (B,) energy not to be exceeded, from `budget` of the rollout's first state.
+            context: From `context` of the rollout's first state; of this state when left out.
         """
+        context = context or self.context(particles)
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self.in_cells(particles)
-            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)
+            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
             normalised = self.normalised(state)
-            if self.training and self.grid_noise > 0:
-                normalised = normalised + self.grid_noise * normal_like(normalised)
+            if self.training and self.recipe.grid_noise > 0:
+                normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
         with torch.autocast(device, enabled=False):
             fields = output.to(self.precision) * self.output_scale
@@ -214,7 +228,10 @@ class Emulator(nn.Module):
             carried = self.decoder.carried(velocity, smoothed)
             share = equal_shares(particles.mask, cells.dtype)
             flight = Flight(cells, carried, gravity, particles.material, fields, share)
-            path = advection.free(flight) if self.training else advection.constrained(flight, solid, budget)
+            if self.training:
+                path = advection.free(flight)
+            else:
+                path = advection.constrained(flight, context.solid, context.budget)
             steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
             precision = particles.position.dtype
             return Bundle(
@@ -229,3 +246,10 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
+
+
+def _bounds_in_cells(scene: Scene, grid: Grid) -> Tensor:
+    """(2, D) lowest and highest positions in cells, rounded to float32 only at the end."""
+    limits = torch.tensor(scene.bounds, dtype=torch.float64).T
+    lower, spacing = (torch.tensor(values, dtype=torch.float64) for values in (grid.lower, grid.spacing))
+    return ((limits - lower) / spacing).float()

@@ -25,9 +25,9 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     """
     if monitor is not None:
         monitor.start(emulator, particles)
-    solid, budget = emulator.solid(particles), emulator.budget(particles)
+    context = emulator.context(particles)
     for _ in range(bundles):
-        bundle = emulator(particles, solid, budget)
+        bundle = emulator(particles, context)
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
         yield bundle

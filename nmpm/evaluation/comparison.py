@@ -1,4 +1,4 @@
-"""An emulator's rollout errors beside those of the trivial predictors, so that a number means something."""
+"""An emulator's rollout errors beside those of the trivial predictors."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 from torch import Tensor, nn
 
+from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall, still
-from nmpm.evaluation.metrics import RolloutError
+from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
@@ -19,44 +20,62 @@ class Comparison(nn.Module):
 
     Args:
         scene: Gives gravity and walls for the free fall.
-        horizons: Frames at which the MSE is reported, beside the full rollout.
+        metrics: What to compute, an `MSE` among them; copied, so that one list serves several comparisons.
+
+    Raises:
+        ConfigError: if there is not exactly one `MSE`, by which checkpoints are chosen.
     """
 
-    def __init__(self, scene: Scene, horizons: Sequence[int]) -> None:
+    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric]) -> None:
         super().__init__()
+        if sum(isinstance(metric, MSE) for metric in metrics) != 1:
+            raise ConfigError("model.metrics needs nmpm.metrics.MSE once: the best checkpoint is chosen by it.")
         self.scene = scene
-        self.model = RolloutError(horizons)
-        self.still = RolloutError(horizons)
-        self.free_fall = RolloutError(horizons)
+        self.metrics = nn.ModuleDict(
+            {
+                kind: nn.ModuleList(metric.clone() for metric in metrics if kind == "model" or metric.compared)
+                for kind in PREDICTORS
+            }
+        )
 
     @property
-    def errors(self) -> Mapping[str, RolloutError]:
-        """The errors of each of `PREDICTORS`."""
-        return {"model": self.model, "still": self.still, "free_fall": self.free_fall}
+    def errors(self) -> Mapping[str, MSE]:
+        """The squared errors of each of `PREDICTORS`."""
+        return {kind: next(metric for metric in own if isinstance(metric, MSE)) for kind, own in self._by_predictor()}
 
     def update(self, window: Window, predicted: Tensor) -> None:
-        """Take in whole trajectories and the model's rollouts of them, (B, T - 2, N, D)."""
+        """Add whole trajectories and the model's rollouts of them, (B, T - 2, N, D)."""
         frames = window.target.shape[1]
-        self.model.update(predicted, window.target, window.mask)
-        self.still.update(still(window.initial, frames), window.target, window.mask)
-        self.free_fall.update(free_fall(self.scene, window.initial, frames), window.target, window.mask)
+        rollouts = {
+            "model": predicted,
+            "still": still(window.initial, frames),
+            "free_fall": free_fall(self.scene, window.initial, frames),
+        }
+        for kind, own in self._by_predictor():
+            for metric in own:
+                metric.update(window, rollouts[kind])
 
     def reset(self) -> None:
-        """Forget everything taken in."""
-        for metric in self.errors.values():
-            metric.reset()
+        """Forget everything added."""
+        for _, own in self._by_predictor():
+            for metric in own:
+                metric.reset()
 
     def compute(self) -> dict[str, Tensor]:
         """Means over trajectories: "mse", "mse@8", … of the model, "still/mse", … of the trivial predictors."""
         return {
             name if kind == "model" else f"{kind}/{name}": value
-            for kind, metric in self.errors.items()
+            for kind, own in self._by_predictor()
+            for metric in own
             for name, value in metric.compute().items()
         }
 
+    def _by_predictor(self) -> list[tuple[str, list[RolloutMetric]]]:
+        return [(kind, list(own)) for kind, own in self.metrics.items()]  # type: ignore[call-overload]  # (a ModuleList)
+
 
 def figure_names(figures: Mapping[str, float]) -> list[str]:
-    """Names of the model's figures, horizons in order, the full rollout after them, then the rest."""
+    """Names of the model's figures: MSE at horizons in order, the full rollout's after them, then the rest."""
     names = [name for name in figures if "/" not in name]
     return sorted(names, key=lambda name: (not name.startswith("mse"), "@" not in name, _horizon(name)))
 

@@ -1,18 +1,22 @@
-"""Checkpoints read as tensors and plain data: nothing in them is run, and a damaged one is named."""
+"""Read checkpoints as tensors and plain data; nothing in them is executed."""
 
 from __future__ import annotations
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from nmpm.errors import DataError
 from nmpm.training.module import EmulatorModule
 
+FORMER_ARGUMENTS = frozenset({"horizons", "emd"})
+"""Hyperparameters of version 0.1.0 that are not the model's any more: metrics are chosen anew where it is judged."""
 
-def check_checkpoint(path: Path) -> None:
-    """Make sure that a file can be read as a checkpoint.
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The content of a checkpoint, on the CPU, of which nothing is executed.
 
     Raises:
         DataError: if it is missing, damaged, or holds more than tensors and plain data.
@@ -24,11 +28,12 @@ def check_checkpoint(path: Path) -> None:
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
         reason = str(error).strip().split("\n")[0]
         raise DataError(
-            f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain data, which is"
-            f" never run. Take another, such as best.ckpt or last.ckpt beside it. ({type(error).__name__}: {reason})"
+            f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain data, which"
+            f" is never executed. Take another, such as best.ckpt or last.ckpt beside it. ({reason})"
         ) from error
     if not isinstance(content, dict) or "state_dict" not in content:
         raise DataError(f"{path} is no checkpoint of a training: it holds no state_dict.")
+    return content
 
 
 def load_module(path: Path) -> EmulatorModule:
@@ -36,9 +41,15 @@ def load_module(path: Path) -> EmulatorModule:
 
     Raises:
         DataError: if the file cannot be read, or is not a checkpoint of an emulator.
+        ConfigError: if a newer nmpm wrote it, or it names a part that is not known.
     """
-    check_checkpoint(path)
+    content = read_checkpoint(path)
+    stored = content.get("hyper_parameters", {})
+    arguments = {key: value for key, value in stored.items() if key not in FORMER_ARGUMENTS}
     try:
-        return EmulatorModule.load_from_checkpoint(path, map_location="cpu", weights_only=True)
+        module = EmulatorModule(**arguments)
+        module.on_load_checkpoint(content)
+        module.load_state_dict(content["state_dict"])
     except (RuntimeError, TypeError, KeyError) as error:
         raise DataError(f"{path} is not a checkpoint of an emulator of this version: {error}") from error
+    return module

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
@@ -16,28 +17,24 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.utils.checkpoint import checkpoint
 
-from nmpm._support.collectives import normal_like, of_all, of_the_first, share_of
-from nmpm._support.specs import from_spec, to_spec
-from nmpm.decoders import Decoder, Residual
+from nmpm._support.collectives import broadcast_from_rank0, global_mean, normal_like, rank_slice
+from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
-from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Bundle, Emulator
-from nmpm.emulator.rollouts import rollout, unroll
+from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
-from nmpm.evaluation.metrics import EarthMover
+from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Particles, Window
-from nmpm.processors import Processor, UNet
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirrored
 from nmpm.training.losses import position_error
 from nmpm.training.schedules import Schedule
-from nmpm.transfer import Linear, Transfer
 
 OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  # (jsonargparse knows this form)
 
 CALIBRATION_BATCHES = 4
+CLOCK_EVERY = 16  # steps
 
 
 def adam(parameters: Iterable[Tensor]) -> Optimizer:
@@ -50,56 +47,39 @@ class EmulatorModule(LightningModule):
 
     Args:
         scene: The facts of the scenes; from the command line it comes from the data.
-        cells: Grid cells along the longest axis, or along each.
-        frames: m, frames predicted by one call of the processor (time bundling).
         unroll: K, calls that a training step backpropagates through; the training horizon is m K frames.
         unroll_growth: Share of the training, in [0, 1], over which the calls grow from 1 to K: early steps are cheap.
-        transfer: How particles and grid see each other.
-        processor: The network on the grid.
-        decoder: What the network's output means.
-        constraints: Facts that rollouts are held to; but for the bounds they do not act in training.
         optimizer: Makes the optimizer from the parameters.
-        schedule: The learning rate's course over the training.
+        schedule: Factor on the learning rate over the training.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
-        grid_noise: Standard deviation of the noise on the normalised grid state in training.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
-        horizons: Frames at which rollout errors are reported, beside the full rollout.
-        emd: Every how many frames to compute the exact earth mover's distance in tests; 0 for never (it is slow).
-        recompute: Whether gradients recompute each bundle instead of keeping what they need of it: the memory of one
-            bundle instead of K, for the time of one more forward pass.
+        metrics: Errors that validations and tests report, see `nmpm.metrics`.
+        recompute: Whether gradients recompute each bundle instead of keeping its activations: the memory of one bundle
+            instead of K, for the time of one more forward pass.
         compile: Whether to compile the network by torch.compile, where that works. It takes half a minute or more at
             the start; on a CPU it gains next to nothing.
         seed: Of the noise.
+        recipe: The emulator's form: the further arguments of `EmulatorRecipe`.
     """
 
     def __init__(
         self,
         scene: Scene,
-        cells: int | list[int] = 64,
-        frames: int = 8,
         unroll: int = 2,
         unroll_growth: float = 0.0,
-        transfer: Transfer = Linear(),  # noqa: B008 (frozen)
-        processor: Processor = UNet(),  # noqa: B008
-        decoder: Decoder = Residual(),  # noqa: B008
-        constraints: Constraints = Constraints(),  # noqa: B008
         optimizer: OptimizerCallable = adam,
-        schedule: Schedule = Schedule(),  # noqa: B008
+        schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         position_noise: float = 0.0,
-        grid_noise: float = 0.0,
         mirror: Sequence[int] = (),
-        horizons: Sequence[int] = (1, 8, 32, 100),
-        emd: int = 0,
+        metrics: Sequence[RolloutMetric] | None = None,
         recompute: bool = False,
         compile: bool = False,  # noqa: A002 (torch's word)
         seed: int = 0,
+        **recipe: Any,
     ) -> None:
         super().__init__()
-        scene = scene if isinstance(scene, Scene) else Scene.from_dict(scene)
-        transfer, decoder = from_spec(transfer, Transfer), from_spec(decoder, Decoder)
-        processor = from_spec(processor, Processor)
-        constraints = constraints if isinstance(constraints, Constraints) else Constraints(**constraints)
-        self.emulator = Emulator(scene, cells, frames, transfer, processor, decoder, grid_noise, constraints)
+        self.emulator = EmulatorRecipe(scene, **recipe).build()
+        scene = self.emulator.scene
         if not 0 <= unroll_growth <= 1:
             raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
         self.unroll, self.unroll_growth = unroll, unroll_growth
@@ -109,57 +89,40 @@ class EmulatorModule(LightningModule):
         self.position_noise, self.mirror = position_noise, tuple(mirror)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
-        self.save_hyperparameters(
-            {
-                "scene": scene.to_dict(),
-                "cells": list(self.emulator.grid.shape),
-                "frames": frames,
-                "unroll": unroll,
-                "unroll_growth": unroll_growth,
-                "transfer": to_spec(transfer),
-                "processor": to_spec(processor),
-                "decoder": to_spec(decoder),
-                "constraints": dataclasses.asdict(constraints),
-                "schedule": to_spec(self.schedule)["init_args"],
-                "position_noise": position_noise,
-                "grid_noise": grid_noise,
-                "mirror": list(mirror),
-                "horizons": list(horizons),
-                "emd": emd,
-                "recompute": recompute,
-                "compile": compile,
-                "seed": seed,
-            },
-            logger=False,
-        )
-        self.valid_errors = Comparison(scene, horizons)
-        self.test_errors = Comparison(scene, horizons)
-        self.earth_mover = EarthMover(emd) if emd else None
+        plain = self.emulator.recipe.to_dict()
+        del plain["format"]  # (of the checkpoint, see on_save_checkpoint)
+        own = {
+            "unroll": unroll,
+            "unroll_growth": unroll_growth,
+            "schedule": dataclasses.asdict(self.schedule),
+            "position_noise": position_noise,
+            "mirror": list(mirror),
+            "recompute": recompute,
+            "compile": compile,
+            "seed": seed,
+        }
+        self.save_hyperparameters(plain | own, logger=False)
+        chosen = [MSE()] if metrics is None else list(metrics)
+        self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
+        self.test_errors = Comparison(scene, chosen)
         self.validated_step = -1
+        self._clock_read = 0.0
 
     @classmethod
     def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
-        """A module that trains an emulator on: the same form, a copy of its weights and statistics.
+        """A module that trains a copy of an emulator, with its weights and statistics.
 
         Args:
             emulator: For example `Zoo.load("goop").emulator`.
-            options: What else the constructor takes, such as `unroll` and `optimizer`.
+            options: Further arguments of the constructor, such as `unroll` and `optimizer`.
         """
-        module = cls(
-            emulator.scene,
-            cells=list(emulator.grid.shape),
-            frames=emulator.frames,
-            transfer=emulator.transfer,
-            processor=emulator.recipe,
-            decoder=emulator.decoder,
-            constraints=emulator.constraints,
-            **options,
-        )
+        recipe = {field.name: getattr(emulator.recipe, field.name) for field in dataclasses.fields(emulator.recipe)}
+        module = cls(**(recipe | options))
         module.emulator.load_state_dict(emulator.state_dict())
         return module
 
-    def setup(self, stage: str) -> None:
-        """Check that the data are of the model's scene; for a training, calibrate and compile what is to be.
+    def setup(self, stage: str) -> None:  # noqa: ARG002
+        """Check that the data are of the model's scene.
 
         Raises:
             ConfigError: if the data's scene is another.
@@ -167,12 +130,24 @@ class EmulatorModule(LightningModule):
         theirs = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
         if isinstance(theirs, Scene):
             _check_same(self.emulator.scene, theirs)
-        if stage == "fit" and not self.emulator.calibrated:
+
+    def on_fit_start(self) -> None:
+        """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
+        if not self.emulator.calibrated:
             loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]  # (Lightning sets it)
-            calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
-        if stage == "fit" and self.compiled:
+            windows = [window.to(self.device) for window in islice(loader, CALIBRATION_BATCHES)]
+            calibrate(self.emulator, windows)
+        if self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
             compile_network(self.emulator.processor, example)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """State the format of the hyperparameters."""
+        checkpoint["nmpm_format"] = FORMAT
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint that a newer version wrote."""
+        check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Make the batch's randomness a function of its number, so that a resumed run repeats it.
@@ -189,12 +164,12 @@ class EmulatorModule(LightningModule):
         little more in a batch with fewer.
         """
         for axis in self.mirror:
-            chances = share_of(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
+            chances = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
             batch = mirrored(batch, self.emulator.scene, axis, chances < 0.5)
         bundles = self._unrolled(self._perturbed(batch.initial), self.bundles(self._progress()))
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
         error = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
-        loss, logged = of_all(error, batch.mask.sum())
+        loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged, prog_bar=True)
         return loss
 
@@ -204,8 +179,6 @@ class EmulatorModule(LightningModule):
     def test_step(self, batch: Window, batch_idx: int) -> Tensor:
         predicted = self.predict_step(batch, batch_idx)
         self.test_errors.update(batch, predicted)
-        if self.earth_mover is not None:
-            self.earth_mover.update(predicted, batch.target, batch.mask, batch.material)
         return predicted
 
     def predict_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
@@ -217,24 +190,24 @@ class EmulatorModule(LightningModule):
 
     def on_test_epoch_start(self) -> None:
         self.test_errors.reset()
-        if self.earth_mover is not None:
-            self.earth_mover.reset()
 
     def on_validation_epoch_end(self) -> None:
         self.log_dict({f"valid/{name}": value for name, value in self.valid_errors.compute().items()})
         self.validated_step = self.global_step
 
     def on_test_epoch_end(self) -> None:
-        figures = self.test_errors.compute()
-        if self.earth_mover is not None:
-            figures |= self.earth_mover.compute()
-        self.log_dict({f"test/{name}": value for name, value in figures.items()})
+        self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         optimizer = self.make_optimizer(self.emulator.parameters())
-        total = self.trainer.estimated_stepping_batches
+        total = self._total_steps()
+        if math.isinf(total) and self._timer() is None:
+            raise ConfigError(
+                "The training has no end, as its batches are endless: give --trainer.max_steps N or --trainer.max_time"
+                " DD:HH:MM:SS (or, to count epochs, --trainer.limit_train_batches N)."
+            )
         scheduler = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: self.schedule.factor(max(step, self._clock() * total), total)
+            optimizer, lambda step: self.schedule.factor(step, total, self._clock(step))
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -248,28 +221,41 @@ class EmulatorModule(LightningModule):
         """Share of the training that is over, by steps or by the clock, whichever is further."""
         if not self.unroll_growth:
             return 1.0
-        return max(self.global_step / self.trainer.estimated_stepping_batches, self._clock())
+        return max(self.global_step / self._total_steps(), self._clock(self.global_step))
+
+    def _total_steps(self) -> float:
+        """Optimizer steps of the whole training; infinite where nothing but its time is limited."""
+        steps = self.trainer.estimated_stepping_batches  # -1 where epochs are limited and their batches are endless
+        return steps if steps > 0 else math.inf
+
+    def _timer(self) -> Timer | None:
+        """The trainer's `max_time`, if there is one."""
+        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
+        return next((one for one in callbacks if isinstance(one, Timer) and one._duration), None)
+
+    def _clock(self, step: int) -> float:
+        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine.
+
+        By the clock of rank 0: with rates of their own, the ranks' weights would drift apart. Several ranks ask it
+        every `CLOCK_EVERY` steps only, as the answer is read back from the device.
+        """
+        timer = self._timer()
+        if timer is None:
+            return 0.0
+        if self.trainer.world_size == 1 or step % CLOCK_EVERY == 0:
+            elapsed = min(timer.time_elapsed() / (timer._duration or 1.0), 1.0)
+            self._clock_read = broadcast_from_rank0(elapsed, self.trainer.strategy.root_device)
+        return self._clock_read
 
     def _unrolled(self, particles: Particles, count: int) -> Iterator[Bundle]:
         if not self.recompute:
             yield from unroll(self.emulator, particles, count)
             return
-        solid = self.emulator.solid(particles)
+        context = self.emulator.context(particles)
         for _ in range(count):
-            bundle: Bundle = checkpoint(self.emulator, particles, solid, use_reentrant=False)
+            bundle: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
             yield bundle
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)
-
-    def _clock(self) -> float:
-        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine.
-
-        By the clock of process 0: with rates of their own, the processes' weights would drift apart.
-        """
-        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # (Lightning sets it)
-            if isinstance(callback, Timer) and callback._duration:
-                over = min(callback.time_elapsed() / callback._duration, 1.0)
-                return of_the_first(over, self.trainer.strategy.root_device)
-        return 0.0
 
     def _perturbed(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:

@@ -1,4 +1,4 @@
-"""The learning rate's course: linear warm-up, a flat stretch, half a cosine to zero."""
+"""Learning rate over the training: linear warm-up, a flat stretch, half a cosine to zero."""
 
 from __future__ import annotations
 
@@ -22,10 +22,17 @@ class Schedule:
     flat: int = 0
     start: float = 0.01
 
-    def factor(self, step: float, total: float) -> float:
-        """The factor at `step` of `total` steps; 0 from `total` on."""
-        if step < self.warmup:
-            return self.start + (1 - self.start) * step / self.warmup
+    def factor(self, step: int, total: float, clock: float = 0.0) -> float:
+        """The factor at a step; 0 once the steps or the time are over, whichever is first.
+
+        Args:
+            step: Steps taken.
+            total: Steps of the whole training; infinite where only its time is limited.
+            clock: Share of the training's time that is over, in [0, 1]; 0 where only its steps are limited.
+        """
         begin = self.warmup + self.flat
-        decayed = (step - begin) / max(total - begin, 1)
-        return 0.5 * (1 + math.cos(math.pi * min(max(decayed, 0.0), 1.0)))
+        by_time = (clock * total - begin) / max(total - begin, 1) if math.isfinite(total) else clock
+        by_steps = (step - begin) / max(total - begin, 1)
+        decay = 0.5 * (1 + math.cos(math.pi * min(max(by_steps, by_time, 0.0), 1.0)))
+        warm = self.start + (1 - self.start) * step / self.warmup if step < self.warmup else 1.0
+        return min(warm, decay)

@@ -17,7 +17,7 @@ from safetensors.torch import save
 from nmpm.errors import ZooError
 from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
 from nmpm.training.checkpoints import load_module
-from nmpm.zoo.registry import check_name, emulator_config
+from nmpm.zoo.registry import check_name
 
 
 def add(run: Path, name: str, root: Path, about: str = "") -> Path:
@@ -53,7 +53,7 @@ def add(run: Path, name: str, root: Path, about: str = "") -> Path:
     part = Path(tempfile.mkdtemp(prefix=".adding-", dir=target.parent))
     try:
         (part / "model.safetensors").write_bytes(weights)
-        (part / "config.yaml").write_text(_yaml(emulator_config(module.emulator)))
+        (part / "config.yaml").write_text(_yaml(module.emulator.recipe.to_dict()))
         (part / "card.yaml").write_text(_yaml(card))
         (part / "README.md").write_text(_readme(card, (run / "rollout.png").is_file()))
         if (run / "rollout.png").is_file():

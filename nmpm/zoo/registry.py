@@ -27,18 +27,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
+from nmpm._support.devices import find_device
 from nmpm._support.shipped import shipped
-from nmpm._support.specs import from_spec, to_spec
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.decoders import Decoder
-from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Emulator
-from nmpm.emulator.rollouts import rollout
+from nmpm.emulator import Emulator, EmulatorRecipe, rollout
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Particles
-from nmpm.processors import Processor
 from nmpm.scene import Scene
-from nmpm.transfer import Transfer
 
 NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 """What a pretrained network can run in, by name."""
@@ -50,7 +45,7 @@ class Pretrained:
     """A model from the zoo, ready to roll out or to fine-tune.
 
     Args:
-        emulator: In evaluation mode, on the CPU.
+        emulator: In evaluation mode.
         card: What `card.yaml` says.
     """
 
@@ -76,9 +71,21 @@ class Pretrained:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
 
+    def to(self, device: torch.device | str) -> Pretrained:
+        """The model on another device: "cpu", "cuda", "mps", or "auto" for the best that there is.
+
+        Raises:
+            ConfigError: if the device is not there.
+        """
+        return dataclasses.replace(self, emulator=self.emulator.to(find_device(device)))
+
     def rollout(self, state: Particles, frames: int) -> Tensor:
-        """Predict from a state: (B, frames, N, D) positions in domain length, the state's own frame not included."""
-        return rollout(self.emulator, state, frames)
+        """Predict from a state, which is moved to the model's device.
+
+        Returns:
+            (B, frames, N, D) positions in domain length, the state's own frame not included, on the model's device.
+        """
+        return rollout(self.emulator, state.to(self.emulator.device), frames)
 
 
 class Zoo:
@@ -100,12 +107,13 @@ class Zoo:
         return _read_yaml(_folder(name, root) / "card.yaml")
 
     @staticmethod
-    def load(name: str, root: Path | None = None) -> Pretrained:
+    def load(name: str, root: Path | None = None, device: torch.device | str = "cpu") -> Pretrained:
         """A pretrained model.
 
         Args:
             name: One of `Zoo.list()`.
             root: Folder of a zoo; the shipped one when left out.
+            device: Where to compute: "cpu", "cuda", "mps", or "auto" for the best that there is.
 
         Raises:
             ZooError: if there is no such model, a file is missing or damaged, or the weights are not those of the card.
@@ -114,42 +122,11 @@ class Zoo:
         card = _read_yaml(folder / "card.yaml")
         weights = _weights(folder / "model.safetensors", card)
         try:
-            emulator = emulator_from_config(_read_yaml(folder / "config.yaml"))
+            emulator = EmulatorRecipe.from_dict(_read_yaml(folder / "config.yaml")).build()
             emulator.load_state_dict(weights)
         except (ConfigError, RuntimeError, KeyError, TypeError) as error:
             raise ZooError(f"{folder}: config.yaml and model.safetensors do not make a model: {error}") from error
-        return Pretrained(emulator.eval().requires_grad_(False), card)
-
-
-def emulator_config(emulator: Emulator) -> dict[str, Any]:
-    """All that is needed to build an emulator of the same form, as plain data."""
-    return {
-        "scene": emulator.scene.to_dict(),
-        "cells": list(emulator.grid.shape),
-        "frames": emulator.frames,
-        "transfer": to_spec(emulator.transfer),
-        "processor": to_spec(emulator.recipe),
-        "decoder": to_spec(emulator.decoder),
-        "constraints": dataclasses.asdict(emulator.constraints),
-    }
-
-
-def emulator_from_config(config: Mapping[str, Any]) -> Emulator:
-    """The emulator that `emulator_config` described, with fresh weights.
-
-    Raises:
-        ConfigError: if the configuration names what is not known.
-        KeyError: if a key is missing.
-    """
-    return Emulator(
-        Scene.from_dict(config["scene"]),
-        cells=config["cells"],
-        frames=config["frames"],
-        transfer=from_spec(config["transfer"], Transfer),
-        processor=from_spec(config["processor"], Processor),
-        decoder=from_spec(config["decoder"], Decoder),
-        constraints=Constraints(**config.get("constraints", {})),
-    )
+        return Pretrained(emulator.eval().requires_grad_(False), card).to(device)
 
 
 def check_name(name: str) -> str:

@@ -85,8 +85,8 @@ def test_every_part_can_be_swapped_by_class_name(make_dataset):
     data = source("waterdrop.yaml", make_dataset)
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *swaps, "--trainer.default_root_dir", "run"]) == 0
     saved = EmulatorModule.load_from_checkpoint(next(Path().rglob("best.ckpt")), weights_only=True)
-    assert type(saved.emulator.recipe).__name__ == "FNO"
-    assert saved.emulator.recipe.modes == 4
+    assert type(saved.emulator.recipe.processor).__name__ == "FNO"
+    assert saved.emulator.recipe.processor.modes == 4
     assert type(saved.emulator.transfer).__name__ == "Quadratic"
     assert type(saved.emulator.decoder).__name__ == "Flip"
     assert list(Path("logs").rglob("metrics.csv"))
@@ -157,10 +157,13 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     }
 
 
+METRICS = '[{"class_path": "nmpm.metrics.MSE"}, {"class_path": "nmpm.metrics.EarthMover", "init_args": {"every": 10}}]'
+
+
 def test_configurations_are_laid_over_one_another_and_refer_to_other_values(make_dataset):
     Path("mine.yaml").write_text("trainer: {default_root_dir: 'run_${model.frames}_${data.batch_size}'}\n")
     words = ["--config", "waterdrop.yaml", "--config", "mine.yaml", *TINY, *source("waterdrop.yaml", make_dataset)]
-    assert main(["fit", *words, "--model.frames", "3", "--model.emd", "10"]) == 0
+    assert main(["fit", *words, "--model.frames", "3", "--model.metrics", METRICS]) == 0
     report = json.loads(Path("run_3_2/report.json").read_text())
     assert report["test"]["emd"] > 0
 

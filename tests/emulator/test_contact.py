@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scenes import box, cloud
 
 from nmpm.data.initial_states import lattice
+from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.contact import SURFACE, Contact
-from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout
 from nmpm.grid import Grid
 from nmpm.processors import Pointwise
@@ -95,7 +95,11 @@ def falling(solids: bool) -> torch.Tensor:
     """Lowest particle, after a block fell onto a slab, under a network that knows nothing."""
     scene = box(obstacles=True, particle_volume=0.01**2)
     torch.manual_seed(0)
-    emulator = Emulator(scene, 32, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=solids)).eval()
+    emulator = (
+        EmulatorRecipe(scene, 32, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=solids))
+        .build()
+        .eval()
+    )
     emulator.output_scale.fill_(1e-3)
     particles = cloud(scene)
     slab = lattice(((0.08, 0.92), (0.1, 0.2)), 0.01)[None]
@@ -113,7 +117,9 @@ def test_a_model_without_obstacles_pays_nothing_and_is_the_same():
     particles = cloud(scene)
     torch.manual_seed(0)
     with_, without = (
-        Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=on)).eval()
+        EmulatorRecipe(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=on))
+        .build()
+        .eval()
         for on in (True, False)
     )
     without.load_state_dict(with_.state_dict())

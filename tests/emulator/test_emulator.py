@@ -5,8 +5,8 @@ import torch
 from scenes import box, cloud
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
+from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.calibration import calibrate
-from nmpm.emulator.model import Emulator
 from nmpm.emulator.rasterise import grid_state
 from nmpm.emulator.rollouts import rollout, stream, unroll
 from nmpm.errors import ConfigError
@@ -20,9 +20,9 @@ DECODERS = (Absolute(), Residual(), Flip(), Blend(), Acceleration())
 CASES = [(t, d) for t in TRANSFERS for d in DECODERS]
 
 
-def small(scene, transfer=None, decoder=None, processor=SMALL, frames=3, cells=16):
+def small(scene, transfer=Linear(), decoder=Residual(), processor=SMALL, frames=3, cells=16):
     torch.manual_seed(0)
-    return Emulator(scene, cells, frames, transfer, processor, decoder).eval()
+    return EmulatorRecipe(scene, cells, frames, transfer, processor, decoder).build().eval()
 
 
 def silenced(emulator):
@@ -38,7 +38,7 @@ def test_every_combination_predicts_finite_bundles_within_the_walls(transfer, de
     scene = box(dim, ("water", "sand"))
     particles = cloud(scene, batch=2, speed=0.05)
     emulator = small(scene, transfer, decoder, cells=8)
-    bundle = emulator(particles, emulator.solid(particles))
+    bundle = emulator(particles)
     assert bundle.position.shape == (2, 3, 30, dim)
     assert bundle.velocity.shape == (2, 30, dim)
     assert bundle.position.min() >= 0.1 - 1e-6
@@ -297,10 +297,10 @@ def test_particles_a_piece_at_a_time_move_as_all_at_once(transfer, monkeypatch):
     scene = box(materials=("water", "sand"))
     emulator, particles = small(scene, transfer), cloud(scene)
     with torch.no_grad():
-        whole = emulator(particles, emulator.solid(particles))
+        whole = emulator(particles)
         for module in ("nmpm.transfer.base", "nmpm.emulator.advection"):
             monkeypatch.setattr(f"{module}.pieces", in_sevens)
-        cut = emulator(particles, emulator.solid(particles))
+        cut = emulator(particles)
     torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)
     torch.testing.assert_close(cut.velocity, whole.velocity, rtol=0, atol=1e-6)
 
@@ -309,9 +309,8 @@ def test_a_network_in_bfloat16_moves_particles_in_float32():
     scene = box()
     emulator, particles = small(scene), cloud(scene)
     quick = emulator.with_network(torch.bfloat16)
-    solid = emulator.solid(particles)
     with torch.no_grad():
-        exact, rough = emulator(particles, solid), quick(particles, solid)
+        exact, rough = emulator(particles), quick(particles)
     assert quick.network_precision == torch.bfloat16
     assert emulator.network_precision == rough.position.dtype == torch.float32
     assert 0 < (exact.position - rough.position).abs().max() < 1e-3

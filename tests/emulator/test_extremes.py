@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box, cloud
 
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.rasterise import grid_state
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import DataError
@@ -25,7 +25,7 @@ TRANSFERS = [Nearest(), Linear(), Quadratic(), Affine()]
 
 def emulator_of(scene: Scene, transfer=None, cells=16, frames=2) -> Emulator:
     torch.manual_seed(0)
-    return Emulator(scene, cells, frames, transfer or Linear(), Pointwise(hidden=(4,))).eval()
+    return EmulatorRecipe(scene, cells, frames, transfer or Linear(), Pointwise(hidden=(4,))).build().eval()
 
 
 def at(scene: Scene, position: torch.Tensor, velocity: float = 0.0) -> Particles:
@@ -74,7 +74,7 @@ def test_faces_corners_bounds_and_a_hair_beyond(transfer):
     places = [0.1, 0.9, 0.08, 0.92, _near(0.1, 0), _near(0.9, 1), _near(0.08, 0), _near(0.92, 1), -5.0, 7.0, 0.5]
     position = torch.cartesian_prod(torch.tensor(places), torch.tensor(places))
     emulator, particles = emulator_of(scene, transfer), at(scene, position, 1e-3)
-    predicted = emulator(particles, emulator.solid(particles)).position
+    predicted = emulator(particles).position
     assert predicted.isfinite().all()
     assert predicted.min() >= 0.1 - 1e-6  # held at the bounds from the first frame on
     assert predicted.max() <= 0.9 + 1e-6
@@ -148,7 +148,7 @@ def test_gradients_are_finite_beside_empty_cells_and_walls(transfer):
     velocity = particles.velocity.clone().requires_grad_()
     emulator = emulator_of(scene, transfer)
     moved = particles.moved(leaf, velocity)
-    bundle = emulator(moved, emulator.solid(moved))
+    bundle = emulator(moved)
     bundle.position.square().sum().backward()
     for tensor in (leaf.grad, velocity.grad, *(p.grad for p in emulator.parameters())):
         assert tensor is not None
@@ -173,9 +173,9 @@ def test_half_precision_around_leaves_transfers_alone(dtype):
     scene, grid = box(), Grid((16, 16), (0.0, 0.0), (1.0, 1.0), (False, False))
     particles = cloud(scene, count=200)
     emulator = emulator_of(scene)
-    full = emulator(particles, emulator.solid(particles)).position
+    full = emulator(particles).position
     with torch.autocast("cpu", dtype):
-        half = emulator(particles, emulator.solid(particles)).position
+        half = emulator(particles).position
         summed = Linear().p2g(torch.full((1, 100, 1), 4097.0), 16 * torch.rand(1, 100, 2), grid)
     assert half.dtype == torch.float32
     assert (half - full).abs().max() < 1e-2

@@ -5,8 +5,8 @@ import torch
 from scenes import box, cloud
 
 from nmpm.data.initial_states import lattice, resting
+from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
 from nmpm.emulator.rollouts import rollout, stream
 from nmpm.processors import Pointwise
@@ -14,7 +14,7 @@ from nmpm.processors import Pointwise
 
 def emulator_of(scene, scale: float, frames: int = 4) -> Emulator:
     torch.manual_seed(0)
-    emulator = Emulator(scene, 16, frames, processor=Pointwise(hidden=(4,))).eval()
+    emulator = EmulatorRecipe(scene, 16, frames, processor=Pointwise(hidden=(4,))).build().eval()
     emulator.output_scale.fill_(scale)
     return emulator
 
@@ -111,7 +111,11 @@ class TestBounds:
     def falling(self, rule: str) -> torch.Tensor:
         scene = box()
         torch.manual_seed(0)
-        emulator = Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds=rule)).eval()
+        emulator = (
+            EmulatorRecipe(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds=rule))
+            .build()
+            .eval()
+        )
         emulator.output_scale.fill_(1e-9)
         particles = cloud(scene, speed=0.0)
         particles = particles.moved(particles.position, torch.tensor([0.0, -0.03]).expand_as(particles.position))
@@ -129,7 +133,9 @@ class TestBounds:
 
     def test_error(self):
         scene = box()
-        emulator = Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds="error"))
+        emulator = EmulatorRecipe(
+            scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds="error")
+        ).build()
         particles = cloud(scene)
         fast = particles.moved(particles.position, torch.full_like(particles.position, 0.5))
         with pytest.raises(ValueError, match=r"particle 0: predicted at .* more than one beyond"):

@@ -3,27 +3,41 @@ import torch
 from scenes import box, cloud
 
 from nmpm.evaluation.baselines import free_fall, still
-from nmpm.evaluation.metrics import EarthMover, RolloutError, earth_mover
 from nmpm.grid import Grid
+from nmpm.metrics import MSE, EarthMover, earth_mover
+from nmpm.particles import Window
 from nmpm.training.losses import position_error
+
+
+def recorded(target: torch.Tensor, mask: torch.Tensor | None = None, material: torch.Tensor | None = None) -> Window:
+    """A window whose frames to predict (B, T, N, D) are given."""
+    batch, _, count, dim = target.shape
+    return Window(
+        frames=torch.cat([target[:, :1].expand(-1, 2, -1, -1), target], dim=1),
+        material=torch.zeros(batch, count, dtype=torch.int64) if material is None else material,
+        mask=torch.ones(batch, count, dtype=torch.bool) if mask is None else mask,
+        obstacle=torch.zeros(batch, 0, dim),
+        obstacle_mask=torch.zeros(batch, 0, dtype=torch.bool),
+        gravity=torch.zeros(batch, dim),
+    )
 
 
 def test_mse_at_h_is_the_mean_up_to_h_over_particles_and_dimensions():
     target = torch.zeros(2, 40, 5, 2)
     predicted = torch.arange(1, 41).view(1, -1, 1, 1).expand(2, 40, 5, 2).sqrt()  # squared error at frame i is i
-    metric = RolloutError((1, 8, 32, 100))
-    metric.update(predicted, target, torch.ones(2, 5, dtype=torch.bool))
+    metric = MSE((1, 8, 32, 100))
+    metric.update(recorded(target), predicted)
     found = {name: value.item() for name, value in metric.compute().items()}
     assert found == pytest.approx({"mse@1": 1.0, "mse@8": 4.5, "mse@32": 16.5, "mse": 20.5}, rel=1e-6)
 
 
 def test_padding_does_not_count_and_trajectories_of_any_length_do():
-    metric = RolloutError((2,))
+    metric = MSE((2,))
     mask = torch.tensor([[True, True, False]])
     predicted = torch.zeros(1, 4, 3, 2)
     predicted[:, :, 2] = 1e6
-    metric.update(predicted, torch.zeros_like(predicted), mask)
-    metric.update(torch.ones(1, 6, 1, 2), torch.zeros(1, 6, 1, 2), torch.ones(1, 1, dtype=torch.bool))
+    metric.update(recorded(torch.zeros_like(predicted), mask), predicted)
+    metric.update(recorded(torch.zeros(1, 6, 1, 2)), torch.ones(1, 6, 1, 2))
     assert [len(curve) for curve in metric.curves()] == [4, 6]
     assert [row["mse"] for row in metric.per_trajectory()] == [0.0, 1.0]
     assert metric.compute()["mse"] == 0.5
@@ -40,11 +54,10 @@ def test_earth_mover_keeps_materials_apart():
     metric = EarthMover(every=1)
     ours = torch.tensor([[[[0.0, 0.0], [1.0, 0.0]]]])
     theirs = ours.flip(2)
-    everyone = torch.ones(1, 2, dtype=torch.bool)
-    metric.update(ours, theirs, everyone, torch.tensor([[0, 0]]))
+    metric.update(recorded(theirs), ours)
     assert metric.compute()["emd"] == 0
     metric.reset()
-    metric.update(ours, theirs, everyone, torch.tensor([[0, 1]]))
+    metric.update(recorded(theirs, material=torch.tensor([[0, 1]])), ours)
     assert metric.compute()["emd"] == 1
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.processors import FFNO, FNO, TFNO, Axial, ConvNeXt, Identity, Pointwise, UNet, UNetModern
 
@@ -31,7 +31,7 @@ def test_trains_and_rolls_out(processor, dim, cells, periodic):
     scene = box(dim, ("water", "sand"), boundary=boundary, obstacles=True, **changes)
     particles = cloud(scene, batch=2, statics=5)
     torch.manual_seed(0)
-    emulator = Emulator(scene, cells, frames=2, processor=processor)
+    emulator = EmulatorRecipe(scene, cells, frames=2, processor=processor).build()
     with torch.autocast("cpu", torch.bfloat16):
         predicted = torch.cat([bundle.position for bundle in unroll(emulator, particles, 2)], dim=1)
     assert predicted.shape == (2, 4, 30, dim)

@@ -151,11 +151,11 @@ def test_calibration_of_parts_is_that_of_the_whole(folder, monkeypatch):
     whole, parted = (EmulatorModule(data.scene, cells=8, frames=2).emulator for _ in range(2))
     calibrate(whole, windows)
     asked = []  # what two processes would tell each other
-    monkeypatch.setattr("nmpm.emulator.calibration.gathered", lambda value: asked.append(value) or [value])
+    monkeypatch.setattr("nmpm.emulator.calibration.all_gather", lambda value: asked.append(value) or [value])
     for part in (windows[:1], windows[1:]):
         calibrate(parted, part)
     answers = iter([[asked[0], asked[2]], [asked[1], asked[3]]])
-    monkeypatch.setattr("nmpm.emulator.calibration.gathered", lambda _: next(answers))
+    monkeypatch.setattr("nmpm.emulator.calibration.all_gather", lambda _: next(answers))
     calibrate(parted, windows[:1])
     for name, value in whole.named_buffers():
         torch.testing.assert_close(dict(parted.named_buffers())[name], value)
@@ -163,7 +163,9 @@ def test_calibration_of_parts_is_that_of_the_whole(folder, monkeypatch):
 
 def test_one_process_writes_the_predictions_of_all_in_order(monkeypatch, tmp_path):
     made = [made_up_trajectory(5, particles) for particles in (3, 4, 5)]
-    monkeypatch.setattr("nmpm.training.callbacks.prediction_writer.collected", lambda mine: [made[::2], made[1::2]])
+    monkeypatch.setattr(
+        "nmpm.training.callbacks.prediction_writer.gather_to_rank0", lambda mine: [made[::2], made[1::2]]
+    )
     trainer = SimpleNamespace(is_global_zero=True, default_root_dir=tmp_path)
     PredictionWriter().on_predict_end(trainer, None)
     written = Split(tmp_path / "predictions.h5")

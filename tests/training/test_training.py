@@ -17,6 +17,7 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError, NmpmError
+from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.processors import UNet
 from nmpm.training import EmulatorModule
@@ -28,8 +29,8 @@ TINY = UNet(width=4, depth=1, perceptron=(4,))
 
 def module_of(data: TrajectoryDataModule, **changes) -> EmulatorModule:
     torch.manual_seed(0)
-    options = {"cells": 8, "frames": 2, "unroll": 2, "processor": TINY, "horizons": (1, 4), "position_noise": 1e-4}
-    return EmulatorModule(data.scene, **(options | {"grid_noise": 0.01} | changes))
+    options = {"cells": 8, "frames": 2, "unroll": 2, "processor": TINY, "position_noise": 1e-4}
+    return EmulatorModule(data.scene, metrics=[MSE((1, 4))], **(options | {"grid_noise": 0.01} | changes))
 
 
 def data_of(folder: Path) -> TrajectoryDataModule:
@@ -103,7 +104,11 @@ def test_a_checkpoint_stands_alone(make_dataset, tmp_path):
     trainer_of(tmp_path, 2).fit(model, data)
     loaded = EmulatorModule.load_from_checkpoint(tmp_path / "last.ckpt", weights_only=True, map_location="cpu")
     assert loaded.emulator.scene == data.scene
-    assert (loaded.emulator.recipe, loaded.emulator.transfer, loaded.emulator.decoder) == (TINY, Nearest(), Absolute())
+    assert (loaded.emulator.recipe.processor, loaded.emulator.transfer, loaded.emulator.decoder) == (
+        TINY,
+        Nearest(),
+        Absolute(),
+    )
     assert loaded.emulator.calibrated
     for name, value in model.emulator.state_dict().items():
         assert torch.equal(value, loaded.emulator.state_dict()[name]), name
@@ -123,7 +128,7 @@ def test_fine_tuning_starts_from_the_same_predictions(make_dataset, tmp_path):
     pretrained = module_of(data, transfer=Nearest()).emulator
     pretrained.output_scale.fill_(0.5)
     pretrained.calibrated.fill_(True)
-    tuned = EmulatorModule.of(pretrained, unroll=2, horizons=(1,))
+    tuned = EmulatorModule.of(pretrained, unroll=2)
     window = next(iter(data.test_dataloader()))
     before = rollout(pretrained.eval(), window.initial, 6)
     assert torch.equal(rollout(tuned.emulator.eval(), window.initial, 6), before)
@@ -207,7 +212,7 @@ def test_kill_9_in_mid_training_loses_nothing_but_time(make_dataset, tmp_path):
     folder = make_dataset()
 
     def script(root: Path) -> list[str]:
-        text = SCRIPT.format(tests=str(Path(__file__).parents[1]), folder=str(folder), root=str(root))
+        text = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(folder), root=str(root))
         return [sys.executable, "-c", text]
 
     environment = os.environ | {"OMP_NUM_THREADS": "1"}

@@ -14,8 +14,8 @@ import torch
 from scenes import box, cloud
 
 from nmpm.cli import main
+from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -32,9 +32,11 @@ def emulator_of(scene: Scene, constraints: Constraints = FREE, processor=None, t
     torch.manual_seed(0)
     recipe = processor or Pointwise(hidden=(8,))
     cells = 12 if scene.dim == 2 else 6
-    emulator = Emulator(
-        scene, cells, frames=2, transfer=transfer or Linear(), processor=recipe, constraints=constraints
-    ).eval()
+    emulator = (
+        EmulatorRecipe(scene, cells, frames=2, transfer=transfer or Linear(), processor=recipe, constraints=constraints)
+        .build()
+        .eval()
+    )
     emulator.output_scale.mul_(gain)
     return emulator.requires_grad_(False)
 

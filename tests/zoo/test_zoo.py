@@ -12,19 +12,19 @@ from nmpm._support.specs import from_spec
 from nmpm.cli import main
 from nmpm.data.format import Split
 from nmpm.decoders import Flip
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError, ZooError
 from nmpm.processors import Processor, UNet
 from nmpm.transfer import Quadratic
-from nmpm.zoo.registry import Zoo, emulator_config
+from nmpm.zoo import Zoo
 
 
 @pytest.fixture
 def root(tmp_path):
     """A zoo with one small model."""
     torch.manual_seed(0)
-    emulator = Emulator(box(), 16, 4, Quadratic(), UNet(width=4, depth=1, perceptron=(4,)), Flip())
+    emulator = EmulatorRecipe(box(), 16, 4, Quadratic(), UNet(width=4, depth=1, perceptron=(4,)), Flip()).build()
     emulator.input_std.fill_(2.0)
     write(tmp_path / "zoo" / "small", emulator)
     return tmp_path / "zoo"
@@ -34,7 +34,7 @@ def write(folder, emulator):
     folder.mkdir(parents=True)
     weights = save({name: value.contiguous() for name, value in emulator.state_dict().items()})
     (folder / "model.safetensors").write_bytes(weights)
-    (folder / "config.yaml").write_text(yaml.safe_dump(emulator_config(emulator)))
+    (folder / "config.yaml").write_text(yaml.safe_dump(emulator.recipe.to_dict()))
     card = {"name": "small", "dataset": "made up", "sha256": hashlib.sha256(weights).hexdigest(), "test": {"mse": 0.1}}
     (folder / "card.yaml").write_text(yaml.safe_dump(card))
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError
 from nmpm.evaluation.stress.course import SOUND, apart
@@ -61,17 +60,14 @@ def _regridded(subject: Subject, name: str, factor: float, size: Size) -> Line:
     mine = subject.emulator
     cells = [max(1, round(factor * n)) for n in mine.grid.shape]
     try:
-        other = Emulator(
-            mine.scene, cells, mine.frames, mine.transfer, mine.recipe, mine.decoder, constraints=mine.constraints
-        )
+        other = mine.rebuilt(dataclasses.replace(mine.recipe, cells=tuple(cells)))
     except ConfigError as error:
         return Line(_GROUP, f"grid {name}: {error}", None, {})
-    other.load_state_dict(mine.state_dict())
     if subject.preset is None:
         window = Window.of(subject.starts(1))
     else:
         window = simulated(subject.preset, subject.seeds(size.scenes), size.compared)
-    _, figures = judged(subject.over(other.eval()), window)
+    _, figures = judged(subject.over(other), window)
     return Line(_GROUP, f"grid {name}", None, figures)
 
 

@@ -1,4 +1,4 @@
-"""A training that has diverged is stopped before it writes a checkpoint of it."""
+"""Stop a training whose loss or weights are not finite, before a checkpoint of them is written."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
+from nmpm._support.collectives import any_rank
 from nmpm.errors import NmpmError
 
 
 class DivergedError(NmpmError):
-    """A training has come to weights or a loss that are not finite."""
+    """The loss or the weights of a training are not finite."""
 
 
 class DivergenceGuard(Callback):
-    """Looks at the loss every `log_every_n_steps` steps, and at the weights before each checkpoint and at the end.
+    """Checks the loss every `log_every_n_steps` steps, and the weights before each checkpoint and at the end.
 
     Raises:
         DivergedError: naming what is not finite, and the last good checkpoint.
@@ -35,8 +36,12 @@ class DivergenceGuard(Callback):
         if trainer.global_step % max(1, trainer.log_every_n_steps):  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         loss = outputs["loss"] if isinstance(outputs, dict) else outputs
-        if isinstance(loss, Tensor) and not torch.isfinite(loss).all():
-            raise self._diverged(trainer, f"the loss is {float(loss)}")
+        broken = isinstance(loss, Tensor) and not bool(torch.isfinite(loss).all())
+        # All ranks stop together: one that raised alone would leave the others waiting in their next collective.
+        if any_rank(broken, trainer.strategy.root_device):
+            raise self._diverged(
+                trainer, f"the loss is {float(loss)}" if broken else "the loss of another rank is not finite"
+            )
 
     def on_save_checkpoint(
         self,

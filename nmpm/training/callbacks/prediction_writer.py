@@ -9,7 +9,7 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
-from nmpm._support.collectives import collected
+from nmpm._support.collectives import gather_to_rank0
 from nmpm.data.format import Trajectory, write_split
 from nmpm.data.predictions import predicted_trajectory
 from nmpm.particles import Window
@@ -42,7 +42,7 @@ class PredictionWriter(BasePredictionWriter):
             self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        dealt = collected(self._made)
+        dealt = gather_to_rank0(self._made)
         if trainer.is_global_zero:
             turns = zip_longest(*dealt)  # trajectories are dealt in turn, so the last turn may be short
             made = [trajectory for turn in turns for trajectory in turn if trajectory is not None]

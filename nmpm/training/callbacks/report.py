@@ -18,7 +18,7 @@ from torch import Tensor
 from nmpm._support.atomic import replacing
 from nmpm._support.version import __version__
 from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
-from nmpm.evaluation.metrics import RolloutError
+from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.training.module import EmulatorModule
 from nmpm.viz import Exhibit, animation, snapshots
@@ -78,7 +78,7 @@ class Report(Callback):
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not isinstance(pl_module, EmulatorModule):
             return
-        judged = {kind: _gathered(metric) for kind, metric in pl_module.test_errors.errors.items()}
+        judged = {kind: _all_ranks(metric) for kind, metric in pl_module.test_errors.errors.items()}
         if not trainer.is_global_zero:
             return
         folder = Path(trainer.default_root_dir)
@@ -149,7 +149,7 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def _gathered(metric: RolloutError) -> tuple[list[dict[str, float]], list[Tensor]]:
+def _all_ranks(metric: MSE) -> tuple[list[dict[str, float]], list[Tensor]]:
     """MSE per trajectory and curves, from all processes."""
     with metric.sync_context():
         return metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]

@@ -39,7 +39,7 @@ def write_compiled(part: Part, about: Mapping[str, str], path: Path) -> None:
             with torch.no_grad():
                 _inductor.aoti_compile_and_package(exported, package_path=str(temporary), inductor_configs=settings)
         except Exception as error:  # the compiler's own among them
-            recipe = type(part.emulator.recipe).__name__
+            recipe = type(part.emulator.recipe.processor).__name__
             raise ConfigError(
                 f"AOTInductor cannot compile the model with its {recipe} ({type(error).__name__}: {first_line(error)})."
                 " --format onnx needs no compiler."

@@ -87,7 +87,7 @@ def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
                 verbose=False,
             )
     except RuntimeError as error:
-        recipe = type(part.emulator.recipe).__name__
+        recipe = type(part.emulator.recipe.processor).__name__
         raise ConfigError(
             f"The model cannot be written as ONNX, which lacks an operation of {recipe} or of the transfer:"
             f" {_reason(error)}. --format pt2 takes whatever torch.export does."

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import Emulator, RolloutContext
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
@@ -121,11 +121,11 @@ class Step(Part):
         solid = self.emulator.solid(state) if solid is None else solid
         own = self.emulator.budget(state)
         if own is None or budget is None:
-            bundle = self.emulator(state, solid)
+            bundle = self.emulator(state, RolloutContext(solid, own))
             return bundle.position, bundle.velocity
-        held = torch.where(budget.isnan(), own, budget)
-        bundle = self.emulator(state, solid, held)
-        return bundle.position, bundle.velocity, held
+        kept = torch.where(budget.isnan(), own, budget)
+        bundle = self.emulator(state, RolloutContext(solid, kept))
+        return bundle.position, bundle.velocity, kept
 
     def _state(self, position: Tensor, velocity: Tensor, material: Tensor | None, gravity: Tensor | None) -> Particles:
         batch, count, dim = position.shape

@@ -23,7 +23,7 @@ def program(part: Part) -> ExportedProgram:
         with torch.no_grad(), using("native"):
             return torch.export.export(part, (), example, dynamic_shapes=shapes)
     except Exception as error:  # whatever a network of anybody's does that a program cannot
-        recipe = type(part.emulator.recipe).__name__
+        recipe = type(part.emulator.recipe.processor).__name__
         raise ConfigError(
             f"torch.export cannot follow {recipe} ({type(error).__name__}: {first_line(error)}). Networks that decide"
             " by their data, or fix the number of scenes, cannot be exported: use torch.where, x.shape[0] for len(x)."

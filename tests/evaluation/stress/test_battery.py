@@ -8,8 +8,8 @@ from scenes import box, cloud
 
 from nmpm.data.initial_states import lattice, resting, thrown_blocks
 from nmpm.decoders import Absolute
+from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import beyond_walls, rollout
 from nmpm.evaluation.stress import GROUPS, Line, Size, Subject, battery
 from nmpm.evaluation.stress.course import Course, apart, energy_above_lowest, filled, follow, outside
@@ -28,7 +28,7 @@ QUIET = Constraints(energy=True, rest_speed=0.05)
 
 def emulator_of(scene, cells=32, constraints=QUIET, scale=1e-3) -> Emulator:
     torch.manual_seed(0)
-    emulator = Emulator(scene, cells, 4, processor=Pointwise(hidden=(4,)), constraints=constraints).eval()
+    emulator = EmulatorRecipe(scene, cells, 4, processor=Pointwise(hidden=(4,)), constraints=constraints).build().eval()
     emulator.output_scale.fill_(scale)
     return emulator
 
@@ -190,7 +190,7 @@ def test_one_in_the_way_of_a_model_without_walls_is_left_out():
 def test_absolute_models_are_taken_too():
     scene = box()
     torch.manual_seed(0)
-    emulator = Emulator(scene, 16, 4, processor=Pointwise(hidden=(4,)), decoder=Absolute()).eval()
+    emulator = EmulatorRecipe(scene, 16, 4, processor=Pointwise(hidden=(4,)), decoder=Absolute()).build().eval()
     assert rollout(emulator, cloud(scene), 4).isfinite().all()
     assert list(battery(Subject("absolute", emulator, 8), TINY, {"precision": GROUPS["precision"]}))
 

@@ -1,0 +1,161 @@
+"""The recipe of an emulator: all that its form depends on, as plain data that checkpoints and zoo entries store."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+from nmpm._support.plain_data import to_lists
+from nmpm._support.specs import from_spec, to_spec
+from nmpm.decoders import Decoder, Residual
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.model import Emulator
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
+from nmpm.processors import Processor, UNet
+from nmpm.scene import Scene
+from nmpm.transfer import Linear, Transfer
+
+FORMAT = 1
+"""Version of the form that `to_dict` writes; raised when an older nmpm could not read it."""
+
+
+@dataclass(frozen=True)
+class EmulatorRecipe:
+    """Everything that decides the form of an emulator; only its weights and normalisation statistics are learnt.
+
+    Each argument may be given as the plain data that `to_dict` makes of it.
+
+    Args:
+        scene: The facts of the scenes: channels, dimension, walls; from the command line it comes from the data.
+        cells: Grid cells along the longest axis, or along each.
+        frames: m, frames predicted by one call of the processor (time bundling).
+        transfer: How particles and grid see each other.
+        processor: The network on the grid.
+        decoder: What the network's output means.
+        grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training only.
+        constraints: Facts that rollouts are held to; but for the bounds they do not act in training.
+
+    Raises:
+        ConfigError: if scene, grid, processor and constraints do not suit each other.
+    """
+
+    scene: Scene
+    cells: int | tuple[int, ...] = 64
+    frames: int = 8
+    transfer: Transfer = Linear()  # noqa: RUF009 (frozen)
+    processor: Processor = UNet()  # noqa: RUF009
+    decoder: Decoder = Residual()  # noqa: RUF009
+    grid_noise: float = 0.0
+    constraints: Constraints = Constraints()  # noqa: RUF009
+
+    def __post_init__(self) -> None:
+        scene = self.scene if isinstance(self.scene, Scene) else Scene.from_dict(self.scene)
+        constraints = self.constraints
+        read = {
+            "scene": scene,
+            "cells": Grid.of(scene, self.cells).shape,
+            "transfer": from_spec(self.transfer, Transfer),
+            "processor": from_spec(self.processor, Processor),
+            "decoder": from_spec(self.decoder, Decoder),
+            "constraints": constraints if isinstance(constraints, Constraints) else _constraints(constraints),
+        }
+        for name, value in read.items():
+            object.__setattr__(self, name, value)
+        if self.frames < 1:
+            raise ConfigError(f"frames = {self.frames}: a call predicts at least 1 frame.")
+        if self.constraints.energy and not self.scene.gravity_known:
+            raise ConfigError(
+                "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
+            )
+        self.processor.check_grid(self.grid)
+
+    @property
+    def grid(self) -> Grid:
+        """The grid over the scene's domain."""
+        return Grid.of(self.scene, self.cells)
+
+    def build(self) -> Emulator:
+        """An emulator of this form, its weights drawn from torch's random state, its statistics not yet calibrated."""
+        return Emulator(self)
+
+    def over(self, scene: Scene) -> Self:
+        """The recipe for another scene, on a grid with cells of the same size.
+
+        Args:
+            scene: Other bounds and domain, finer or coarser particles, perhaps obstacles where there were walls
+                already; all else must be the same.
+
+        Raises:
+            ConfigError: if channels, time step or gravity differ, the domain is not a whole number of cells, or the
+                processor cannot take the grid.
+        """
+        for name in ("input_channels", "dt", "boundary", "gravity"):
+            if getattr(scene, name) != getattr(self.scene, name):
+                raise ConfigError(
+                    f"The emulator was made for {name} = {getattr(self.scene, name)}; the other scene has"
+                    f" {getattr(scene, name)}."
+                )
+        spacing = self.grid.spacing
+        sides = [(high - low) / h for (low, high), h in zip(scene.domain, spacing, strict=True)]
+        if any(abs(side - round(side)) > 1e-4 for side in sides):
+            raise ConfigError(
+                f"The domain {scene.domain} is {[round(side, 4) for side in sides]} cells of the emulator's grid"
+                f" {spacing}; whole numbers are needed."
+            )
+        return dataclasses.replace(self, scene=scene, cells=tuple(round(side) for side in sides))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The recipe as plain lists, strings and numbers, with the version of this form."""
+        plain = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        return {"format": FORMAT, **plain}
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Self:
+        """The recipe that `to_dict` described; files of version 0.1.0, which lack `format`, are read too.
+
+        Raises:
+            ConfigError: if a newer nmpm wrote it, or a key is missing, unknown or wrong.
+        """
+        values = dict(plain)
+        check_format(values.pop("format", 0), "This model")
+        known = {field.name for field in dataclasses.fields(cls)}
+        wrong = sorted(set(values) - known) or sorted({"scene", "cells", "frames", "processor"} - set(values))
+        if wrong:
+            raise ConfigError(
+                f"A recipe of an emulator has unknown or missing keys: {', '.join(wrong)}; it has"
+                f" {', '.join(sorted(known))}."
+            )
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise ConfigError(f"The recipe of an emulator cannot be read: {error}.") from error
+
+
+def check_format(found: object, what: str) -> None:
+    """Make sure that this version can read a file's format.
+
+    Raises:
+        ConfigError: if the format is newer, or not a number.
+    """
+    if not isinstance(found, int) or found > FORMAT:
+        raise ConfigError(f"{what} has format {found}; this nmpm reads up to {FORMAT}: pip install --upgrade nmpm.")
+
+
+def _constraints(plain: Any) -> Constraints:
+    if not isinstance(plain, Mapping):
+        raise ConfigError(f"constraints must map names to values; got {plain!r}.")
+    try:
+        return Constraints(**plain)
+    except TypeError as error:
+        raise ConfigError(f"constraints: {error}.") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Scene):
+        return value.to_dict()
+    if isinstance(value, Constraints):
+        return dataclasses.asdict(value)
+    return to_spec(value) if dataclasses.is_dataclass(value) else to_lists(value)

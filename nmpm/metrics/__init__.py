@@ -1,0 +1,10 @@
+"""Rollout metrics: the contract and one metric per file.
+
+A metric is added by one file and one line here; others are named by their class path in a configuration.
+"""
+
+from nmpm.metrics.base import RolloutMetric
+from nmpm.metrics.earth_mover import EarthMover, earth_mover
+from nmpm.metrics.mse import MSE
+
+__all__ = ["MSE", "EarthMover", "RolloutMetric", "earth_mover"]

@@ -1,0 +1,65 @@
+"""Mean squared position error of rollouts.
+
+*MSE at h*: the mean over predicted frames 1 … h, particles that move and dimensions, of the squared position error, in
+domain length squared, from a rollout that starts with frames 0 and 1; *full* is h = T - 2. Averaged over trajectories.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchmetrics.utilities import dim_zero_cat
+
+from nmpm.metrics.base import RolloutMetric
+from nmpm.particles import Window
+
+
+class MSE(RolloutMetric):
+    """Squared position error of each trajectory at each predicted frame, reported as MSE at horizons.
+
+    Args:
+        horizons: Frames h at which the MSE is reported, beside the full rollout.
+    """
+
+    squared: list[Tensor] | Tensor  # one tensor once gathered from several processes
+    lengths: list[Tensor] | Tensor
+
+    def __init__(self, horizons: Sequence[int] = (1, 8, 32, 100)) -> None:
+        super().__init__()
+        self.horizons = tuple(horizons)
+        self.add_state("squared", default=[], dist_reduce_fx="cat")
+        self.add_state("lengths", default=[], dist_reduce_fx="cat")
+
+    def update(self, window: Window, predicted: Tensor) -> None:
+        mask = window.mask
+        squared = (predicted.double() - window.target.double()).square().mean(-1) * mask.unsqueeze(1)
+        per_frame = squared.sum(-1) / mask.sum(-1, keepdim=True)
+        self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
+        self.lengths.append(  # type: ignore[union-attr]  # (likewise)
+            torch.full((len(per_frame),), per_frame.shape[1], device=per_frame.device)
+        )
+
+    def curves(self) -> list[Tensor]:
+        """One (T,) curve of squared error against frame for each trajectory."""
+        if not len(self.lengths):
+            return []
+        lengths: list[int] = dim_zero_cat(self.lengths).tolist()
+        return list(dim_zero_cat(self.squared).split(lengths))
+
+    def per_trajectory(self) -> list[dict[str, float]]:
+        """MSE at each horizon that the trajectory reaches, and over the full rollout ("mse")."""
+        return [self._at_horizons(curve.double()) for curve in self.curves()]
+
+    def compute(self) -> dict[str, Tensor]:
+        """Means over trajectories, by the names "mse@h" and "mse"."""
+        rows = self.per_trajectory()
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        means = {name: np.mean([row[name] for row in rows if name in row]) for name in names}
+        return {name: torch.tensor(value, dtype=torch.float32) for name, value in means.items()}
+
+    def _at_horizons(self, curve: Tensor) -> dict[str, float]:
+        row = {f"mse@{h}": float(curve[:h].mean()) for h in self.horizons if h <= len(curve)}
+        return row | {"mse": float(curve.mean())}
