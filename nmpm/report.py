@@ -21,7 +21,7 @@ from nmpm.metrics import RolloutError
 from nmpm.particles import Window
 from nmpm.training import EmulatorModule
 from nmpm.version import __version__
-from nmpm.viz import Exhibit, animation, snapshots
+from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
 
 
 class Report(Callback):
@@ -89,8 +89,8 @@ class Report(Callback):
         _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in judged.items()})
         if self._exhibit is not None:
             exhibit = exhibit_of(pl_module, *self._exhibit)
-            snapshots(exhibit, folder / "rollout.png")
-            animation(exhibit, folder / "rollout.gif")
+            write_snapshots(exhibit, folder / "rollout.png")
+            write_animation(exhibit, folder / "rollout.gif")
         _print_table(figures, folder)
 
     def _elapsed(self) -> float:
@@ -118,7 +118,7 @@ class Report(Callback):
         }
 
 
-def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exhibit:
+def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> LabelledTrajectories:
     """The first trajectory of a batch beside its prediction, as something to draw.
 
     Both start with the two frames that the prediction started from; both end where the prediction is not finite.
@@ -131,7 +131,7 @@ def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exh
     rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
     title = f"The prediction is not finite from frame {frames} on" if broken.any() else ""
-    return Exhibit.of_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
+    return LabelledTrajectories.from_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
 
 
 def hardware() -> str:
