@@ -23,9 +23,7 @@ def run(words: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="nmpm render", description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4."
     )
-    parser.add_argument(
-        "file", type=Path, help="an HDF5 file written by nmpm rollout, or of a dataset in native format"
-    )
+    parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
     parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: the first)")
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
     parser.add_argument("--mp4", action="store_true", help="write an MP4 instead of a GIF (pip install nmpm[video])")

@@ -105,9 +105,8 @@ def test_a_full_disk_keeps_the_old_file(falling, tmp_path, write, name):
 def test_a_failing_encoder_is_reported(falling, tmp_path, monkeypatch):
     """The encoder reads everything, then fails without closing the video: imageio does not report it."""
     encoder = tmp_path / "encoder.py"
-    encoder.write_text(
-        f"#!{sys.executable}\nimport sys\nopen(sys.argv[-1], 'wb').write(b'half')\nsys.stdin.buffer.read()\nsys.exit(1)\n"
-    )
+    lines = "import sys", "open(sys.argv[-1], 'wb').write(b'half')", "sys.stdin.buffer.read()", "sys.exit(1)"
+    encoder.write_text("\n".join((f"#!{sys.executable}", *lines)))
     encoder.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(encoder))
     with pytest.raises(DataError, match="video encoder"):
