@@ -46,10 +46,10 @@ def test_a_missing_folder_is_reported_before_drawing(falling, tmp_path, write, n
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("write", "name"), FORMATS)
 def test_a_read_only_folder_is_reported_before_drawing(falling, tmp_path, monkeypatch, write, name):
-    def refuse(**_):
+    def fail(**_):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)  # permission bits do not stop root
+    monkeypatch.setattr(tempfile, "TemporaryFile", fail)  # permission bits do not stop root
     with pytest.raises(DataError, match=r"not writable \(Read-only file system\)"):
         write(falling, tmp_path / name)
 

@@ -56,10 +56,10 @@ def test_obstacles_are_drawn(still):
 
 def test_particles_out_of_view_are_counted_and_not_drawn(falling):
     panel = PanelRenderer(falling, 200)
-    gone = np.array([[0.3, 0.8], [1e30, -1e30]])
+    positions = np.array([[0.3, 0.8], [1e30, -1e30]])
     assert panel.count_outside(first_frame(falling)) == 0
-    assert panel.count_outside(gone) == 1
-    assert tuple(panel.draw(gone)[panel.pixel_of(gone[0])]) == material_colour("water")
+    assert panel.count_outside(positions) == 1
+    assert tuple(panel.draw(positions)[panel.pixel_of(positions[0])]) == material_colour("water")
 
 
 def test_particles_wrap_along_a_periodic_axis(falling):
