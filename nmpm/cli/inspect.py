@@ -153,14 +153,14 @@ def _draw(origin: Folder, found: Inspection, path: Path) -> None:
     import numpy as np
 
     from nmpm.data.format import Split, split_paths
-    from nmpm.viz import Exhibit, material_names, snapshots
+    from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
     metadata = origin.metadata
     trajectory = Split(next(iter(split_paths(origin.folder).values()))).read(0)
     moving = np.isin(trajectory.particle_type, metadata.moving_types)
     static = np.isin(trajectory.particle_type, list(metadata.static_types))
-    exhibit = Exhibit(
-        rows={"recorded": trajectory.position[:, moving]},
+    exhibit = LabelledTrajectories(
+        positions={"recorded": trajectory.position[:, moving]},
         material=material_names(trajectory.particle_type[moving], metadata.particle_types),
         bounds=origin.scene.bounds,
         dt=metadata.dt,
@@ -170,5 +170,5 @@ def _draw(origin: Folder, found: Inspection, path: Path) -> None:
         gravity=origin.scene.gravity,
         title=f"{Path(found.path).name}, first trajectory",
     )
-    snapshots(exhibit, path)
+    write_snapshots(exhibit, path)
     sys.stdout.write(f"\nwrote {path}\n")

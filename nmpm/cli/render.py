@@ -1,4 +1,4 @@
-"""`nmpm render out.h5`: PNG and GIF of a trajectory."""
+"""`nmpm render out.h5`: PNG and GIF or MP4 of a trajectory."""
 
 from __future__ import annotations
 
@@ -15,35 +15,48 @@ from nmpm.errors import ConfigError
 if TYPE_CHECKING:
     from nmpm.data.format import Split, Trajectory
     from nmpm.scene import Scene
+    from nmpm.viz import LabelledTrajectories
 
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["render", "out.h5"]."""
     parser = argparse.ArgumentParser(
-        prog="nmpm render", description="Draw a trajectory: snapshots as PNG, animation as GIF, beside the file."
+        prog="nmpm render", description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4."
     )
-    parser.add_argument("file", type=Path, help="an HDF5 file, of nmpm rollout or of a dataset in the native layout")
-    parser.add_argument("--trajectory", type=int, default=0, help="which trajectory (default: the first)")
-    parser.add_argument("--family", help="what type ids mean where metadata.json does not say: deepmind, lagrangebench")
-    parser.add_argument("--out", type=Path, help="name of the pictures, without ending (default: that of the file)")
-    chosen = parser.parse_args(words[1:])
+    parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
+    parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: the first)")
+    parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
+    parser.add_argument("--mp4", action="store_true", help="write an MP4 instead of a GIF (pip install nmpm[video])")
+    parser.add_argument("--out", type=Path, help="path of the pictures without suffix (default: that of the file)")
+    arguments = parser.parse_args(words[1:])
     from nmpm.data.format import Split
+    from nmpm.viz import write_animation, write_snapshots
+    from nmpm.viz.output import check_output
 
-    split = Split(chosen.file)
-    if not 0 <= chosen.trajectory < len(split):
-        raise ConfigError(f"--trajectory {chosen.trajectory}: {chosen.file} holds trajectories 0 … {len(split) - 1}.")
-    _draw(split, chosen.trajectory, chosen.family, chosen.out or chosen.file.with_suffix(""))
+    stem = arguments.out or arguments.file.with_suffix("")
+    picture = stem.with_name(f"{stem.name}.png")
+    video = stem.with_name(f"{stem.name}{'.mp4' if arguments.mp4 else '.gif'}")
+    split = Split(arguments.file)
+    if not 0 <= arguments.trajectory < len(split):
+        raise ConfigError(
+            f"--trajectory {arguments.trajectory}: {arguments.file} contains trajectories 0 … {len(split) - 1}."
+        )
+    for path in (picture, video):
+        check_output(path)
+    trajectories = _read(split, arguments.trajectory, arguments.family)
+    for path in (write_snapshots(trajectories, picture), write_animation(trajectories, video)):
+        sys.stdout.write(f"wrote {path}\n")
 
 
-def _draw(split: Split, index: int, family: str | None, stem: Path) -> None:
-    from nmpm.viz import Exhibit, animation, material_names, snapshots
+def _read(split: Split, index: int, family: str | None) -> LabelledTrajectories:
+    from nmpm.viz import LabelledTrajectories, material_names
 
     trajectory = split.read(index)
-    scene, names, static = _facts(split, trajectory, family)
+    scene, names, static = _describe(split, trajectory, family)
     moving = ~np.isin(trajectory.particle_type, sorted(static))
     label = "prediction" if "predicted" in str(trajectory.attributes.get("generator", "")) else "recorded"
-    exhibit = Exhibit(
-        rows={label: trajectory.position[:, moving]},
+    return LabelledTrajectories(
+        positions={label: trajectory.position[:, moving]},
         material=material_names(trajectory.particle_type[moving], names),
         bounds=scene.bounds,
         dt=scene.dt,
@@ -52,22 +65,18 @@ def _draw(split: Split, index: int, family: str | None, stem: Path) -> None:
         periodic=scene.periodic,
         gravity=scene.gravity,
     )
-    for suffix, draw in ((".png", snapshots), (".gif", animation)):
-        target = stem.with_name(stem.name + suffix)
-        draw(exhibit, target)
-        sys.stdout.write(f"wrote {target}\n")
 
 
-def _facts(split: Split, trajectory: Trajectory, family: str | None) -> tuple[Scene, dict[int, str], frozenset[int]]:
-    """Scene, names of the type ids and static ids: from the trajectory itself if a rollout wrote it, else metadata."""
+def _describe(split: Split, trajectory: Trajectory, family: str | None) -> tuple[Scene, dict[int, str], frozenset[int]]:
+    """Scene, names of the type ids and static ids: from a rollout's own attributes, otherwise from metadata.json."""
     from nmpm.data.format import read_metadata
     from nmpm.data.scenes import infer_scene
     from nmpm.scene import Scene
 
     if "scene" in trajectory.attributes:
         names = json.loads(trajectory.attributes["particle_types"])
-        static = frozenset(int(number) for number in trajectory.attributes["static_types"])
+        static = frozenset(int(index) for index in trajectory.attributes["static_types"])
         scene = Scene.from_dict(json.loads(trajectory.attributes["scene"]))
-        return scene, {int(number): name for number, name in names.items()}, static
+        return scene, {int(index): name for index, name in names.items()}, static
     metadata = read_metadata(split.path.parent, family)
     return infer_scene(split.path.parent, family), dict(metadata.particle_types), metadata.static_types

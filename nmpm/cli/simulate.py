@@ -115,14 +115,14 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
     from rich.progress import Progress
 
     from nmpm.sim.preset import BOUNDARY
-    from nmpm.viz import Exhibit, material_names, snapshots
+    from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
         made = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
     moving, scene = made.particle_type != BOUNDARY, preset.scene
-    exhibit = Exhibit(
-        rows={"simulated": made.position[:, moving]},
+    exhibit = LabelledTrajectories(
+        positions={"simulated": made.position[:, moving]},
         material=material_names(made.particle_type[moving], preset.type_names),
         bounds=scene.bounds,
         dt=scene.dt,
@@ -132,5 +132,5 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
         gravity=tuple(np.asarray(made.attributes.get("gravity", scene.gravity or ())).tolist()) or None,
         title=f"{preset.name}, simulated by nmpm ({preset.generator})",
     )
-    snapshots(exhibit, path)
+    write_snapshots(exhibit, path)
     sys.stdout.write(f"wrote {path}\n")

@@ -1,14 +1,14 @@
-"""Pictures of particle trajectories: snapshots (PNG) and animations (GIF, MP4), drawn from NumPy arrays alone.
+"""Pictures of particle trajectories: snapshots (PNG) and animations (GIF, MP4), drawn from NumPy arrays.
 
 Usage::
 
-    exhibit = Exhibit({"simulation": truth, "prediction": rollout}, material, bounds=bounds, dt=dt)
-    snapshots(exhibit, "rollout.png")
-    animation(exhibit, "rollout.gif")
+    trajectories = LabelledTrajectories({"simulation": truth, "prediction": rollout}, material, bounds=bounds, dt=dt)
+    write_snapshots(trajectories, "rollout.png")
+    write_animation(trajectories, "rollout.gif")
 """
 
-from nmpm.viz.animation import animation
-from nmpm.viz.exhibit import Exhibit, material_names
-from nmpm.viz.snapshots import snapshots
+from nmpm.viz.animation import write_animation
+from nmpm.viz.snapshots import write_snapshots
+from nmpm.viz.trajectories import LabelledTrajectories, material_names
 
-__all__ = ["Exhibit", "animation", "material_names", "snapshots"]
+__all__ = ["LabelledTrajectories", "material_names", "write_animation", "write_snapshots"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -12,66 +11,70 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.atomic import replacing
 from nmpm.errors import ConfigError
-from nmpm.viz.exhibit import Exhibit
+from nmpm.viz.frame_renderer import FrameRenderer
 from nmpm.viz.gif_palette import TRANSPARENT, GifPalette
-from nmpm.viz.output import check_suffix
-from nmpm.viz.progress import tracked
-from nmpm.viz.reel import Reel
+from nmpm.viz.output import check_output, check_suffix, replace_picture
+from nmpm.viz.progress import with_progress_bar
+from nmpm.viz.trajectories import LabelledTrajectories
 
-SAMPLES = 5
-"""Frames that the palette of a GIF is chosen from."""
-HOLD = 1.0
-"""Seconds that a GIF rests on its last frame before it starts again."""
+PALETTE_SAMPLES = 5
+"""Number of frames from which the palette of a GIF is chosen."""
+LAST_FRAME_SECONDS = 1.0
+"""How long a GIF shows its last frame before it starts again."""
 
 
-class _Order(NamedTuple):
-    reel: Reel
-    moments: list[int]
+class _Animation(NamedTuple):
+    renderer: FrameRenderer
+    frames: list[int]
     fps: float
     name: str
 
-    def drawn(self) -> Iterator[NDArray[np.uint8]]:
-        """The frames, one after the other, with a progress bar where that takes long."""
-        return tracked(map(self.reel.draw, self.moments), len(self.moments), f"Drawing {self.name}")
+    def draw_frames(self) -> Iterator[NDArray[np.uint8]]:
+        """Draws the frames in order, with a progress bar if this takes long."""
+        return with_progress_bar(map(self.renderer.draw, self.frames), len(self.frames), f"Drawing {self.name}")
 
 
-def animation(exhibit: Exhibit, path: Path | str, fps: float = 20.0, max_frames: int = 100, side: int = 320) -> Path:
-    """Writes an animation of the trajectories, side by side in the exhibit's order.
+def write_animation(
+    trajectories: LabelledTrajectories, path: Path | str, fps: float = 20.0, max_frames: int = 100, side: int = 320
+) -> Path:
+    """Writes an animation of the trajectories, side by side in the given order.
 
     Args:
-        exhibit: What to draw.
-        path: A `.gif` or `.mp4` file; replaced only once the new one is whole.
-        fps: Drawn frames per second; a GIF counts hundredths of a second and rounds to them.
-        max_frames: Draws at most so many frames, evenly spread from the first to the last.
+        trajectories: What to draw.
+        path: A `.gif` or `.mp4` file; an existing one is replaced only when the new one is complete.
+        fps: Drawn frames per second; a GIF rounds the time per frame to hundredths of a second.
+        max_frames: Largest number of frames to draw, evenly spaced from the first to the last.
         side: Side of a square panel in pixels.
 
     Returns:
         The path.
 
     Raises:
-        ConfigError: if the suffix is not supported, a number is out of range, or MP4 lacks its encoder.
+        ConfigError: if the suffix is not supported, an argument is out of range, or the MP4 encoder is not installed.
+        DataError: if the file cannot be written; a missing or read-only folder is found before drawing.
     """
     path = Path(path)
     write = _WRITERS[check_suffix(path, _WRITERS, "an animation")]
     if not 0 < fps <= 50:
-        raise ConfigError(f"fps = {fps} must be above 0 and at most 50, the fastest that viewers play.")
+        raise ConfigError(f"fps = {fps} must be above 0 and at most 50, the highest rate that viewers play.")
     if max_frames < 1 or not 64 <= side <= 4096:
         raise ConfigError(f"max_frames = {max_frames} must be at least 1, and side = {side} within 64 and 4096 pixels.")
-    order = _Order(Reel(exhibit, side), exhibit.spread(max_frames), fps, path.name)
-    with replacing(path) as temporary:
-        write(order, temporary)
+    check_output(path)
+    frames = trajectories.evenly_spaced_frames(max_frames)
+    animation = _Animation(FrameRenderer(trajectories, side), frames, fps, path.name)
+    with replace_picture(path) as temporary:
+        write(animation, temporary)
     return path
 
 
-def _write_gif(order: _Order, path: Path) -> None:
-    spread = np.linspace(0, len(order.moments) - 1, SAMPLES).astype(int)
-    samples = [order.reel.draw(order.moments[place]) for place in dict.fromkeys(spread.tolist())]
-    chosen = GifPalette(samples, order.reel.colours)
-    first, *rest = (chosen.apply(frame) for frame in order.drawn())
-    frame_time = round(100 / order.fps) * 10
-    durations = [frame_time] * len(rest) + [max(frame_time, round(HOLD * 1000))]
+def _write_gif(animation: _Animation, path: Path) -> None:
+    indices = np.linspace(0, len(animation.frames) - 1, PALETTE_SAMPLES).astype(int)
+    samples = [animation.renderer.draw(animation.frames[index]) for index in dict.fromkeys(indices.tolist())]
+    palette = GifPalette(samples, animation.renderer.colours)
+    first, *rest = (palette.quantize(frame) for frame in animation.draw_frames())
+    frame_time = round(100 / animation.fps) * 10
+    durations = [frame_time] * len(rest) + [max(frame_time, round(LAST_FRAME_SECONDS * 1000))]
     # With `optimize` and a transparent entry, a frame stores only the pixels that changed.
     first.save(
         path,
@@ -86,17 +89,26 @@ def _write_gif(order: _Order, path: Path) -> None:
     )
 
 
-def _write_mp4(order: _Order, path: Path) -> None:
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ConfigError(
-            "MP4 needs a video encoder that is not installed: `pip install 'nmpm[video]'`, or write a .gif instead."
-        )
+def _write_mp4(animation: _Animation, path: Path) -> None:
     encoder: Any = imageio.get_writer(
-        path, format="FFMPEG", mode="I", fps=order.fps, codec="libx264", quality=8, macro_block_size=2
+        path, format="FFMPEG", mode="I", fps=animation.fps, codec="libx264", quality=8, macro_block_size=2
     )
     with encoder as video:
-        for frame in order.drawn():
+        for frame in animation.draw_frames():
             video.append_data(frame)
+    _check_mp4(path, len(animation.frames))
 
 
-_WRITERS: Mapping[str, Callable[[_Order, Path], None]] = MappingProxyType({".gif": _write_gif, ".mp4": _write_mp4})
+def _check_mp4(path: Path, frames: int) -> None:
+    """Raises OSError for an incomplete video; imageio ignores the encoder's exit status."""
+    from imageio_ffmpeg import count_frames_and_secs
+
+    try:
+        written, _ = count_frames_and_secs(str(path))
+    except RuntimeError as error:
+        raise OSError("the video encoder failed") from error
+    if written < frames:
+        raise OSError(f"the video encoder wrote {written} of {frames} frames")
+
+
+_WRITERS: Mapping[str, Callable[[_Animation, Path], None]] = MappingProxyType({".gif": _write_gif, ".mp4": _write_mp4})

@@ -1,28 +1,28 @@
-"""The words on pictures."""
+"""Text in pictures: times, distances and the count of particles out of view."""
 
 from __future__ import annotations
 
 import math
 
-from nmpm.viz.exhibit import Exhibit
+from nmpm.viz.trajectories import LabelledTrajectories
 
 
-def clock(exhibit: Exhibit, frame: int) -> str:
-    """The time of a frame in seconds, with the same number of decimals for every frame of an exhibit."""
-    longest = max(exhibit.frames - 1, 1) * exhibit.dt
+def format_time(trajectories: LabelledTrajectories, frame: int) -> str:
+    """The time of a frame in seconds, with the same number of decimals for every frame."""
+    longest = max(trajectories.frame_count - 1, 1) * trajectories.dt
     decimals = max(0, 2 - math.floor(math.log10(longest)))
-    return f"{frame * exhibit.dt:.{decimals}f} s"
+    return f"{frame * trajectories.dt:.{decimals}f} s"
 
 
-def distance(exhibit: Exhibit, length: float) -> str:
-    """A distance in domain length, to about a thousandth of the box, with as many decimals for every frame;
-    in powers of ten where it is far beyond the box.
+def format_distance(trajectories: LabelledTrajectories, length: float) -> str:
+    """A distance in domain length, rounded to about a thousandth of the box, with the same number of decimals for every
+    frame; in scientific notation from 100 box lengths on.
     """
-    longest = max(high - low for low, high in exhibit.bounds)
+    longest = max(high - low for low, high in trajectories.bounds)
     decimals = max(0, 3 - math.floor(math.log10(longest)))
     return f"{length:.{decimals}f}" if length < 100 * longest else f"{length:.1e}"
 
 
-def unseen(count: int) -> str:
-    """What is said of particles that left the picture; nothing where none did."""
+def format_out_of_view(count: int) -> str:
+    """States how many particles lie outside of the picture; empty for none."""
     return f"{count} out of view" if count else ""

@@ -1,6 +1,6 @@
-"""Which colour stands for which material, and the greys around them.
+"""Colours of materials, walls, background and text.
 
-Materials differ in lightness as well as in hue, so that they stay apart for colour-blind readers and in print.
+Materials differ in lightness as well as in hue, to be distinguishable for colour-blind readers and in print.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 Rgb = tuple[int, int, int]
 
-PAGE: Rgb = (255, 255, 255)
+BACKGROUND: Rgb = (255, 255, 255)
 INTERIOR: Rgb = (247, 247, 247)
 WALL: Rgb = (205, 209, 215)
 EDGE: Rgb = (168, 174, 183)
-INK: Rgb = (38, 42, 48)
-FAINT_INK: Rgb = (118, 124, 133)
+TEXT: Rgb = (38, 42, 48)
+FAINT_TEXT: Rgb = (118, 124, 133)
 OBSTACLE: Rgb = (132, 138, 147)
 
-MATERIALS: Mapping[str, Rgb] = MappingProxyType(
+MATERIAL_COLOURS: Mapping[str, Rgb] = MappingProxyType(
     {
         "water": (38, 112, 200),
         "fluid": (38, 112, 200),
@@ -38,7 +38,7 @@ MATERIALS: Mapping[str, Rgb] = MappingProxyType(
     }
 )
 
-SPARE: tuple[Rgb, ...] = (
+FALLBACK_COLOURS: tuple[Rgb, ...] = (
     (213, 94, 0),
     (111, 84, 190),
     (128, 150, 40),
@@ -46,48 +46,48 @@ SPARE: tuple[Rgb, ...] = (
     (222, 120, 150),
     (150, 20, 40),
 )
-"""For materials without a colour of their own."""
+"""For materials not in MATERIAL_COLOURS."""
 
 
-def colour(name: str) -> Rgb:
-    """The colour of a material; one that is not known gets a spare colour, the same in every scene and every run."""
-    return MATERIALS.get(name) or SPARE[_spare_index(name)]
+def material_colour(name: str) -> Rgb:
+    """The colour of a material; an unknown one gets a fallback colour, the same in every scene and run."""
+    return MATERIAL_COLOURS.get(name) or FALLBACK_COLOURS[_fallback_index(name)]
 
 
-def palette(names: Iterable[str]) -> dict[str, Rgb]:
-    """A colour for each material of one scene, in the order given.
+def material_colours(names: Iterable[str]) -> dict[str, Rgb]:
+    """The colour of each material of one scene, in the given order.
 
-    As `colour`, but unknown materials that would share a spare colour are moved apart while spare colours last.
+    As `material_colour`, but unknown materials get different fallback colours as long as there are enough.
     """
     ordered = list(dict.fromkeys(names))
-    chosen = {name: MATERIALS[name] for name in ordered if name in MATERIALS}
+    chosen = {name: MATERIAL_COLOURS[name] for name in ordered if name in MATERIAL_COLOURS}
     for name in sorted(set(ordered) - set(chosen)):
-        start = _spare_index(name)
-        probes = [SPARE[(start + step) % len(SPARE)] for step in range(len(SPARE))]
-        chosen[name] = next((spare for spare in probes if spare not in chosen.values()), probes[0])
+        start = _fallback_index(name)
+        probes = [FALLBACK_COLOURS[(start + step) % len(FALLBACK_COLOURS)] for step in range(len(FALLBACK_COLOURS))]
+        chosen[name] = next((free for free in probes if free not in chosen.values()), probes[0])
     return {name: chosen[name] for name in ordered}
 
 
-def shaded(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The same colours with a little light and dark from particle to particle, which shows how a material flows.
+def vary_brightness(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Makes some particles slightly lighter or darker, to show how a material flows.
 
     Args:
-        colours: (N, 3) one colour per particle.
+        colours: (N, 3), one per particle.
 
     Returns:
-        (N, 3); a particle's tone depends on its index alone, and the first particle's is unchanged.
+        (N, 3); the change depends on the particle's index only, and is zero for the first.
     """
-    tones = np.array([0.0, 0.16, -0.14, 0.07, -0.07])
-    tone = tones[(np.arange(len(colours), dtype=np.uint64) * 2654435761 >> 13) % len(tones)][:, None]
+    changes = np.array([0.0, 0.16, -0.14, 0.07, -0.07])
+    change = changes[(np.arange(len(colours), dtype=np.uint64) * 2654435761 >> 13) % len(changes)][:, None]
     base = colours.astype(np.float64)
-    mixed = np.where(tone > 0, base + (255 - base) * tone, base * (1 + tone))
+    mixed = np.where(change > 0, base + (255 - base) * change, base * (1 + change))
     return np.asarray(np.round(mixed), dtype=np.uint8)
 
 
-def css(ink: Rgb) -> str:
-    """A colour as matplotlib and browsers write it."""
-    return "#{:02x}{:02x}{:02x}".format(*ink)
+def hex_code(colour: Rgb) -> str:
+    """A colour as #rrggbb, for matplotlib."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
-def _spare_index(name: str) -> int:
-    return zlib.crc32(name.encode()) % len(SPARE)
+def _fallback_index(name: str) -> int:
+    return zlib.crc32(name.encode()) % len(FALLBACK_COLOURS)

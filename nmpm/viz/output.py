@@ -1,20 +1,71 @@
-"""Which formats pictures can be written in."""
+"""Output files of pictures: checks before drawing, and writing through a temporary file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from nmpm.errors import ConfigError
+from nmpm._support.atomic import replacing
+from nmpm.errors import ConfigError, DataError
 
 
 def check_suffix(path: Path, supported: Iterable[str], purpose: str) -> str:
-    """The suffix of a file to write, in lower case.
+    """Returns the suffix of an output file in lower case.
 
     Raises:
-        ConfigError: if it is none of those supported.
+        ConfigError: if the suffix is not supported.
     """
     suffix = path.suffix.lower()
     if suffix not in supported:
         raise ConfigError(f"Cannot write {purpose} to {path}: its name must end in {' or '.join(supported)}.")
     return suffix
+
+
+def check_output(path: Path) -> None:
+    """Checks, before anything is drawn, that a picture can be written to this path.
+
+    Raises:
+        ConfigError: if the file is an MP4 and the video encoder is not installed.
+        DataError: if the folder does not exist or is not writable, or the path is a folder.
+    """
+    if path.suffix.lower() == ".mp4":
+        _check_encoder()
+    if path.is_dir():
+        raise DataError(f"Cannot write {path}: it is a folder.")
+    if not path.parent.is_dir():
+        raise DataError(f"Cannot write {path}: the folder {path.parent} does not exist; create it first.")
+    try:
+        # Unlike a look at the permission bits, this also finds read-only and full file systems.
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise DataError(f"Cannot write {path}: the folder {path.parent} is not writable ({error.strerror}).") from error
+
+
+def _check_encoder() -> None:
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise ConfigError(
+            "MP4 needs a video encoder that is not installed: `pip install nmpm[video]`, or write a .gif instead."
+        ) from error
+
+
+@contextmanager
+def replace_picture(path: Path) -> Iterator[Path]:
+    """Yields a temporary path, renamed to `path` on success and deleted after any exception.
+
+    Raises:
+        DataError: if writing fails, for example because the disk is full.
+    """
+    try:
+        with replacing(path) as temporary:
+            yield temporary
+    except OSError as error:
+        # The encoder's message continues with its whole command line.
+        reason = str(error).partition("\n")[0]
+        raise DataError(f"Cannot write {path}: {reason}. The file was left as it was before.") from error

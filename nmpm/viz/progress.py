@@ -1,4 +1,4 @@
-"""A progress bar for what takes long, and nothing for what does not."""
+"""A progress bar that appears only if the work takes long."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import Progress
 
-PATIENCE = 2.0
-"""Seconds without a bar."""
+DELAY = 2.0
+"""Seconds before the bar appears."""
 
 Item = TypeVar("Item")
 
 
-def tracked(items: Iterable[Item], total: int, description: str) -> Iterator[Item]:
-    """The items, with a bar on the terminal (standard error) if they take longer than two seconds."""
+def with_progress_bar(items: Iterable[Item], total: int, description: str) -> Iterator[Item]:
+    """Yields the items, with a progress bar on the terminal (standard error) after `DELAY` seconds."""
     console = Console(stderr=True)
     progress = Progress(console=console, transient=True)
     task = progress.add_task(description, total=total)
-    began = time.monotonic()
-    shown = False
+    start = time.monotonic()
+    visible = False
     try:
         for done, item in enumerate(items, start=1):
             yield item
             progress.update(task, completed=done)
-            if not shown and console.is_terminal and time.monotonic() - began > PATIENCE:
+            if not visible and console.is_terminal and time.monotonic() - start > DELAY:
                 progress.start()
-                shown = True
+                visible = True
     finally:
-        if shown:
+        if visible:
             progress.stop()

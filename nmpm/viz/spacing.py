@@ -1,4 +1,4 @@
-"""How far apart particles are, which decides how large they are drawn."""
+"""The distance between neighbouring particles, which sets the size of the drawn discs."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import math
 
 import numpy as np
 
-from nmpm.viz.exhibit import Floats
+from nmpm.viz.trajectories import Floats
 
 SAMPLES = 64
 NEIGHBOURS = {2: 6, 3: 12}
-"""Neighbours counted, by dimension: enough to even out random placement, few enough to stay near the particle."""
-UNIT_BALL = {2: math.pi, 3: 4 * math.pi / 3}
+"""Neighbours per dimension: enough to average over random placement, few enough to be local."""
+UNIT_BALL_VOLUME = {2: math.pi, 3: 4 * math.pi / 3}
 
 
 def particle_spacing(position: Floats) -> float:
-    """The edge of the square or cube that one particle fills, in domain length.
+    """Edge of the square or cube that one particle occupies, in domain length.
 
-    The ball that reaches to a particle's k-th neighbour holds about k + 1/2 particles; the median over some particles.
-    For particles on a regular lattice this is the lattice's spacing within 2%, and for particles at random the mean
-    one, where the distance to the nearest neighbour would be half of it.
+    A ball around a particle with the distance to its k-th neighbour as radius contains about k + 1/2 particles; the
+    median radius over a sample of particles gives the spacing. The result is within 2% of the spacing of a regular
+    lattice. For random positions it is the mean spacing, about twice the mean distance to the nearest neighbour.
 
     Args:
-        position: (N, D) one frame, D is 2 or 3.
+        position: (N, D), one frame; D is 2 or 3.
 
     Returns:
         The spacing; infinite for a single particle.
@@ -31,10 +31,10 @@ def particle_spacing(position: Floats) -> float:
     neighbours = min(NEIGHBOURS[dim], count - 1)
     if neighbours == 0:
         return math.inf
-    chosen = position[np.linspace(0, count - 1, min(SAMPLES, count)).astype(int)].astype(np.float64)
-    # One axis at a time: the differences of all axes at once would not fit the cache.
-    squares = np.zeros((len(chosen), count))
+    sample = position[np.linspace(0, count - 1, min(SAMPLES, count)).astype(int)].astype(np.float64)
+    # One axis at a time, because the differences of all axes together exceed the cache.
+    squares = np.zeros((len(sample), count))
     for axis in range(dim):
-        squares += np.square(chosen[:, axis, None] - position[None, :, axis])
-    reach = np.sqrt(np.partition(squares, neighbours, axis=1)[:, neighbours])
-    return float((UNIT_BALL[dim] * np.median(reach) ** dim / (neighbours + 0.5)) ** (1 / dim))
+        squares += np.square(sample[:, axis, None] - position[None, :, axis])
+    radius = np.sqrt(np.partition(squares, neighbours, axis=1)[:, neighbours])
+    return float((UNIT_BALL_VOLUME[dim] * np.median(radius) ** dim / (neighbours + 0.5)) ** (1 / dim))

@@ -1,23 +1,23 @@
-"""Small exhibits whose pictures can be reckoned by hand."""
+"""Small trajectories with pictures that can be computed by hand."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from nmpm.viz import Exhibit
+from nmpm.viz import LabelledTrajectories
 
 BOX = ((0.1, 0.9), (0.1, 0.9))
 OUTER = ((0.08, 0.92), (0.08, 0.92))
 
 
 @pytest.fixture
-def falling() -> Exhibit:
+def falling() -> LabelledTrajectories:
     """Two particles of different materials that fall for eleven frames, and a prediction that lags behind."""
     fall = np.linspace(0, 0.5, 11)[:, None]
     truth = np.stack([np.array([[0.3, 0.8], [0.7, 0.8]]) - [0, step[0]] for step in fall])
     lagging = truth + np.linspace(0, 0.03, 11)[:, None, None] * [1, 0]
-    return Exhibit(
+    return LabelledTrajectories(
         {"simulation": truth, "prediction": lagging},
         np.array(["water", "sand"]),
         bounds=BOX,
@@ -28,12 +28,12 @@ def falling() -> Exhibit:
 
 
 @pytest.fixture
-def still() -> Callable[..., Exhibit]:
-    """Makes exhibits of one frame from (N, D) positions."""
+def still() -> Callable[..., LabelledTrajectories]:
+    """Builds trajectories of one frame from (N, D) positions."""
 
-    def build(position: list[list[float]], material: list[str], **facts: object) -> Exhibit:
+    def build(position: list[list[float]], material: list[str], **fields: object) -> LabelledTrajectories:
         frame = np.array([position])
-        bounds = facts.pop("bounds", ((0.1, 0.9),) * frame.shape[2])
-        return Exhibit({"simulation": frame}, np.array(material), bounds=bounds, dt=0.0025, **facts)  # type: ignore[arg-type]
+        bounds = fields.pop("bounds", ((0.1, 0.9),) * frame.shape[2])
+        return LabelledTrajectories({"simulation": frame}, np.array(material), bounds=bounds, dt=0.0025, **fields)  # type: ignore[arg-type]
 
     return build

@@ -1,5 +1,6 @@
 import dataclasses
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
@@ -7,11 +8,11 @@ from PIL import Image, ImageSequence
 
 from nmpm._support.atomic import replacing
 from nmpm.errors import ConfigError
-from nmpm.viz import animation
-from nmpm.viz.colours import INTERIOR, PAGE, WALL, colour
-from nmpm.viz.gif_palette import GROUND, SIZE, GifPalette, _cell
-from nmpm.viz.progress import tracked
-from nmpm.viz.reel import Reel
+from nmpm.viz import write_animation
+from nmpm.viz.colours import BACKGROUND, INTERIOR, WALL, material_colour
+from nmpm.viz.frame_renderer import FrameRenderer
+from nmpm.viz.gif_palette import FIXED_COLOURS, SIZE, GifPalette, _table_index
+from nmpm.viz.progress import with_progress_bar
 
 
 def frames_of(path):
@@ -20,34 +21,35 @@ def frames_of(path):
 
 
 def test_every_frame_is_in_the_gif(falling, tmp_path):
-    frames = frames_of(animation(falling, tmp_path / "a.gif", side=100))
-    assert len(frames) == falling.frames
+    frames = frames_of(write_animation(falling, tmp_path / "a.gif", side=100))
+    assert len(frames) == falling.frame_count
     assert [file.name for file in tmp_path.iterdir()] == ["a.gif"]
 
 
-def test_frames_are_thinned_to_the_number_asked_for(falling, tmp_path):
-    assert len(frames_of(animation(falling, tmp_path / "a.gif", side=100, max_frames=4))) == 4
+def test_max_frames_limits_the_number_of_frames(falling, tmp_path):
+    assert len(frames_of(write_animation(falling, tmp_path / "a.gif", side=100, max_frames=4))) == 4
 
 
-def test_frames_at_rest_are_kept(falling, tmp_path):
-    rest = dataclasses.replace(falling, rows={"simulation": np.repeat(falling.rows["simulation"][:1], 6, axis=0)})
-    assert len(frames_of(animation(rest, tmp_path / "rest.gif", side=100))) == 6
+def test_identical_frames_are_kept(falling, tmp_path):
+    still = np.repeat(falling.positions["simulation"][:1], 6, axis=0)
+    rest = dataclasses.replace(falling, positions={"simulation": still})
+    assert len(frames_of(write_animation(rest, tmp_path / "rest.gif", side=100))) == 6
 
 
-def test_the_gif_shows_what_the_reel_draws(falling, tmp_path):
-    """Nothing is left over from earlier frames, and colours are close to those drawn."""
-    reel = Reel(falling, 160)
-    for frame, shown in enumerate(frames_of(animation(falling, tmp_path / "a.gif", side=160))):
-        drawn = reel.draw(frame)
+def test_the_gif_shows_the_drawn_frames(falling, tmp_path):
+    """No pixels remain from earlier frames, and colours are close to those drawn."""
+    renderer = FrameRenderer(falling, 160)
+    for frame, shown in enumerate(frames_of(write_animation(falling, tmp_path / "a.gif", side=160))):
+        drawn = renderer.draw(frame)
         assert shown.shape == drawn.shape
         difference = np.abs(shown.astype(int) - drawn)
         assert difference.mean() < 1
         assert np.quantile(difference, 0.999) < 40
 
 
-def test_truth_left_prediction_right(falling):
-    image = Reel(falling, 160).draw(5)
-    water = np.abs(image.astype(int) - colour("water")).max(axis=2) < 5
+def test_truth_is_left_and_prediction_right(falling):
+    image = FrameRenderer(falling, 160).draw(5)
+    water = np.abs(image.astype(int) - material_colour("water")).max(axis=2) < 5
     water[-30:] = False
     columns = np.flatnonzero(water.any(axis=0))
     assert columns.min() < image.shape[1] // 2 < columns.max()
@@ -55,72 +57,72 @@ def test_truth_left_prediction_right(falling):
 
 def test_wide_boxes_are_stacked(falling):
     wide = dataclasses.replace(falling, bounds=((0, 4), (0, 1)), domain=None)
-    one = dataclasses.replace(wide, rows={"simulation": wide.rows["simulation"]})
-    assert Reel(wide, 160).width == Reel(one, 160).width
-    assert Reel(wide, 160).height > Reel(one, 160).height
+    one = dataclasses.replace(wide, positions={"simulation": wide.positions["simulation"]})
+    assert FrameRenderer(wide, 160).width == FrameRenderer(one, 160).width
+    assert FrameRenderer(wide, 160).height > FrameRenderer(one, 160).height
 
 
 def test_frames_differ_where_particles_move(falling):
-    reel = Reel(falling, 160)
-    middle = slice(60, reel.height - 40)
-    assert (reel.draw(0)[middle] != reel.draw(1)[middle]).any()
+    renderer = FrameRenderer(falling, 160)
+    middle = slice(60, renderer.height - 40)
+    assert (renderer.draw(0)[middle] != renderer.draw(1)[middle]).any()
 
 
-def test_time_passes_as_fast_as_asked(falling, tmp_path):
-    with Image.open(animation(falling, tmp_path / "a.gif", side=100, fps=25, max_frames=3)) as file:
+def test_frame_durations_follow_fps_and_the_last_frame_is_held(falling, tmp_path):
+    with Image.open(write_animation(falling, tmp_path / "a.gif", side=100, fps=25, max_frames=3)) as file:
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(file)]
     assert durations == [40, 40, 1000]
 
 
 def test_a_single_frame_makes_a_gif(still, tmp_path):
-    assert len(frames_of(animation(still([[0.5, 0.5]], ["water"]), tmp_path / "one.gif", side=100))) == 1
+    assert len(frames_of(write_animation(still([[0.5, 0.5]], ["water"]), tmp_path / "one.gif", side=100))) == 1
 
 
 @pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="imageio-ffmpeg is not installed")
-def test_mp4(falling, tmp_path):
+def test_the_mp4_has_all_frames(falling, tmp_path):
     import imageio.v3 as imageio
 
-    path = animation(falling, tmp_path / "a.mp4", side=100)
+    path = write_animation(falling, tmp_path / "a.mp4", side=100)
     video = imageio.imread(path, plugin="FFMPEG")
-    reel = Reel(falling, 100)
-    assert video.shape == (falling.frames, reel.height, reel.width, 3)
+    renderer = FrameRenderer(falling, 100)
+    assert video.shape == (falling.frame_count, renderer.height, renderer.width, 3)
 
 
-def test_mp4_without_its_encoder_says_what_to_install(falling, tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'nmpm\[video\]'.*\.gif"):
-        animation(falling, tmp_path / "a.mp4")
+def test_a_missing_mp4_encoder_is_a_config_error(falling, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ConfigError, match=r"pip install nmpm\[video\].*\.gif"):
+        write_animation(falling, tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["a.avi", "a"])
-def test_an_unknown_suffix_lists_the_known(falling, tmp_path, name):
+def test_an_unsupported_suffix_lists_the_supported(falling, tmp_path, name):
     with pytest.raises(ConfigError, match=r"\.gif or \.mp4"):
-        animation(falling, tmp_path / name)
+        write_animation(falling, tmp_path / name)
 
 
 @pytest.mark.parametrize("setting", [{"fps": 0}, {"fps": 1000}, {"fps": float("nan")}, {"max_frames": 0}, {"side": 3}])
 def test_settings_out_of_range_are_named(falling, tmp_path, setting):
     with pytest.raises(ConfigError, match=next(iter(setting))):
-        animation(falling, tmp_path / "a.gif", **setting)
+        write_animation(falling, tmp_path / "a.gif", **setting)
 
 
-def test_the_palette_keeps_grounds_and_rare_materials_exact():
-    frame = np.full((40, 40, 3), PAGE, dtype=np.uint8)
+def test_the_palette_keeps_fixed_colours_and_rare_materials_exact():
+    frame = np.full((40, 40, 3), BACKGROUND, dtype=np.uint8)
     frame[:20] = INTERIOR
     frame[:3] = WALL
-    frame[30, 30] = colour("goop")
-    shown = np.asarray(GifPalette([frame], [colour("goop")]).apply(frame).convert("RGB"))
+    frame[30, 30] = material_colour("goop")
+    shown = np.asarray(GifPalette([frame], [material_colour("goop")]).quantize(frame).convert("RGB"))
     np.testing.assert_array_equal(shown, frame)
 
 
-def test_grounds_do_not_share_a_cell_of_the_look_up_table():
-    assert len({int(_cell(np.array(ground, dtype=np.uint8))) for ground in GROUND}) == len(GROUND)
+def test_fixed_colours_have_different_table_cells():
+    assert len({int(_table_index(np.array(colour, dtype=np.uint8))) for colour in FIXED_COLOURS}) == len(FIXED_COLOURS)
 
 
-def test_the_transparent_entry_is_free():
+def test_no_colour_uses_the_transparent_entry():
     noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), dtype=np.uint8)
-    assert np.asarray(GifPalette([noise]).apply(noise)).max() < SIZE - 1
+    assert np.asarray(GifPalette([noise]).quantize(noise)).max() < SIZE - 1
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -138,8 +140,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_progress_gives_every_item_and_stays_silent(capsys):
-    assert list(tracked(iter("abc"), 3, "Drawing")) == ["a", "b", "c"]
+def test_the_progress_bar_yields_every_item_and_is_silent_without_a_terminal(capsys):
+    assert list(with_progress_bar(iter("abc"), 3, "Drawing")) == ["a", "b", "c"]
     captured = capsys.readouterr()
     assert not captured.out
     assert not captured.err

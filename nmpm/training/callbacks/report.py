@@ -21,7 +21,7 @@ from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.training.module import EmulatorModule
-from nmpm.viz import Exhibit, animation, snapshots
+from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
 
 
 class Report(Callback):
@@ -36,7 +36,7 @@ class Report(Callback):
         self.trained_steps = 0
         self._since: float | None = None
         self._trained = False
-        self._exhibit: tuple[Window, Tensor] | None = None
+        self._first_rollout: tuple[Window, Tensor] | None = None
 
     def state_dict(self) -> dict[str, Any]:
         return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps}
@@ -73,7 +73,7 @@ class Report(Callback):
         dataloader_idx: int = 0,  # noqa: ARG002
     ) -> None:
         if batch_idx == 0:
-            self._exhibit = (batch.to("cpu"), outputs.cpu())
+            self._first_rollout = (batch.to("cpu"), outputs.cpu())
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not isinstance(pl_module, EmulatorModule):
@@ -87,10 +87,10 @@ class Report(Callback):
         with replacing(folder / "report.json") as part:
             part.write_text(json.dumps(figures, indent=1) + "\n")
         _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in judged.items()})
-        if self._exhibit is not None:
-            exhibit = exhibit_of(pl_module, *self._exhibit)
-            snapshots(exhibit, folder / "rollout.png")
-            animation(exhibit, folder / "rollout.gif")
+        if self._first_rollout is not None:
+            exhibit = labelled_trajectories(pl_module, *self._first_rollout)
+            write_snapshots(exhibit, folder / "rollout.png")
+            write_animation(exhibit, folder / "rollout.gif")
         _print_table(figures, folder)
 
     def _elapsed(self) -> float:
@@ -118,7 +118,7 @@ class Report(Callback):
         }
 
 
-def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exhibit:
+def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Tensor) -> LabelledTrajectories:
     """The first trajectory of a batch beside its prediction, as something to draw.
 
     Both start with the two frames that the prediction started from; both end where the prediction is not finite.
@@ -131,7 +131,7 @@ def exhibit_of(module: EmulatorModule, window: Window, predicted: Tensor) -> Exh
     rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
     title = f"The prediction is not finite from frame {frames} on" if broken.any() else ""
-    return Exhibit.of_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
+    return LabelledTrajectories.from_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
 
 
 def hardware() -> str:

@@ -1,0 +1,158 @@
+"""Panels: the box with its particles as small antialiased discs, drawn with NumPy and Pillow.
+
+Everything is drawn on a canvas finer than the panel and averaged, so that edges are smooth and motion smaller than a
+pixel is visible.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
+from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, WALL, Rgb, material_colours, vary_brightness
+from nmpm.viz.spacing import particle_spacing
+from nmpm.viz.trajectories import Floats, LabelledTrajectories
+
+SUPERSAMPLING = 3
+"""Canvas points per pixel along each axis."""
+DISC_DIAMETER = 1.2
+"""Diameter of a disc in particle spacings; discs overlap a little, so that a body looks continuous."""
+DIAMETER_LIMITS = (2.2, 24.0)
+"""Smallest and largest diameter of a disc in pixels."""
+DEPTH_FADE = 0.55
+"""Fraction of the background in the colour of the farthest particles of a 3-D scene."""
+CHUNK_POINTS = 1_000_000
+"""Largest number of canvas points written at once."""
+
+
+class PanelRenderer:
+    """Draws single frames of single trajectories, all at one size.
+
+    Args:
+        trajectories: What to draw.
+        width: Width of the panel in pixels; the height follows from the shape of the box.
+    """
+
+    def __init__(self, trajectories: LabelledTrajectories, width: int) -> None:
+        self.trajectories = trajectories
+        self.camera: Camera = fit_camera(trajectories)
+        self.width = width
+        self.height = max(1, round(width * self.camera.height / self.camera.width))
+        self._scale = SUPERSAMPLING * width / self.camera.width
+        self._disc = _disc_offsets(SUPERSAMPLING * self._diameter / 2)
+        # Obstacles come first, so that material is drawn over them in 2-D.
+        obstacles = np.tile(np.array(OBSTACLE, dtype=np.uint8), (len(trajectories.obstacles), 1))
+        self._colours = np.concatenate([obstacles, vary_brightness(self._colours_of_materials())])
+
+    def draw(self, position: Floats) -> NDArray[np.uint8]:
+        """Draws one frame.
+
+        Args:
+            position: (N, D) in domain length; particles outside of the window are omitted (see `count_outside`).
+
+        Returns:
+            (height, width, 3), top row first.
+        """
+        projected = self.camera.project(np.concatenate([self.trajectories.obstacles, self.trajectories.wrap(position)]))
+        inside = self._inside(projected)
+        projected, colours = projected[inside], self._colours[inside]
+        if self.camera.has_depth:
+            order = np.argsort(projected[:, 2], kind="stable")
+            projected, colours = projected[order], _fade_by_depth(colours[order], projected[order, 2])
+        canvas = self._background.copy()
+        self._draw_discs(canvas, projected, colours)
+        # RGBX because reducing RGBA would first multiply by the opacity, which is 1 everywhere.
+        image = Image.frombuffer("RGBX", canvas.shape[::-1], canvas.tobytes(), "raw", "RGBX", 0, 1)
+        return np.asarray(image.reduce(SUPERSAMPLING))[..., :3]
+
+    def count_outside(self, position: Floats) -> int:
+        """Counts the particles (N, D) outside of the window."""
+        return int((~self._inside(self.camera.project(self.trajectories.wrap(position)))).sum())
+
+    def pixel_of(self, point: Floats) -> tuple[int, int]:
+        """Row and column of the pixel where a point (D,) is drawn."""
+        right, up, _ = self.camera.project(point) * self._scale / SUPERSAMPLING
+        return int(self.height - up), int(right)
+
+    @property
+    def _diameter(self) -> float:
+        spacing = particle_spacing(next(iter(self.trajectories.positions.values()))[0])
+        return float(np.clip(DISC_DIAMETER * spacing * self._scale / SUPERSAMPLING, *DIAMETER_LIMITS))
+
+    def _colours_of_materials(self) -> NDArray[np.uint8]:
+        chosen = material_colours(self.trajectories.materials)
+        names, inverse = np.unique(self.trajectories.material, return_inverse=True)
+        return np.array([chosen[name] for name in names.tolist()], dtype=np.uint8)[inverse]
+
+    def _inside(self, projected: NDArray[np.float64]) -> NDArray[np.bool_]:
+        right, up = projected[:, 0], projected[:, 1]
+        return (right >= 0) & (right < self.camera.width) & (up >= 0) & (up < self.camera.height)
+
+    def _draw_discs(
+        self, canvas: NDArray[np.uint32], projected: NDArray[np.float64], colours: NDArray[np.uint8]
+    ) -> None:
+        """Draws discs in order, later ones over earlier ones; at the edges they are shifted inwards to stay whole."""
+        packed = np.full((len(colours), 4), 255, dtype=np.uint8)
+        packed[:, :3] = colours
+        values = packed.view(np.uint32)
+        rows, columns = canvas.shape
+        reach = int(self._disc.max())
+        row = np.clip(np.int64(rows - projected[:, 1] * self._scale), reach, rows - 1 - reach)
+        column = np.clip(np.int64(projected[:, 0] * self._scale), reach, columns - 1 - reach)
+        centre = row * columns + column
+        offsets = self._disc[:, 0] * columns + self._disc[:, 1]
+        flat = canvas.reshape(-1)
+        step = max(1, CHUNK_POINTS // len(offsets))
+        for start in range(0, len(centre), step):
+            part = slice(start, start + step)
+            flat[centre[part, None] + offsets] = values[part]
+
+    @cached_property
+    def _background(self) -> NDArray[np.uint32]:
+        image = Image.new("RGBA", (self.width * SUPERSAMPLING, self.height * SUPERSAMPLING), (*BACKGROUND, 255))
+        draw = ImageDraw.Draw(image)
+        if self.trajectories.dim == 2:
+            self._paint_walls(draw)
+        else:
+            self._paint_box(draw)
+        return np.array(image).view(np.uint32)[..., 0]
+
+    def _paint_walls(self, draw: ImageDraw.ImageDraw) -> None:
+        self._paint_rectangle(draw, self.trajectories.outer_bounds, WALL)
+        self._paint_rectangle(draw, self.trajectories.bounds, INTERIOR)
+
+    def _paint_rectangle(self, draw: ImageDraw.ImageDraw, box: tuple[tuple[float, float], ...], fill: Rgb) -> None:
+        (left, bottom), (right, top) = self._canvas_points(np.array(box).T)
+        draw.rectangle((left, top, right, bottom), fill=(*fill, 255), outline=(*EDGE, 255), width=SUPERSAMPLING)
+
+    def _paint_box(self, draw: ImageDraw.ImageDraw) -> None:
+        corners = box_corners(self.trajectories.bounds)
+        points = self._canvas_points(corners)
+        vertical = vertical_axis(self.trajectories)
+        floor = np.flatnonzero(corners[:, vertical] == self.trajectories.bounds[vertical][0])[[0, 1, 3, 2]]
+        draw.polygon([points[corner] for corner in floor], fill=(*INTERIOR, 255))
+        for one in range(8):
+            for other in (one ^ 1, one ^ 2, one ^ 4):
+                draw.line((points[one], points[other]), fill=(*EDGE, 255), width=SUPERSAMPLING)
+
+    def _canvas_points(self, points: NDArray[Any]) -> list[tuple[float, float]]:
+        projected = self.camera.project(points) * self._scale
+        return [(float(right), float(self.height * SUPERSAMPLING - up)) for right, up in projected[:, :2]]
+
+
+def _disc_offsets(radius: float) -> NDArray[np.int64]:
+    """Offsets (K, 2) of the canvas points within a disc of this radius."""
+    reach = math.ceil(radius)
+    offset = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
+    return np.asarray(offset[np.square(offset).sum(axis=1) <= radius * radius], dtype=np.int64)
+
+
+def _fade_by_depth(colours: NDArray[np.uint8], nearness: NDArray[np.float64]) -> NDArray[np.uint8]:
+    fade = DEPTH_FADE * (1 - nearness[:, None])
+    return np.asarray(colours * (1 - fade) + np.array(INTERIOR) * fade, dtype=np.uint8)
