@@ -1,7 +1,7 @@
-"""The material point method of `mls_mpm` in three dimensions: the same nodes, kernels and walls along one more axis.
+"""The kernels of MLS-MPM in three dimensions: nodes, weights and walls as in two, along one more axis.
 
-Water fills a small part of a box for most of its fall, so that only nodes around the particles are cleared and moved.
-Where two or three walls meet, each acts in turn; friction brakes the velocity along a wall as a vector.
+Material fills a small part of the box for most of its fall, so that only nodes around the particles are cleared and
+updated. Where two or three walls meet, each acts in turn; friction brakes the velocity along a wall as a vector.
 """
 
 from __future__ import annotations
@@ -12,58 +12,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
-from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
+from nmpm.sim.mpm.grid import MpmGrid, Walls
+from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.sim.mpm.stepper import MpmStepper
 
 
-class Stepper3d(Stepper):
-    """Advances a state of three dimensions by substeps of one length.
+class Stepper3d(MpmStepper):
+    """Advances particles in three dimensions.
 
     Args:
-        grid: Where the state lives; without obstacles.
+        grid: On which they move; without obstacles.
         dt: Length of a substep, in seconds.
 
     Raises:
-        ConfigError: if the grid has obstacles or open corners, which are known in two dimensions only.
+        ConfigError: if the grid has obstacles or open corners, which are implemented in two dimensions only.
     """
 
-    def __init__(self, grid: Grid, dt: float) -> None:
-        if grid.solid is not None or grid.walls is Walls.OPEN_CORNERS:
-            raise ConfigError("Obstacles and open corners are known in two dimensions, not in three.")
+    def __init__(self, grid: MpmGrid, dt: float) -> None:
+        if grid.obstacles is not None or grid.walls is Walls.OPEN_CORNERS:
+            raise ConfigError("Obstacles and open corners are implemented in two dimensions, not in three.")
         super().__init__(grid, dt)
         self._first: NDArray[np.int64] = np.zeros(3, np.int64)
         self._last: NDArray[np.int64] = np.zeros(3, np.int64)
 
-    def _to_nodes(self, state: State) -> None:
+    def _scatter(self, particles: MpmParticles) -> None:
         grid = self.grid
-        self._first = ((state.position.min(axis=0) - grid.low) / grid.size).astype(np.int64)
-        self._last = ((state.position.max(axis=0) - grid.low) / grid.size).astype(np.int64) + 3
+        self._first = ((particles.position.min(axis=0) - grid.low) / grid.size).astype(np.int64)
+        self._last = ((particles.position.max(axis=0) - grid.low) / grid.size).astype(np.int64) + 3
         _scatter(
-            self._nodes, grid.low, grid.size, self.dt * state.volume, self._first, self._last,
-            state.position, state.velocity, state.gradient, state.stress, state.mass,
+            self._nodes, grid.low, grid.size, self.dt * particles.volume, self._first, self._last,
+            particles.position, particles.velocity, particles.gradient, particles.stress, particles.mass,
         )  # fmt: skip
 
-    def _move(self) -> None:
+    def _update_nodes(self) -> None:
         grid = self.grid
         holds, inset, _ = self._walls
-        _move(self._nodes, self.dt * grid.gravity, grid.friction, holds, inset, self._first, self._last)
+        _update_nodes(self._nodes, self.dt * grid.gravity, grid.friction, holds, inset, self._first, self._last)
 
-    def _from_nodes(self, state: State) -> int:
+    def _gather(self, particles: MpmParticles) -> int:
         held_back: int = _gather(
             self._nodes, self.grid.low, self.grid.size, self.dt, self._lower, self._upper,
-            state.position, state.velocity, state.gradient,
+            particles.position, particles.velocity, particles.gradient,
         )  # fmt: skip
         return held_back
 
 
-@compiled
+@jit
 def _weights(place: float) -> tuple[float, float, float]:
-    """Of the quadratic B-spline at the three nodes from the one at or below, `place` cells from that node."""
+    """Quadratic B-spline weights of three nodes; the particle is `place` cells from the first."""
     return 0.5 * (1.5 - place) ** 2, 0.75 - (place - 1.0) ** 2, 0.5 * (place - 0.5) ** 2
 
 
-@compiled
+@jit
 def _scatter(
     nodes: Array,
     low: Array,
@@ -113,9 +115,9 @@ def _scatter(
                     nodes[i + a, j + b, k + c, 3] += weight * (cz + zz * c)
 
 
-@compiled
+@jit
 def _slide(normal: float, one: float, other: float, friction: float) -> tuple[float, float, float]:
-    """Velocity at a wall, which takes what goes into it (normal < 0) and brakes what slides along."""
+    """Velocity after contact with a wall: none into it (normal < 0), and Coulomb friction along it."""
     if normal >= 0:
         return normal, one, other
     along = math.sqrt(one * one + other * other)
@@ -123,8 +125,8 @@ def _slide(normal: float, one: float, other: float, friction: float) -> tuple[fl
     return 0.0, left * one, left * other
 
 
-@compiled
-def _move(
+@jit
+def _update_nodes(
     nodes: Array,
     fall: Array,
     friction: float,
@@ -160,7 +162,7 @@ def _move(
                 nodes[i, j, k, 1], nodes[i, j, k, 2], nodes[i, j, k, 3] = u, v, w
 
 
-@compiled
+@jit
 def _gather(
     nodes: Array,
     low: Array,
@@ -172,7 +174,7 @@ def _gather(
     velocity: Array,
     gradient: Array,
 ) -> int:
-    """Velocities, their gradients and the move they make; how many were held back, -1 if a position is not finite."""
+    """Velocities, their gradients and the move; returns how many were clamped, or -1 if a position is not finite."""
     held_back = 0
     for p in range(position.shape[0]):
         x, y, z = (position[p, 0] - low[0]) / size, (position[p, 1] - low[1]) / size, (position[p, 2] - low[2]) / size

@@ -25,9 +25,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from nmpm.errors import ConfigError
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
-from nmpm.sim.materials.elastic import PlaneStrainSolid
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
+from nmpm.sim.mpm.materials.elastic import PlaneStrainSolid
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Sand(PlaneStrainSolid):
         _respond(strain, gradient, stress, dt, self.shear_modulus, self.bulk_modulus, friction)
 
 
-@compiled
+@jit
 def _respond(
     strain: Array,
     gradient: Array,

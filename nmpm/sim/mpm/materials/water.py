@@ -8,8 +8,8 @@ and the Kirchhoff stress is −J p I. Viscosity adds 2 η J times the deviator o
 dJ/dt = J ∇·v, so that a rotation leaves it alone whatever the length of the substep.
 
 Where J > 1 the pressure is below zero: a share `tension` of it is kept. Murnaghan's own (1) levels off at K / γ for
-γ > 0 and holds a splash together; with none (0) drops part freely. J is not reset when particles part: what a tear has
-gained must be lost again before water pushes back, as sand's volume must.
+γ > 0 and holds a splash together; with none (0) drops part freely. J is not reset when particles part: the volume gained while torn
+must be lost again before water pushes back, as with sand.
 
 Murnaghan, "The compressibility of media under extreme pressures", 1944; in the material point method: Tampubolon et
 al., "Multi-species simulation of porous sand and water mixtures", 2017.
@@ -23,10 +23,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from nmpm.errors import ConfigError
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array, Material
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
+from nmpm.sim.mpm.materials.base import Material
 
-# Of the volume at rest: smaller, Tait's pressure would overflow. Nothing in a stable simulation comes near it.
+# Of the volume at rest: smaller, Tait's pressure would overflow. Stable simulations stay far above it.
 _LEAST_VOLUME = 0.1
 
 
@@ -72,6 +73,27 @@ class Water(Material):
     def wave_speed(self) -> float:
         return math.sqrt(self.bulk_modulus / self.density)
 
+    def bulk_stiffness(self, energy: float) -> float:
+        """K / γ · ((γ − 1) J^(1−γ) + J), or K where that is less, with J compressed by the energy."""
+        volume = self._compressed_volume(energy)
+        exponent = self.exponent
+        stiffness = self.bulk_modulus / exponent * ((exponent - 1) * volume ** (1 - exponent) + volume)
+        return max(self.bulk_modulus, stiffness)
+
+    def _compressed_volume(self, energy: float) -> float:
+        """Smallest J that the energy can compress to: the root of ∫ p dV = energy, by bisection in [0.1, 1]."""
+        low, high = _LEAST_VOLUME, 1.0
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self._work(middle) > energy else (low, middle)
+        return high
+
+    def _work(self, volume: float) -> float:
+        """Work that compresses it from rest to J, per volume at rest."""
+        exponent = self.exponent
+        power = -math.log(volume) if exponent == 1 else (volume ** (1 - exponent) - 1) / (exponent - 1)
+        return self.bulk_modulus / exponent * (power - (1 - volume))
+
     def rest(self, dim: int) -> tuple[float, ...]:  # noqa: ARG002
         return (1.0,)
 
@@ -85,14 +107,14 @@ class Water(Material):
             _shear(strain, gradient, stress, self.viscosity)
 
 
-@compiled
+@jit
 def _pressure(volume: float, bulk_modulus: float, exponent: float, tension: float) -> float:
     if volume > 1:
         return tension * bulk_modulus / exponent * (math.exp(-exponent * math.log(volume)) - 1) if tension > 0 else 0.0
     return bulk_modulus / exponent * (math.exp(-exponent * math.log(volume)) - 1)
 
 
-@compiled
+@jit
 def _compress(
     strain: Array,
     gradient: Array,
@@ -108,7 +130,7 @@ def _compress(
         for i in range(dim):
             divergence += gradient[p, i, i]
         volume = strain[p, 0] * (1 + dt * divergence)
-        # Written so that a volume that is not a number stays one, and is found.
+        # Written so that NaN stays NaN, and is found.
         if volume < _LEAST_VOLUME:
             volume = _LEAST_VOLUME
         strain[p, 0] = volume
@@ -121,7 +143,7 @@ def _compress(
             k += dim - i
 
 
-@compiled
+@jit
 def _shear(strain: Array, gradient: Array, stress: Array, viscosity: float) -> None:
     """Adds the viscous stress."""
     dim = gradient.shape[1]

@@ -1,14 +1,16 @@
-"""Obstacles as the grid and the particles feel them: distances sampled once, looked up in every substep.
+"""Obstacles on the grid and at the particles, from signed distances that are sampled once.
 
-At nodes nearer to an obstacle than one cell, velocity into it is removed, and Coulomb friction brakes what slides
-along; away from it material parts freely. The first free node is then on average one and a half cells off, as it is at
-the box's sides. Slanted faces cut cells as they like, so that this alone would let particles seep in: those that end a
-substep too near are put back.
+At nodes nearer to an obstacle than one cell, velocity into it is removed, and Coulomb friction brakes the velocity
+along it; away from it material parts freely. The first free node is then on average one and a half cells off, as it is
+at the box's sides. Slanted faces cut cells at any angle, so that this alone would let particles seep in: those that end
+a substep too near are pushed out.
 
 The particles' distance is interpolated from a lattice four times as fine as the cells. A distance never changes faster
-than its place, so that interpolation errs by less than half the diagonal of a lattice cell, and a particle is held at
-that distance: it is never inside. Obstacles must be at least two cells thick, or the far side's nodes and the lattice
-would not tell in from out.
+than its point moves, so that interpolation errs by less than half the diagonal of a lattice cell, and a particle is kept
+at that margin: it is never inside. Particles are pushed out along the gradient of the distance, to the side that they
+are on: a substep must not carry one past the middle of an obstacle, or it comes out behind it. That bounds the substep
+(`stability.py`), not the thickness. Through an obstacle thinner than two cells, material on its two sides still shares
+nodes, and feels a little of the other's velocity.
 """
 
 from __future__ import annotations
@@ -21,17 +23,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
 
 Distance = Callable[[Array], NDArray[Any]]
 """From points (K, 2) to their signed distances (K,) from the obstacles, negative inside."""
 
-THINNEST = 2.0
-"""Cells that an obstacle must be thick."""
-
-_FINER = 4
-_ATTEMPTS = 4
+_LATTICE_PER_CELL = 4
+_PUSHES = 4
 
 
 class _Cells(Protocol):
@@ -44,16 +43,16 @@ class _Cells(Protocol):
 
 
 @dataclass(frozen=True)
-class Solid:
+class ObstacleField:
     """Obstacles, sampled on a grid's nodes and on a finer lattice.
 
     Args:
-        nodes: (K, 2) indices of the nodes that feel an obstacle.
+        nodes: (K, 2) indices of the nodes within a cell of an obstacle.
         normals: (K, 2) unit vectors out of the obstacle at these nodes.
         low: (2,) first point of the lattice.
         spacing: Of the lattice, in length.
         lattice: Signed distance at its points, in length.
-        margin: Distance that particles keep, in length.
+        margin: Distance at which particles are kept, in length.
         friction: Coulomb friction of the obstacles.
     """
 
@@ -66,22 +65,22 @@ class Solid:
     friction: float
 
     @classmethod
-    def sample(cls, grid: _Cells, distance: Distance, friction: float) -> Solid:
-        """The obstacles of which `distance` tells the signed distance, in a grid's box."""
-        spacing = grid.size / _FINER
-        inner = [np.arange(_FINER * cells + 1) for cells in grid.shape]
-        lattice = _sampled(distance, grid.low, spacing, inner)
+    def sample(cls, grid: _Cells, distance: Distance, friction: float) -> ObstacleField:
+        """Sample obstacles, given by their signed distance, in a grid's box."""
+        spacing = grid.size / _LATTICE_PER_CELL
+        inner = [np.arange(_LATTICE_PER_CELL * cells + 1) for cells in grid.shape]
+        lattice = _sample(distance, grid.low, spacing, inner)
         places = [np.arange(cells + 2) - 0.5 for cells in grid.shape]
-        at_nodes = _sampled(distance, grid.low, grid.size, places)
-        felt = np.argwhere(at_nodes < grid.size)
-        points = grid.low + grid.size * (felt - 0.5)
+        at_nodes = _sample(distance, grid.low, grid.size, places)
+        near = np.argwhere(at_nodes < grid.size)
+        points = grid.low + grid.size * (near - 0.5)
         return cls(
-            nodes=felt,
+            nodes=near,
             normals=_normals(distance, points, spacing / 8),
             low=np.asarray(grid.low, np.float64),
             spacing=spacing,
             lattice=lattice,
-            margin=spacing * math.sqrt(0.5),
+            margin=lattice_margin(grid.size),
             friction=friction,
         )
 
@@ -92,19 +91,19 @@ class Solid:
         return depth
 
     def brake(self, nodes: Array, fall: Array) -> None:
-        """Take what goes into the obstacles from the nodes (X, Y, 3), which hold mass and momentum.
+        """Remove the momentum into the obstacles from the nodes, in place.
 
         Args:
-            nodes: Changed in place.
-            fall: (2,) change of velocity that they are about to undergo, which is braked as well.
+            nodes: (X, Y, 3) mass and momentum.
+            fall: (2,) change of velocity by gravity that follows; its part into the obstacles is removed as well.
         """
         _brake(nodes, fall, self.nodes, self.normals, self.friction)
 
     def push_out(self, before: Array, position: Array, velocity: Array, lower: Array, upper: Array) -> int:
-        """Put particles that are too near back to the margin, without their velocity inwards; returns how many.
+        """Push particles that are too near out to the margin, and remove their velocity inwards; returns how many.
 
         Args:
-            before: (N, 2) where they were when all was well; one that finds no room nearby goes there, and stops.
+            before: (N, 2) valid earlier positions; a particle that finds no room nearby goes back there, and stops.
             position: (N, 2), changed in place.
             velocity: (N, 2), changed in place.
             lower: (2,) least position.
@@ -116,7 +115,12 @@ class Solid:
         return pushed
 
 
-def _sampled(distance: Distance, low: Array, spacing: float, places: list[NDArray[Any]]) -> Array:
+def lattice_margin(size: float) -> float:
+    """Distance from obstacles at which particles are kept on a grid with cells of that size, in length."""
+    return size / _LATTICE_PER_CELL * math.sqrt(0.5)
+
+
+def _sample(distance: Distance, low: Array, spacing: float, places: list[NDArray[Any]]) -> Array:
     points = low + spacing * np.stack(np.meshgrid(*places, indexing="ij"), axis=-1)
     return np.ascontiguousarray(distance(points.reshape(-1, 2)).reshape(points.shape[:2]), dtype=np.float64)
 
@@ -128,19 +132,19 @@ def _normals(distance: Distance, points: Array, step: float) -> Array:
     return np.where(length > 0, slopes / np.where(length > 0, length, 1.0), np.array([0.0, 1.0]))
 
 
-@compiled
+@jit
 def slide(normal: float, tangential: float, friction: float) -> tuple[float, float]:
-    """Velocity at a wall, which takes what goes into it (normal < 0) and brakes what slides along."""
+    """Velocity after contact with a wall: none into it (normal < 0), and Coulomb friction along it."""
     if normal >= 0:
         return normal, tangential
     left = max(0.0, abs(tangential) + friction * normal)
     return 0.0, left if tangential > 0 else -left
 
 
-@compiled
-def _brake(nodes: Array, fall: Array, felt: NDArray[np.int64], normals: Array, friction: float) -> None:
-    for k in range(felt.shape[0]):
-        i, j = felt[k, 0], felt[k, 1]
+@jit
+def _brake(nodes: Array, fall: Array, near: NDArray[np.int64], normals: Array, friction: float) -> None:
+    for k in range(near.shape[0]):
+        i, j = near[k, 0], near[k, 1]
         mass = nodes[i, j, 0]
         if mass <= 0:
             continue
@@ -151,7 +155,7 @@ def _brake(nodes: Array, fall: Array, felt: NDArray[np.int64], normals: Array, f
         nodes[i, j, 2] = normal * ny + along * nx - mass * fall[1]
 
 
-@compiled
+@jit
 def _look_up(x: float, y: float, low: Array, spacing: float, lattice: Array) -> tuple[float, float, float]:
     """Distance and the direction in which it grows, by bilinear interpolation within the lattice."""
     px = min(max((x - low[0]) / spacing, 0.0), lattice.shape[0] - 1.000001)
@@ -163,13 +167,13 @@ def _look_up(x: float, y: float, low: Array, spacing: float, lattice: Array) -> 
     return (1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * d), sx, sy
 
 
-@compiled
+@jit
 def _depths(position: Array, low: Array, spacing: float, lattice: Array, margin: float, depth: Array) -> None:
     for p in range(position.shape[0]):
         depth[p] = max(0.0, margin - _look_up(position[p, 0], position[p, 1], low, spacing, lattice)[0])
 
 
-@compiled
+@jit
 def _push_out(
     before: Array,
     position: Array,
@@ -184,7 +188,7 @@ def _push_out(
     pushed = 0
     for p in range(position.shape[0]):
         x, y = position[p, 0], position[p, 1]
-        # The nearest lattice point is within the margin of the particle: most are far, and that is all they cost.
+        # The nearest lattice point is within the margin of the particle: an early exit for most.
         near = lattice[int((x - low[0]) / spacing + 0.5), int((y - low[1]) / spacing + 0.5)]
         if near > 2 * margin:
             continue
@@ -192,7 +196,7 @@ def _push_out(
         if distance >= margin:
             continue
         pushed += 1
-        for _ in range(_ATTEMPTS):
+        for _ in range(_PUSHES):
             length = math.sqrt(sx * sx + sy * sy)
             if length == 0:
                 break
@@ -200,7 +204,7 @@ def _push_out(
             inwards = min(0.0, velocity[p, 0] * sx + velocity[p, 1] * sy)
             velocity[p, 0] -= inwards * sx
             velocity[p, 1] -= inwards * sy
-            # A little further than needed, as rounding must not leave it a hair too near.
+            # A little further than needed, so that rounding does not leave it inside the margin.
             step = 1.001 * (margin - distance)
             x = min(max(x + step * sx, lower[0]), upper[0])
             y = min(max(y + step * sy, lower[1]), upper[1])

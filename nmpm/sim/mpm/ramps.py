@@ -10,17 +10,18 @@ import numpy as np
 
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.materials.base import Array
-from nmpm.sim.preset import require
+from nmpm.sim.arrays import Array
+from nmpm.sim.config import check
+from nmpm.sim.initial_state import Obstacle
 
-_STARTS = 20
+_RESTARTS = 20
 _ATTEMPTS = 500
 _OUTLINE = 96  # points on a bar's outline by which its distance from others is judged
 
 
 @dataclass(frozen=True)
-class Ramp:
-    """A bar: a rectangle, turned.
+class Ramp(Obstacle):
+    """A bar: a turned rectangle.
 
     Args:
         centre: (x, y) in length.
@@ -36,7 +37,7 @@ class Ramp:
 
     @property
     def _axes(self) -> Array:
-        """(2, 2) unit vectors along and across, as rows."""
+        """(2, 2) unit vectors along and across the bar, as rows."""
         cos, sin = math.cos(self.angle), math.sin(self.angle)
         return np.array([[cos, sin], [-sin, cos]])
 
@@ -69,18 +70,18 @@ class Ramp:
 
 
 @dataclass(frozen=True)
-class Ramps:
-    """How the bars of a scene are drawn; lengths in metres.
+class RampRanges:
+    """How the ramps of a scene are drawn; lengths in metres.
 
     Args:
         number: Least and most of them.
         length: Least and largest length.
         thickness: Of all.
-        angle: Least and largest slope, in degrees; they fall to the left or to the right alike.
-        gap: Least distance between them, from the box's sides, and from what is there before them.
+        angle: Least and largest slope, in degrees; to the left or to the right with equal chances.
+        gap: Least distance between them, from the box's sides, and from blocks.
 
     Raises:
-        ConfigError: if a range is empty or out of reach.
+        ConfigError: if a range is empty or a value is out of range.
     """
 
     number: tuple[int, int]
@@ -90,20 +91,20 @@ class Ramps:
     gap: float
 
     def __post_init__(self) -> None:
-        require(0 <= self.number[0] <= self.number[1], f"ramps.number = {list(self.number)} needs least and most.")
-        require(0 < self.length[0] <= self.length[1], f"ramps.length = {list(self.length)} needs least and largest.")
-        require(0 <= self.angle[0] <= self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
-        require(0 < self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is not 0 < … ≤ the length.")
-        require(self.gap >= 0, f"ramps.gap = {self.gap} must not be negative.")
+        check(0 <= self.number[0] <= self.number[1], f"ramps.number = {list(self.number)} needs least and most.")
+        check(0 < self.length[0] <= self.length[1], f"ramps.length = {list(self.length)} needs least and largest.")
+        check(0 <= self.angle[0] <= self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
+        check(0 < self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is not 0 < … ≤ the length.")
+        check(self.gap >= 0, f"ramps.gap = {self.gap} must not be negative.")
 
-    def most_particles(self, spacing: float) -> int:
-        """Particles that the bars of a scene are made of, at most."""
+    def max_particles(self, spacing: float) -> int:
+        """Upper bound of the particles that the ramps of a scene are made of."""
         return self.number[1] * max(1, round(self.length[1] / spacing)) * max(1, round(self.thickness / spacing))
 
     def draw(
         self, box: tuple[Interval, ...], occupied: Sequence[tuple[Array, Array]], rng: np.random.Generator
     ) -> tuple[Ramp, ...]:
-        """Some bars within a box.
+        """Random ramps within a box.
 
         Args:
             box: (lower, upper) along x and y.
@@ -111,16 +112,16 @@ class Ramps:
             rng: To draw with.
 
         Raises:
-            ConfigError: if no arrangement is found, so crowded is the box.
+            ConfigError: if no arrangement fits into the box.
         """
         number = int(rng.integers(self.number[0], self.number[1] + 1))
-        for _ in range(_STARTS):
-            placed = self._placed(number, box, occupied, rng)
+        for _ in range(_RESTARTS):
+            placed = self._place(number, box, occupied, rng)
             if placed is not None:
                 return placed
         raise ConfigError(f"No room for {number} ramps of ramps.length = {list(self.length)} within {box}.")
 
-    def _placed(
+    def _place(
         self,
         number: int,
         box: tuple[Interval, ...],
@@ -139,12 +140,12 @@ class Ramps:
             outline = drawn.outline()
             inside = np.all((outline >= low + self.gap) & (outline <= high - self.gap))
             clear = all(other.distance(outline).min() >= self.gap for other in placed)
-            if inside and clear and not any(_meet(drawn, corners, self.gap) for corners in occupied):
+            if inside and clear and not any(_too_close(drawn, corners, self.gap) for corners in occupied):
                 placed.append(drawn)
         return None
 
 
-def _meet(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
+def _too_close(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
     """Whether a ramp comes closer to a rectangle than the gap."""
     low, high = corners
     beyond = np.maximum(np.maximum(low - ramp.outline(), ramp.outline() - high), 0.0)
@@ -154,7 +155,7 @@ def _meet(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
     return bool(min(nearest, ramp.distance(points).min()) < gap)
 
 
-def distance(ramps: tuple[Ramp, ...], points: Array) -> Array:
+def distance_to_ramps(ramps: tuple[Ramp, ...], points: Array) -> Array:
     """(K,) signed distance of points (K, 2) from the nearest bar, negative inside; infinite where there is none."""
     found = np.full(len(points), np.inf)
     for ramp in ramps:

@@ -12,12 +12,12 @@ import math
 from dataclasses import dataclass
 
 from nmpm.errors import ConfigError
-from nmpm.sim.materials.base import Material
+from nmpm.sim.mpm.materials.base import Material
 
 
 @dataclass(frozen=True)
 class PlaneStrainSolid(Material):
-    """An elastic solid in two dimensions, to which subclasses add how it yields.
+    """An elastic solid in two dimensions; subclasses add plastic flow.
 
     Args:
         density: Mass per area, in kg / m².
@@ -56,7 +56,10 @@ class PlaneStrainSolid(Material):
     def wave_speed(self) -> float:
         return math.sqrt((self.bulk_modulus + self.shear_modulus) / self.density)
 
+    def bulk_stiffness(self, energy: float) -> float:  # noqa: ARG002  # (the law is linear in Hencky's strains)
+        return self.bulk_modulus
+
     def rest(self, dim: int) -> tuple[float, ...]:
         if dim != 2:
-            raise ConfigError(f"{self.name} is known in two dimensions, not in {dim}.")
+            raise ConfigError(f"{self.name} is implemented in two dimensions, not in {dim}.")
         return 1.0, 0.0, 1.0
