@@ -19,7 +19,7 @@ FRAMES = {"mls_mpm": 40, "wcsph": 2}
 def summary(name: str) -> dict[str, object]:
     """Sizes, a few positions and the mean position of the last frame, and the preset as datasets are named after it."""
     preset = load_preset(name)
-    short = preset.lasting(FRAMES[preset.solver])
+    short = preset.with_frames(FRAMES[preset.solver])
     made = short.simulate(0)
     last = made.position[-1].astype(np.float64)
     described = json.dumps({"preset": preset.to_dict(), "revision": preset.revision}, sort_keys=True)

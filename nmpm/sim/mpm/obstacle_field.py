@@ -6,11 +6,11 @@ at the box's sides. Slanted faces cut cells at any angle, so that this alone wou
 a substep too near are pushed out.
 
 The particles' distance is interpolated from a lattice four times as fine as the cells. A distance never changes faster
-than its point moves, so that interpolation errs by less than half the diagonal of a lattice cell, and a particle is kept
-at that margin: it is never inside. Particles are pushed out along the gradient of the distance, to the side that they
-are on: a substep must not carry one past the middle of an obstacle, or it comes out behind it. That bounds the substep
-(`stability.py`), not the thickness. Through an obstacle thinner than two cells, material on its two sides still shares
-nodes, and feels a little of the other's velocity.
+than its point moves, so that interpolation errs by less than half the diagonal of a lattice cell, and a particle is
+kept at that margin: it is never inside. It is pushed out along the gradient of the distance, to the side that it is on;
+a substep that carries it past the middle of an obstacle would let it out behind. So the thinnest obstacle bounds the
+substep (`stability.py`), not the cells. Through obstacles thinner than two cells, material on the two sides shares
+nodes, and each feels a little of the other's velocity.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class MpmPreset(Preset):
         ramps: Obstacles; in two dimensions only.
 
     Raises:
-        ConfigError: if the numbers contradict each other, or an elastic wave at rest crosses too many cells in a substep.
+        ConfigError: if the numbers contradict each other, or a substep is too long for elastic waves at rest.
     """
 
     solver: ClassVar[str] = "mls_mpm"

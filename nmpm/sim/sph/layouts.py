@@ -56,7 +56,7 @@ class FluidLayout(abc.ABC):
 
 @dataclass(frozen=True)
 class Column(FluidLayout):
-    """A column of water at rest in the lower left corner of the box, its particles displaced at random and then relaxed.
+    """A column of fluid at rest in the lower left corner of the box; its particles are displaced and then relaxed.
 
     Args:
         width: In length.
@@ -138,7 +138,7 @@ class FluidBlocks(BlockRanges, FluidLayout):
     def _arrange(
         self, box: Box, spacing: float, number: int, rng: np.random.Generator
     ) -> list[tuple[Array, tuple[int, int]]] | None:
-        """Lower corner and lattice of each block, or None if they leave the box, meet, or hold too few or too many particles."""
+        """Lower corner and lattice of each block; None if they do not fit, meet, or are too small or large."""
         sizes = self.share + (1 - number * self.share) * rng.dirichlet(np.ones(number))
         sizes *= rng.uniform(*self.particles)
         aspects = np.exp(rng.uniform(math.log(self.aspect[0]), math.log(self.aspect[1]), number))

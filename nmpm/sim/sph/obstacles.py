@@ -53,7 +53,7 @@ class PolygonObstacle(Obstacle):
 
 @dataclass(frozen=True)
 class ObstacleRanges:
-    """How obstacles are drawn: turned boxes and ramps (right-angled triangles), apart from each other and from the box's sides.
+    """How obstacles are drawn: turned boxes and right-angled triangles, apart from each other and the box's sides.
 
     Args:
         number: Least and most of them.

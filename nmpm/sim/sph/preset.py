@@ -151,7 +151,8 @@ class SphPreset(Preset):
         return dataclasses.replace(many, substeps=many.stable_substeps)
 
     def _with_layout(self, layout: FluidLayout) -> SphPreset:
-        return dataclasses.replace(self, **{"blocks" if self.column is None else "column": layout})
+        changed: dict[str, Any] = {"blocks" if self.column is None else "column": layout}
+        return dataclasses.replace(self, **changed)
 
     @property
     def particle_volume(self) -> float:

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
+from nmpm.sim.mpm.grid import MpmGrid, Walls
+from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
+from nmpm.sim.mpm.particles import MpmParticles
 
 GRAVITY = np.array([0.0, -9.81])
 
@@ -16,8 +18,8 @@ def lattice(low, high, spacing):
 
 
 def at_rest(position, groups, size):
-    """Four particles per cell, without velocity; groups as `State` takes them."""
-    return State(position, np.zeros_like(position), groups, size**2 / 4)
+    """Four particles per cell, without velocity; groups as `MpmParticles` takes them."""
+    return MpmParticles(position, np.zeros_like(position), groups, size**2 / 4)
 
 
 def tank(width, height, size, wave_speed, gravity=GRAVITY, friction=0.0, walls=Walls.SEPARATE, cfl=0.3):
@@ -25,7 +27,7 @@ def tank(width, height, size, wave_speed, gravity=GRAVITY, friction=0.0, walls=W
     rows = 1 if walls is Walls.SEPARATE else 3
     low = np.full(2, -0.5 * rows * size)
     shape = (round(width / size) + rows, round(height / size) + rows)
-    return Stepper(Grid(low, size, shape, friction, np.asarray(gravity, float), walls), cfl * size / wave_speed)
+    return Stepper2d(MpmGrid(low, size, shape, friction, np.asarray(gravity, float), walls), cfl * size / wave_speed)
 
 
 def run(stepper, state, seconds):

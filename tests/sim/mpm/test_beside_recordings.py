@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nmpm.errors import ConfigError
-from nmpm.sim import load_preset, preset_from_dict, simulate_from
-from nmpm.sim.materials import Sand, Water
+from nmpm.sim import InitialState, load_preset, preset_from_dict
+from nmpm.sim.mpm.materials import Sand, Water
 
 # What DeepMind's water was made with, as far as its recordings tell.
 WATERDROP = dataclasses.replace(
@@ -33,7 +33,7 @@ def errors(preset, path, frames):
             position = group["position"][: frames + 2].astype(np.float64)
             half_a_kick = preset.frame_dt / 2 * (1 - 1 / preset.substeps) * np.array(preset.gravity)
             velocity = (position[1] - position[0]) / preset.frame_dt + half_a_kick
-            made = simulate_from(preset, position[1], velocity, frames)
+            made = preset.simulate_from(InitialState(position[1], velocity), frames)
             assert made.attributes["held_back"] == 0
             found.append([np.mean((made.position[1:] - position[2:]) ** 2), np.mean((position[1] - position[2:]) ** 2)])
     return np.array(found).T
@@ -74,7 +74,7 @@ def test_walls_that_hold_let_particles_a_cell_and_a_half_beyond_the_box():
     assert WATERDROP.scene.bounds == WATERDROP.reach
     assert dataclasses.replace(WATERDROP, walls="separate").reach == WATERDROP.box
     deepest = np.array([[0.1, 0.086], [0.5, 0.0915]])
-    assert simulate_from(WATERDROP, deepest, np.zeros((2, 2)), 5).position.min() > 0.085
+    assert WATERDROP.simulate_from(InitialState(deepest, np.zeros((2, 2))), 5).position.min() > 0.085
 
 
 def test_walls_are_read_from_files_and_checked():

@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
 from nmpm.sim import load_preset
-from nmpm.sim.blocks import draw_start
 
 GOOP = load_preset("goop")
 
@@ -16,7 +15,7 @@ GOOP = load_preset("goop")
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**63 - 1))
 def test_blocks_keep_to_the_preset(seed):
-    start = draw_start(GOOP, np.random.default_rng(seed))
+    start = GOOP.draw(seed)
     low, high = np.array(GOOP.box).T
     gap, slack = GOOP.blocks.gap, GOOP.spacing * (0.5 - GOOP.blocks.jitter)
     assert 1700 <= len(start.position) == sum(start.counts) <= 2000
@@ -35,11 +34,11 @@ def test_blocks_keep_to_the_preset(seed):
 
 
 def test_every_number_of_blocks_is_drawn_about_as_often():
-    drawn = [len(np.unique(draw_start(GOOP, np.random.default_rng(s)).velocity, axis=0)) for s in range(150)]
+    drawn = [len(np.unique(GOOP.draw(s).velocity, axis=0)) for s in range(150)]
     assert np.bincount(drawn)[1:].min() > 30
 
 
 def test_a_box_too_crowded_is_an_error():
     crowded = dataclasses.replace(GOOP, blocks=dataclasses.replace(GOOP.blocks, particles=(20_000, 21_000)))
     with pytest.raises(ConfigError, match="No room"):
-        draw_start(crowded, np.random.default_rng(0))
+        crowded.draw(0)

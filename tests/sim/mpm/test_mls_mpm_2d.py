@@ -3,8 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.sim.materials import Goop
-from nmpm.sim.mls_mpm import Grid, State, Stepper
+from nmpm.sim.mpm.grid import MpmGrid
+from nmpm.sim.mpm.materials import Goop
+from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
+from nmpm.sim.mpm.particles import MpmParticles
 
 GOOP = Goop(density=1000.0, young=4e5, poisson=0.4, yield_stress=200.0, viscosity=60.0)
 LOW, SIZE, CELLS = 0.1, 0.025, 32
@@ -12,11 +14,11 @@ DT = 2e-4
 
 
 def make_grid(gravity=(0.0, 0.0), friction=0.5):
-    return Grid(np.full(2, LOW), SIZE, (CELLS, CELLS), friction, np.array(gravity))
+    return MpmGrid(np.full(2, LOW), SIZE, (CELLS, CELLS), friction, np.array(gravity))
 
 
 def make_state(position, velocity):
-    return State(position, velocity, ((GOOP, len(position)),), (SIZE / 2) ** 2)
+    return MpmParticles(position, velocity, ((GOOP, len(position)),), (SIZE / 2) ** 2)
 
 
 def make_block(rng, side=12, low=0.4):
@@ -40,7 +42,7 @@ def test_momentum_and_angular_momentum_are_kept_away_from_walls():
     position = make_block(rng)
     state = make_state(position, rng.normal(size=position.shape))
     before, turning = momentum(state), angular_momentum(state)
-    stepper = Stepper(make_grid(), DT)
+    stepper = Stepper2d(make_grid(), DT)
     for _ in range(50):
         stepper.step(state)
     assert np.abs(state.stress).max() > 100, "The test should strain the material."
@@ -51,7 +53,7 @@ def test_momentum_and_angular_momentum_are_kept_away_from_walls():
 def test_the_grid_receives_the_mass_of_the_particles():
     position = make_block(np.random.default_rng(0))
     state = make_state(position, np.zeros_like(position))
-    stepper = Stepper(make_grid(), DT)
+    stepper = Stepper2d(make_grid(), DT)
     stepper.step(state)
     assert stepper._nodes[..., 0].sum() == pytest.approx(len(position) * GOOP.density * (SIZE / 2) ** 2)
 
@@ -59,7 +61,7 @@ def test_the_grid_receives_the_mass_of_the_particles():
 def test_gravity_changes_momentum_by_its_impulse():
     position = make_block(np.random.default_rng(0))
     state = make_state(position, np.zeros_like(position))
-    stepper = Stepper(make_grid(gravity=(1.0, -9.81)), DT)
+    stepper = Stepper2d(make_grid(gravity=(1.0, -9.81)), DT)
     for _ in range(100):
         stepper.step(state)
     expected = state.mass.sum() * 100 * DT * np.array([1.0, -9.81])
@@ -72,7 +74,7 @@ def test_a_rotating_block_keeps_its_shape():
     arms = position - position.mean(axis=0)
     state = make_state(position, 5.0 * np.stack([-arms[:, 1], arms[:, 0]], -1))
     state.gradient[:] = 5.0 * np.array([[0.0, -1.0], [1.0, 0.0]])
-    stepper = Stepper(make_grid(), DT)
+    stepper = Stepper2d(make_grid(), DT)
     for _ in range(int(np.pi / 5.0 / DT)):
         stepper.step(state)
     half_turned = state.position - state.position.mean(axis=0)
@@ -86,7 +88,7 @@ def test_no_particle_leaves_the_box_and_the_last_safety_never_acts(seed, speed, 
     inset = SIZE / 4
     position = np.concatenate([make_block(rng, 6, LOW + inset), make_block(rng, 6, LOW + CELLS * SIZE - 3 * SIZE)])
     state = make_state(position, rng.uniform(-speed, speed, position.shape))
-    stepper = Stepper(make_grid((0.0, -9.81), friction), DT)
+    stepper = Stepper2d(make_grid((0.0, -9.81), friction), DT)
     for _ in range(60):
         stepper.step(state)
         assert np.all((state.position > LOW) & (state.position < LOW + CELLS * SIZE))
@@ -96,7 +98,7 @@ def test_no_particle_leaves_the_box_and_the_last_safety_never_acts(seed, speed, 
 def test_walls_never_pull():
     position = make_block(np.random.default_rng(0), low=LOW + SIZE / 4)
     state = make_state(position, np.tile([0.0, 2.0], (len(position), 1)))
-    stepper = Stepper(make_grid(), DT)
+    stepper = Stepper2d(make_grid(), DT)
     for _ in range(200):
         stepper.step(state)
     np.testing.assert_allclose(state.velocity, np.tile([0.0, 2.0], (len(position), 1)), atol=1e-9)
@@ -108,7 +110,7 @@ def test_a_thin_layer_slides_to_a_stop_by_coulomb_friction(friction, expected):
     lattice = np.stack(np.meshgrid(np.arange(columns), np.arange(2)), -1).reshape(-1, 2)
     position = np.array([LOW + 3 * SIZE, LOW + 0.75 * SIZE]) + SIZE / 2 * lattice
     state = make_state(position, np.tile([1.0, 0.0], (len(position), 1)))
-    stepper = Stepper(make_grid((0.0, -9.81), friction), DT)
+    stepper = Stepper2d(make_grid((0.0, -9.81), friction), DT)
     for _ in range(500):
         stepper.step(state)
     assert momentum(state)[0] / state.mass.sum() == pytest.approx(expected, abs=0.1)
@@ -119,4 +121,4 @@ def test_a_state_that_is_not_finite_is_found_at_once():
     state = make_state(position, np.zeros_like(position))
     state.strain[17, 0] = np.nan
     with pytest.raises(FloatingPointError):
-        Stepper(make_grid(), DT).step(state)
+        Stepper2d(make_grid(), DT).step(state)

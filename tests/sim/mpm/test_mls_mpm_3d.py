@@ -4,17 +4,19 @@ import numpy as np
 import pytest
 
 from nmpm.errors import ConfigError
-from nmpm.sim import load_preset, preset_from_dict, simulate_from
-from nmpm.sim.materials import Water
-from nmpm.sim.mls_mpm import Grid, State, Stepper, Walls
-from nmpm.sim.mls_mpm_3d import Stepper3d
+from nmpm.sim import InitialState, load_preset, preset_from_dict
+from nmpm.sim.mpm.grid import MpmGrid, Walls
+from nmpm.sim.mpm.materials import Water
+from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
+from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
+from nmpm.sim.mpm.particles import MpmParticles
 
 WATER = Water(density=1000.0, bulk_modulus=7.0e4)
 SIZE = 0.05
 
 
-def grid(cells: int = 20, gravity: tuple[float, ...] = (0.0, 0.0, 0.0), **changes: object) -> Grid:
-    plain = Grid(np.zeros(3), SIZE, (cells,) * 3, 0.0, np.array(gravity))
+def grid(cells: int = 20, gravity: tuple[float, ...] = (0.0, 0.0, 0.0), **changes: object) -> MpmGrid:
+    plain = MpmGrid(np.zeros(3), SIZE, (cells,) * 3, 0.0, np.array(gravity))
     return dataclasses.replace(plain, **changes)  # type: ignore[arg-type]
 
 
@@ -25,8 +27,8 @@ def cloud(low: tuple[float, ...], shape: tuple[int, ...], seed: int = 0) -> np.n
     return np.array(low) + SIZE / 2 * (nodes + 0.5 + shift)
 
 
-def state(position: np.ndarray, velocity: np.ndarray) -> State:
-    return State(position, velocity, ((WATER, len(position)),), (SIZE / 2) ** 3)
+def state(position: np.ndarray, velocity: np.ndarray) -> MpmParticles:
+    return MpmParticles(position, velocity, ((WATER, len(position)),), (SIZE / 2) ** 3)
 
 
 def test_free_fall_is_exact():
@@ -85,11 +87,11 @@ def test_a_slab_that_fills_the_depth_moves_as_in_two_dimensions():
     flat = SIZE / 2 * (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2) + 0.5)
     layers = SIZE / 2 * (np.arange(depth) + 0.5)
     deep = np.concatenate([np.repeat(flat, depth, axis=0), np.tile(layers, len(flat))[:, None]], axis=1)
-    plane_grid = Grid(np.zeros(2), SIZE, (16, 12), 0.0, np.array([0.0, -9.81]))
-    box_grid = Grid(np.zeros(3), SIZE, (16, 12, 8), 0.0, np.array([0.0, -9.81, 0.0]))
-    plane = State(flat, np.zeros_like(flat), ((WATER, len(flat)),), (SIZE / 2) ** 2)
+    plane_grid = MpmGrid(np.zeros(2), SIZE, (16, 12), 0.0, np.array([0.0, -9.81]))
+    box_grid = MpmGrid(np.zeros(3), SIZE, (16, 12, 8), 0.0, np.array([0.0, -9.81, 0.0]))
+    plane = MpmParticles(flat, np.zeros_like(flat), ((WATER, len(flat)),), (SIZE / 2) ** 2)
     box = state(deep, np.zeros_like(deep))
-    two, three = Stepper(plane_grid, 2e-4), Stepper3d(box_grid, 2e-4)
+    two, three = Stepper2d(plane_grid, 2e-4), Stepper3d(box_grid, 2e-4)
     for _ in range(600):
         two.step(plane)
         three.step(box)
@@ -104,7 +106,7 @@ def test_pressure_at_the_bottom_carries_the_column():
     cells, height = 6, 16
     start = cloud((0.0, 0.0, 0.0), (2 * cells, 2 * height, 2 * cells))
     water = state(start, np.zeros_like(start))
-    box = Grid(np.zeros(3), SIZE, (cells, 2 * height, cells), 0.0, np.array([0.0, -9.81, 0.0]))
+    box = MpmGrid(np.zeros(3), SIZE, (cells, 2 * height, cells), 0.0, np.array([0.0, -9.81, 0.0]))
     stepper = Stepper3d(box, 5e-4)
     stepper.enclose(water)
     sums, count = np.zeros(len(start)), 0
@@ -156,16 +158,16 @@ def test_what_is_known_in_two_dimensions_only_is_refused():
     with pytest.raises(ConfigError, match="in two dimensions, not in three"):
         Stepper3d(grid(walls=Walls.OPEN_CORNERS), 1e-4)
     plain = load_preset("waterdrop3d").to_dict()
-    with pytest.raises(ConfigError, match="open corners are known in two dimensions"):
+    with pytest.raises(ConfigError, match="open corners are implemented in two dimensions"):
         preset_from_dict(plain | {"walls": "slip, open corners"})
-    with pytest.raises(ConfigError, match="sand is known in two dimensions, not in 3"):
+    with pytest.raises(ConfigError, match="sand is implemented in two dimensions, not in 3"):
         preset_from_dict(plain | {"materials": load_preset("sandramps").to_dict()["materials"]})
 
 
 def test_the_preset_stays_in_its_box_and_keeps_its_water():
     preset = load_preset("waterdrop3d")
     start = cloud((0.2, 0.15, 0.2), (8, 8, 8)) * 0.35 / SIZE * 0.05 + 0.2
-    made = simulate_from(preset, start, np.full_like(start, 0.8), 60)
+    made = preset.simulate_from(InitialState(start, np.full_like(start, 0.8)), 60)
     low, high = np.array(preset.scene.bounds).T
     assert made.position.shape == (61, 512, 3)
     assert np.all((made.position >= low - 1e-6) & (made.position <= high + 1e-6))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim import load_preset, simulate_from
+from nmpm.sim import InitialState, load_preset
 
 GOOP = load_preset("goop")
 
@@ -58,7 +58,7 @@ def test_is_the_same_for_a_seed_and_another_for_another():
 
 def test_free_fall_is_exact_before_contact():
     position = block(20, 20, (0.4, 0.55))
-    made = simulate_from(GOOP, position, np.tile([0.4, 0.3], (400, 1)), frames=60)
+    made = GOOP.simulate_from(InitialState(position, np.tile([0.4, 0.3], (400, 1))), frames=60)
     t = GOOP.frame_dt * np.arange(61)[:, None, None]
     # Gravity acts at the start of each substep, so that the fall runs ahead by half a substep's worth.
     ahead = t * GOOP.frame_dt / GOOP.substeps / 2
@@ -67,7 +67,7 @@ def test_free_fall_is_exact_before_contact():
 
 
 def test_a_heap_at_rest_keeps_its_area():
-    made = simulate_from(GOOP, block(110, 16, (0.1072, 0.1036)), np.zeros((1760, 2)), frames=300)
+    made = GOOP.simulate_from(InitialState(block(110, 16, (0.1072, 0.1036)), np.zeros((1760, 2))), frames=300)
     assert speeds(made.position)[-1] < 0.02
     rise = np.percentile(made.position[-1, :, 1], 98) - np.percentile(made.position[0, :, 1], 98)
     sunk = np.percentile(made.position[-1, :, 1], 2) - np.percentile(made.position[0, :, 1], 2)
@@ -76,23 +76,25 @@ def test_a_heap_at_rest_keeps_its_area():
 
 def test_a_higher_yield_stress_makes_a_higher_and_narrower_heap():
     position, velocity = block(30, 30, (0.4, 0.15)), np.zeros((900, 2))
-    soft = simulate_from(with_goop(yield_stress=50.0), position, velocity, frames=200).position[-1]
-    stiff = simulate_from(with_goop(yield_stress=800.0), position, velocity, frames=200).position[-1]
+    soft = with_goop(yield_stress=50.0).simulate_from(InitialState(position, velocity), frames=200).position[-1]
+    stiff = with_goop(yield_stress=800.0).simulate_from(InitialState(position, velocity), frames=200).position[-1]
     assert np.percentile(stiff[:, 1], 98) - 0.1 > 1.3 * (np.percentile(soft[:, 1], 98) - 0.1)
     assert np.ptp(stiff[:, 0]) < 0.8 * np.ptp(soft[:, 0])
 
 
 def test_a_higher_viscosity_spreads_more_slowly():
     position, velocity = block(30, 30, (0.4, 0.12)), np.zeros((900, 2))
-    thin = simulate_from(with_goop(viscosity=30.0), position, velocity, frames=60).position[-1]
-    thick = simulate_from(with_goop(viscosity=300.0), position, velocity, frames=60).position[-1]
+    thin = with_goop(viscosity=30.0).simulate_from(InitialState(position, velocity), frames=60).position[-1]
+    thick = with_goop(viscosity=300.0).simulate_from(InitialState(position, velocity), frames=60).position[-1]
     assert np.ptp(thick[:, 0]) < 0.9 * np.ptp(thin[:, 0])
 
 
 def test_coarser_grids_converge_to_the_fine_one():
     position, velocity = block(30, 30, (0.4, 0.3)), np.tile([1.0, 0.0], (900, 1))
-    fine = simulate_from(GOOP, position, velocity, frames=150).position
-    coarse = [simulate_from(GOOP.coarsened(factor), position, velocity, frames=150) for factor in (2, 4, 8)]
+    fine = GOOP.simulate_from(InitialState(position, velocity), frames=150).position
+    coarse = [
+        GOOP.coarsened(factor).simulate_from(InitialState(position, velocity), frames=150) for factor in (2, 4, 8)
+    ]
     errors = [np.mean((made.position - fine) ** 2) for made in coarse]
     still = np.mean((fine - fine[0]) ** 2)
     assert errors[0] < errors[1] < errors[2] < still
@@ -102,14 +104,14 @@ def test_coarser_grids_converge_to_the_fine_one():
 
 def test_starts_from_the_very_corner():
     corners = np.array(np.meshgrid([0.1, 0.9], [0.1, 0.9])).T.reshape(-1, 2)
-    made = simulate_from(GOOP, corners, np.zeros_like(corners), frames=20)
+    made = GOOP.simulate_from(InitialState(corners, np.zeros_like(corners)), frames=20)
     assert made.position.min() >= 0.1
     assert made.position.max() <= 0.9
 
 
 def test_tells_of_its_progress():
     seen: list[int] = []
-    simulate_from(GOOP, block(2, 2, (0.4, 0.4)), np.zeros((4, 2)), frames=3, progress=seen.append)
+    GOOP.simulate_from(InitialState(block(2, 2, (0.4, 0.4)), np.zeros((4, 2))), frames=3, progress=seen.append)
     assert seen == [1, 2, 3]
 
 
@@ -125,16 +127,16 @@ def test_tells_of_its_progress():
 )
 def test_refuses_states_that_cannot_be(position, velocity, message):
     with pytest.raises(DataError, match=message):
-        simulate_from(GOOP, np.array(position, float), np.array(velocity, float), frames=1)
+        GOOP.simulate_from(InitialState(np.array(position, float), np.array(velocity, float)), frames=1)
 
 
 def test_refuses_counts_that_do_not_add_up():
     with pytest.raises(DataError, match="Counts"):
-        simulate_from(GOOP, np.full((2, 2), 0.5), np.zeros((2, 2)), 1, counts=(1,))
+        GOOP.simulate_from(InitialState(np.full((2, 2), 0.5), np.zeros((2, 2)), counts=(1,)), 1)
 
 
 def test_a_blow_up_names_its_substep():
     position = block(10, 10, (0.4, 0.4))
     velocity = np.where(np.indices(position.shape).sum(0) % 2, 1e200, -1e200)
     with pytest.raises(ConfigError, match=r"not finite after substep \d+ of 12 of frame 1;.*more substeps"):
-        simulate_from(GOOP, position, velocity, frames=3)
+        GOOP.simulate_from(InitialState(position, velocity), frames=3)

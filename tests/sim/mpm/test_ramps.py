@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
-from nmpm.sim.obstacles import Ramp, Ramps, distance
+from nmpm.sim.mpm.ramps import Ramp, RampRanges, distance_to_ramps
 
-RAMPS = Ramps(number=(2, 4), length=(0.1, 0.3), thickness=0.03, angle=(10.0, 50.0), gap=0.05)
+RAMPS = RampRanges(number=(2, 4), length=(0.1, 0.3), thickness=0.03, angle=(10.0, 50.0), gap=0.05)
 BOX = ((0.1, 0.9), (0.1, 0.9))
 
 ramps = st.builds(
@@ -64,14 +64,14 @@ def test_drawn_bars_keep_their_distance_from_everything(seed, low):
         assert 10 <= abs(math.degrees(ramp.angle)) <= 50
         for other in drawn[:index]:
             assert other.distance(outline).min() >= 0.05 - 1e-9
-    assert sum(len(ramp.particles(0.01)) for ramp in drawn) <= RAMPS.most_particles(0.01)
+    assert sum(len(ramp.particles(0.01)) for ramp in drawn) <= RAMPS.max_particles(0.01)
 
 
 def test_the_nearest_bar_counts():
     one, two = Ramp((0.3, 0.3), 0.2, 0.02, 0.0), Ramp((0.7, 0.7), 0.2, 0.02, 0.0)
     points = np.array([[0.3, 0.36], [0.7, 0.76], [0.7, 0.7]])
-    np.testing.assert_allclose(distance((one, two), points), [0.05, 0.05, -0.01], atol=1e-12)
-    assert np.all(np.isinf(distance((), points)))
+    np.testing.assert_allclose(distance_to_ramps((one, two), points), [0.05, 0.05, -0.01], atol=1e-12)
+    assert np.all(np.isinf(distance_to_ramps((), points)))
 
 
 @pytest.mark.parametrize(

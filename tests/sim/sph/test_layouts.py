@@ -5,13 +5,14 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
-from nmpm.sim.sph.relaxation import relaxed
-from nmpm.sim.sph.starts import Column, Strewn, Throw
+from nmpm.sim.sph.layouts import Column, FluidBlocks
+from nmpm.sim.sph.obstacles import ObstacleRanges
+from nmpm.sim.sph.relaxation import relax
 
 BOX = ((0.1, 0.9), (0.2, 0.8))
 COLUMN = Column(width=0.3, height=0.2, noise=0.25, relaxation=100)
-THROW = Throw((1, 3), (400, 500), 0.2, (0.5, 2.0), 0.02, 1.0, 0.1)
-STREWN = Strewn((1, 3), (0.06, 0.1), 0.02)
+THROW = FluidBlocks((1, 3), (400, 500), 0.2, (0.5, 2.0), 0.02, 1.0, 0.1)
+STREWN = ObstacleRanges((1, 3), (0.06, 0.1), 0.02)
 
 
 def nearest(position):
@@ -36,7 +37,7 @@ def test_relaxation_spreads_strewn_particles():
     rng = np.random.default_rng(0)
     strewn = rng.uniform(0, 1, (400, 2))
     box = ((0.0, 1.0), (0.0, 1.0))
-    evenness = [np.percentile(nearest(relaxed(strewn, box, 0.05, sweeps)), 5) for sweeps in (0, 30, 300)]
+    evenness = [np.percentile(nearest(relax(strewn, box, 0.05, sweeps)), 5) for sweeps in (0, 30, 300)]
     assert evenness[0] < evenness[1] < evenness[2]
     assert evenness[2] > 0.6 * 0.05
 
@@ -44,7 +45,7 @@ def test_relaxation_spreads_strewn_particles():
 def test_a_lattice_is_relaxed_already():
     nodes = np.stack(np.meshgrid(np.arange(20), np.arange(10), indexing="ij"), -1).reshape(-1, 2)
     lattice = 0.05 * (nodes + 0.5)
-    np.testing.assert_allclose(relaxed(lattice, ((0.0, 1.0), (0.0, 0.5)), 0.05, 20), lattice, atol=1e-6)
+    np.testing.assert_allclose(relax(lattice, ((0.0, 1.0), (0.0, 0.5)), 0.05, 20), lattice, atol=1e-6)
 
 
 @settings(max_examples=30, deadline=None)
@@ -78,10 +79,10 @@ def test_the_same_seed_draws_the_same():
 @pytest.mark.parametrize(
     ("crowded", "message"),
     [
-        (Throw((1, 1), (9000, 9001), 0.2, (1.0, 1.0), 0.02, 1.0, 0.1), "No room"),
-        (Strewn((9, 9), (0.3, 0.3), 0.1), "No"),
+        (FluidBlocks((1, 1), (9000, 9001), 0.2, (1.0, 1.0), 0.02, 1.0, 0.1), "No room"),
+        (ObstacleRanges((9, 9), (0.3, 0.3), 0.1), "No"),
     ],
 )
 def test_a_box_too_crowded_is_an_error(crowded, message):
     with pytest.raises(ConfigError, match=message):
-        crowded.draw(*((BOX, 0.01, ()) if isinstance(crowded, Throw) else (BOX,)), np.random.default_rng(0))
+        crowded.draw(*((BOX, 0.01, ()) if isinstance(crowded, FluidBlocks) else (BOX,)), np.random.default_rng(0))

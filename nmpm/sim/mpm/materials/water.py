@@ -8,8 +8,8 @@ and the Kirchhoff stress is −J p I. Viscosity adds 2 η J times the deviator o
 dJ/dt = J ∇·v, so that a rotation leaves it alone whatever the length of the substep.
 
 Where J > 1 the pressure is below zero: a share `tension` of it is kept. Murnaghan's own (1) levels off at K / γ for
-γ > 0 and holds a splash together; with none (0) drops part freely. J is not reset when particles part: the volume gained while torn
-must be lost again before water pushes back, as with sand.
+γ > 0 and holds a splash together; with none (0) drops part freely. J is not reset when particles part: the
+volume gained while torn must be lost again before water pushes back, as with sand.
 
 Murnaghan, "The compressibility of media under extreme pressures", 1944; in the material point method: Tampubolon et
 al., "Multi-species simulation of porous sand and water mixtures", 2017.
@@ -78,7 +78,7 @@ class Water(Material):
         volume = self._compressed_volume(energy)
         exponent = self.exponent
         stiffness = self.bulk_modulus / exponent * ((exponent - 1) * volume ** (1 - exponent) + volume)
-        return max(self.bulk_modulus, stiffness)
+        return float(max(self.bulk_modulus, stiffness))
 
     def _compressed_volume(self, energy: float) -> float:
         """Smallest J that the energy can compress to: the root of ∫ p dV = energy, by bisection in [0.1, 1]."""
@@ -92,7 +92,7 @@ class Water(Material):
         """Work that compresses it from rest to J, per volume at rest."""
         exponent = self.exponent
         power = -math.log(volume) if exponent == 1 else (volume ** (1 - exponent) - 1) / (exponent - 1)
-        return self.bulk_modulus / exponent * (power - (1 - volume))
+        return float(self.bulk_modulus / exponent * (power - (1 - volume)))
 
     def rest(self, dim: int) -> tuple[float, ...]:  # noqa: ARG002
         return (1.0,)
