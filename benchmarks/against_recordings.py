@@ -31,7 +31,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from nmpm.data.format import Split, Trajectory
-from nmpm.sim import MpmPreset, load_preset, simulate_from
+from nmpm.sim import InitialState, Preset, load_preset
+from nmpm.sim.preset import BOUNDARY
 
 Positions = NDArray[np.float64]
 
@@ -47,12 +48,12 @@ def main() -> None:
     parser.add_argument("--as", nargs="+", default=[], dest="aliases", metavar="TYPE=MATERIAL")
     given = parser.parse_args()
     preset = load_preset(given.preset)
-    if not isinstance(preset, MpmPreset):
-        raise SystemExit(f"{given.preset} is not simulated by the material point method.")
+    if preset.scene.gravity is None:
+        raise SystemExit(f"{given.preset} has no gravity of its own to start recordings with.")
     aliases = {int(number): name for number, name in (alias.split("=") for alias in given.aliases)}
     errors: list[Mapping[str, Positions]] = []
     bulks: list[Positions] = []
-    say(" " * 22 + "".join(f"{horizon:>11}" for horizon in (*HORIZONS, "full")))
+    write_line(" " * 22 + "".join(f"{horizon:>11}" for horizon in (*HORIZONS, "full")))
     for split in given.splits:
         recordings = Split(given.folder / f"{split}.h5")
         for index in range(len(recordings)):
@@ -62,24 +63,24 @@ def main() -> None:
             table(f"{split} {recordings.names[index]}", found)
     table("mean", {key: np.mean([found[key] for found in errors], axis=0) for key in errors[0]})
     recorded, ours, apart = np.mean(bulks, axis=0)
-    say("\nlast frame" + "".join(f"{name:>12}" for name in ("height", "energy", "width", "top", "distance")))
-    say("recorded  " + "".join(f"{value:12.5f}" for value in recorded[:4]))
-    say("simulated " + "".join(f"{value:12.5f}" for value in ours[:4]) + f"{apart[0]:12.5f}")
+    write_line("\nlast frame" + "".join(f"{name:>12}" for name in ("height", "energy", "width", "top", "distance")))
+    write_line("recorded  " + "".join(f"{value:12.5f}" for value in recorded[:4]))
+    write_line("simulated " + "".join(f"{value:12.5f}" for value in ours[:4]) + f"{apart[0]:12.5f}")
 
 
 def compared(
-    preset: MpmPreset, trajectory: Trajectory, aliases: Mapping[int, str]
+    preset: Preset, trajectory: Trajectory, aliases: Mapping[int, str]
 ) -> tuple[Mapping[str, Positions], Positions]:
     """Mean squared distances of each of ours, still, fall and nudged at the horizons; and bulk figures (3, 4)."""
     order, counts = sorted_by_material(preset, trajectory.particle_type, aliases)
     recorded = trajectory.position[:, order].astype(np.float64)
-    dt, fall = preset.frame_dt, np.array(preset.gravity)
+    dt, fall = preset.frame_dt, np.array(preset.scene.gravity)
     # The mean velocity between the frames, and what gravity's kicks, one per substep, add until the second.
     velocity = (recorded[1] - recorded[0]) / dt + fall * dt / 2 * (1 - 1 / preset.substeps)
     frames = len(recorded) - 2
     ours = simulated(preset, recorded[1], velocity, frames, counts)
     nudge = np.random.default_rng(0).normal(scale=1e-6, size=recorded[1].shape)
-    low, high = np.array(preset.reach).T
+    low, high = np.array(preset.scene.bounds).T
     nudged = simulated(preset, np.clip(recorded[1] + nudge, low, high), velocity, frames, counts)
     times = dt * np.arange(1, frames + 1)[:, None, None]
     falling = np.clip(recorded[1] + times * velocity + times**2 / 2 * fall, low, high)
@@ -96,25 +97,26 @@ def compared(
 
 
 def sorted_by_material(
-    preset: MpmPreset, particle_type: NDArray[np.int64], aliases: Mapping[int, str]
+    preset: Preset, particle_type: NDArray[np.int64], aliases: Mapping[int, str]
 ) -> tuple[NDArray[np.int64], tuple[int, ...]]:
     """The order that sorts particles as the preset's materials, and how many there are of each."""
-    places = {material.particle_type: k for k, material in enumerate(preset.materials)}
-    names = {material.name: k for k, material in enumerate(preset.materials)}
+    kinds = {number: name for number, name in preset.type_names.items() if number != BOUNDARY}
+    places = {number: k for k, number in enumerate(kinds)}
+    names = {name: k for k, name in enumerate(kinds.values())}
     places |= {number: names[name] for number, name in aliases.items()}
     unknown = sorted(set(particle_type.tolist()) - set(places))
     if unknown:
         raise SystemExit(f"Preset {preset.name} has no material for the types {unknown}; name one by --as.")
     place = np.array([places[number] for number in particle_type.tolist()])
-    counts = tuple(int(np.sum(place == k)) for k in range(len(preset.materials)))
+    counts = tuple(int(np.sum(place == k)) for k in range(len(kinds)))
     return np.argsort(place, kind="stable"), counts
 
 
 def simulated(
-    preset: MpmPreset, position: Positions, velocity: Positions, frames: int, counts: tuple[int, ...]
+    preset: Preset, position: Positions, velocity: Positions, frames: int, counts: tuple[int, ...]
 ) -> Positions:
     """Our positions after the given state, (frames, N, 2)."""
-    made = simulate_from(preset, position, velocity, frames, counts)
+    made = preset.simulate_from(InitialState(position, velocity, counts=counts), frames)
     return made.position[1:].astype(np.float64)
 
 
@@ -135,10 +137,10 @@ def bulk(positions: Positions, dt: float) -> Positions:
 def table(name: str, errors: Mapping[str, Positions]) -> None:
     """One line per predictor."""
     for key, values in errors.items():
-        say(f"{name:<14}{key:<8}" + "".join(f"{1e3 * value:11.5f}" for value in values))
+        write_line(f"{name:<14}{key:<8}" + "".join(f"{1e3 * value:11.5f}" for value in values))
 
 
-def say(line: Any) -> None:
+def write_line(line: Any) -> None:
     """One line of the result."""
     sys.stdout.write(f"{line}\n")
 

@@ -30,9 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from nmpm.sim import load_preset
+from nmpm.sim import InitialState, load_preset
 from nmpm.sim.sph.preset import SphPreset
-from nmpm.sim.sph.simulate import simulate_from
 
 Water = NDArray[np.float64]
 Series = dict[str, NDArray[np.float64]]
@@ -56,16 +55,16 @@ def main() -> None:
     deviations("nmpm from JAX-SPH", series, measured(recorded, preset), preset.frame_dt)
     deviations("nmpm from itself, nudged", floor, series, preset.frame_dt)
     apart = [np.sqrt(((ours[n] - recorded[n]) ** 2).sum(-1).mean()) for n in frames(preset.frame_dt)]
-    say("\nRMS distance of the same particles: " + ", ".join(f"{d:.4f}" for d in apart))
+    write_line("\nRMS distance of the same particles: " + ", ".join(f"{d:.4f}" for d in apart))
 
 
 def simulated(preset: SphPreset, start: Water) -> Water:
-    """Our water from the start, likewise; says how long it took."""
+    """Our water from the same start, (401, 5000, 2); prints how long it took."""
     begin = time.perf_counter()
-    made = simulate_from(preset, start, np.zeros_like(start), preset.frames, progress=tell)
+    made = preset.simulate_from(InitialState(start, np.zeros_like(start)), preset.frames, show_frame)
     seconds = time.perf_counter() - begin
     steps = preset.frames * preset.substeps * len(start)
-    say(f"\n{seconds:.0f} s, {steps / seconds / 1e6:.2f} million particle-steps per second, {made.attributes}\n")
+    write_line(f"\n{seconds:.0f} s, {steps / seconds / 1e6:.2f} million particle-steps per second, {made.attributes}\n")
     return made.position[:, : len(start)].astype(np.float64)
 
 
@@ -97,7 +96,7 @@ def measured(water: Water, preset: SphPreset) -> Series:
 
 
 def crest(heights: NDArray[Any]) -> float:
-    """Height below which 99% of some particles are; nought where there are too few to tell."""
+    """Height below which 99% of some particles are; 0 where there are ten or fewer."""
     return float(np.quantile(heights, 0.99)) if len(heights) > 10 else 0.0
 
 
@@ -108,11 +107,11 @@ def frames(dt: float) -> list[int]:
 
 def table(theirs: Series, ours: Series, dt: float) -> None:
     """Both at the times."""
-    say("JAX-SPH / nmpm\n")
-    say("| t | " + " | ".join(ours) + " |")
-    say("| --- |" + " --- |" * len(ours))
+    write_line("JAX-SPH / nmpm\n")
+    write_line("| t | " + " | ".join(ours) + " |")
+    write_line("| --- |" + " --- |" * len(ours))
     for n in frames(dt):
-        say(f"| {n * dt:.2f} | " + " | ".join(f"{theirs[k][n]:.3f} / {ours[k][n]:.3f}" for k in ours) + " |")
+        write_line(f"| {n * dt:.2f} | " + " | ".join(f"{theirs[k][n]:.3f} / {ours[k][n]:.3f}" for k in ours) + " |")
 
 
 def deviations(name: str, series: Series, reference: Series, dt: float) -> None:
@@ -121,15 +120,15 @@ def deviations(name: str, series: Series, reference: Series, dt: float) -> None:
     for when, part in ((f"until {IMPACT}", slice(1, impact + 1)), (f"after {IMPACT}", slice(impact + 1, None))):
         largest = [(np.abs(series[k] - reference[k])[part].max(), np.abs(reference[k][part]).max()) for k in series]
         cells = (f"{error / scale:.2%}" if scale else "–" for error, scale in largest)
-        say(f"| {name}, {when} | " + " | ".join(cells) + " |")
+        write_line(f"| {name}, {when} | " + " | ".join(cells) + " |")
 
 
-def say(line: str) -> None:
+def write_line(line: str) -> None:
     """One line of the result."""
     sys.stdout.write(line + "\n")
 
 
-def tell(frame: int) -> None:
+def show_frame(frame: int) -> None:
     """One line of progress."""
     sys.stderr.write(f"\rframe {frame}")
 

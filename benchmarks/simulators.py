@@ -1,6 +1,6 @@
-"""How fast the material point method is: million particle-substeps per second, on one core and on all.
+"""How fast the simulators are: million particle-substeps per second, on one core and on all.
 
-python benchmarks/simulators.py                   every shipped preset of it
+python benchmarks/simulators.py                   every shipped preset of the material point method
 python benchmarks/simulators.py goop waterramps --frames 100 --repeats 5 --json simulators.json
 """
 
@@ -15,11 +15,11 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from nmpm.sim import MpmPreset, load_preset, preset_names
+from nmpm.sim import MpmPreset, Preset, load_preset, preset_names
 from nmpm.sim.preset import BOUNDARY
 
 
-def rate(preset: MpmPreset, workers: int, seed: int) -> float:
+def rate(preset: Preset, workers: int, seed: int) -> float:
     """Million particle-substeps per second of as many trajectories at a time as there are workers."""
     start = time.perf_counter()
     with ThreadPoolExecutor(workers) as pool:
@@ -32,20 +32,18 @@ def rate(preset: MpmPreset, workers: int, seed: int) -> float:
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="presets (default: all of the method's)")
+    parser.add_argument("names", nargs="*", help="presets (default: all of the material point method)")
     parser.add_argument("--frames", type=int, default=60, help="of each trajectory (default: 60)")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     chosen = parser.parse_args()
     cores, rows = os.cpu_count() or 1, []
-    names = chosen.names or [name for name in preset_names() if isinstance(load_preset(name), MpmPreset)]
+    names = chosen.names or [name for name in preset_names() if load_preset(name).solver == MpmPreset.solver]
     sys.stdout.write(f"million particle-substeps/s, median (least-most) of {chosen.repeats}; {cores} cores\n")
     for name in names:
         preset = load_preset(name)
-        if not isinstance(preset, MpmPreset):
-            parser.error(f"{name} is not simulated by the material point method")
-        preset.lasting(1).simulate(0)  # compiles
-        preset = preset.lasting(chosen.frames)
+        preset.with_frames(1).simulate(0)  # compiles
+        preset = preset.with_frames(chosen.frames)
         # Alternating, so that both see the same machine.
         rates = {workers: [0.0] * chosen.repeats for workers in (1, cores)}
         for repeat in range(chosen.repeats):

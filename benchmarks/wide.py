@@ -27,14 +27,14 @@ from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE
-from nmpm.sim import MpmPreset, load_preset
+from nmpm.sim import Preset, load_preset
 from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
 
 HORIZONS = (32, 100)
 
 
-def error(emulator: Emulator, preset: MpmPreset, seeds: list[int], workers: int) -> dict[str, float]:
+def error(emulator: Emulator, preset: Preset, seeds: list[int], workers: int) -> dict[str, float]:
     """Errors of the emulator on scenes of a preset, in the box of that preset."""
     scene = preset.scene
     emulator = emulator.over(scene).eval()
@@ -65,8 +65,6 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     chosen = parser.parse_args()
     preset = load_preset(chosen.preset)
-    if not isinstance(preset, MpmPreset):
-        parser.error(f"{chosen.preset} is not simulated by the material point method")
     seeds = [derived_seed(chosen.seed, index) for index in range(chosen.scenes)]
     models = {run.name: trained(run) for run in chosen.runs} | {name: Zoo.load(name).emulator for name in chosen.zoo}
     for name, emulator in models.items():

@@ -64,7 +64,7 @@ def _simulate(chosen: argparse.Namespace) -> None:
     if chosen.workers is not None and chosen.workers < 1:
         raise ConfigError(f"--workers {chosen.workers}: at least 1 is needed.")
     preset = load_preset(chosen.name)
-    preset = preset if chosen.frames is None else preset.lasting(chosen.frames)
+    preset = preset if chosen.frames is None else preset.with_frames(chosen.frames)
     if chosen.preview is not None:
         _preview(preset, chosen.seed, chosen.preview)
         return
@@ -92,7 +92,7 @@ def _list() -> None:
         materials = ", ".join(preset.scene.materials)
         splits = "/".join(map(str, paper.values()))
         sys.stdout.write(
-            f"{name:<17}{preset.generator:<9}{preset.scene.dim:<6}{f'≤ {preset.most_particles}':<11}"
+            f"{name:<17}{preset.generator:<9}{preset.scene.dim:<6}{f'≤ {preset.max_particles}':<11}"
             f"{preset.frames:<8}{splits:<15}{materials}{_varying(preset)}\n"
         )
 

@@ -103,7 +103,7 @@ def request_of(
     """
     entry = describe(name)
     preset = load_preset(entry.preset)
-    preset = preset if frames is None else preset.lasting(frames)
+    preset = preset if frames is None else preset.with_frames(frames)
     return Request(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
 
 

@@ -255,7 +255,7 @@ def metadata_of(preset: Preset) -> Metadata:
         particle_volume=scene.particle_volume,
         extra={
             "default_connectivity_radius": round(1.8 * scene.particle_spacing, 6),
-            "num_particles_max": preset.most_particles,
+            "num_particles_max": preset.max_particles,
             "generator": f"nmpm {__version__}, {preset.generator}",
             "note": "Simulated by nmpm; not measured, and not anybody else's dataset.",
         },

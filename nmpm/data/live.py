@@ -51,7 +51,7 @@ class LiveRecordings:
     @property
     def most_bytes(self) -> int:
         """Size of the positions of the largest trajectory that may come."""
-        return 4 * (self.preset.frames + 1) * self.preset.most_particles * self.scene.dim
+        return 4 * (self.preset.frames + 1) * self.preset.max_particles * self.scene.dim
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
         """Simulates several trajectories side by side; those asked for last and next to last are still at hand."""

@@ -1,17 +1,21 @@
-"""Reference simulators: the source of the embedded datasets and the classical side of every comparison."""
+"""Reference simulators: the source of the embedded datasets and the classical baseline of every comparison.
 
+`preset.py` is what all simulators offer; `mpm/` (material point method, 2-D and 3-D) and `sph/` (weakly compressible
+SPH, 2-D) implement it, and `presets/` describes the shipped scenes.
+"""
+
+from nmpm.sim.initial_state import InitialState
 from nmpm.sim.loading import load_preset, preset_from_dict, preset_names
-from nmpm.sim.mpm import simulate_from
-from nmpm.sim.mpm_preset import MpmPreset
+from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset
 from nmpm.sim.trajectory import SimulatedTrajectory
 
 __all__ = [
+    "InitialState",
     "MpmPreset",
     "Preset",
     "SimulatedTrajectory",
     "load_preset",
     "preset_from_dict",
     "preset_names",
-    "simulate_from",
 ]

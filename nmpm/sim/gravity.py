@@ -1,4 +1,4 @@
-"""Gravity that points another way in each trajectory."""
+"""Gravity whose direction differs between trajectories."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 
-def turned(gravity: tuple[float, ...], most: float, rng: np.random.Generator) -> tuple[float, ...]:
-    """A gravity of two axes, turned by an angle drawn between -most and most degrees; unchanged for most = 0."""
-    if not most:
+def draw_gravity(gravity: tuple[float, ...], max_turn: float, rng: np.random.Generator) -> tuple[float, ...]:
+    """A gravity of two axes, turned by a random angle of at most `max_turn` degrees; unchanged for 0."""
+    if not max_turn:
         return gravity
-    angle = math.radians(rng.uniform(-most, most))
+    angle = math.radians(rng.uniform(-max_turn, max_turn))
     (x, y), cos, sin = gravity, math.cos(angle), math.sin(angle)
     return cos * x - sin * y, sin * x + cos * y

@@ -12,7 +12,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError
-from nmpm.sim.mpm_preset import MpmPreset
+from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset
 from nmpm.sim.sph.preset import SphPreset
 

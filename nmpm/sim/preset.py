@@ -1,55 +1,112 @@
-"""Presets: everything that a simulated family of scenes is made of, read from one YAML file."""
+"""Presets: a family of simulated scenes, its solver and initial states included, read from one YAML file."""
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-from nmpm._support.plain_data import to_lists, to_tuples
 from nmpm.errors import ConfigError
-from nmpm.scene import Scene
+from nmpm.scene import Interval, Scene
+from nmpm.sim.config import check, to_plain
+from nmpm.sim.initial_state import InitialState
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
 BOUNDARY = 3
-"""Type number of particles that never move, after DeepMind's scenes."""
+"""Type id of particles that never move, as in DeepMind's scenes."""
 
 
+@dataclass(frozen=True)
 class Preset(abc.ABC):
-    """A family of simulated scenes; below it, one frozen dataclass per solver.
+    """A family of simulated scenes; each solver has a subclass with its own parameters.
 
-    Attributes:
+    Args:
         name: Of the family.
         frames: Simulated frames of a trajectory after its initial state.
         frame_dt: Time between frames, in seconds.
+        substeps: Substeps of a frame.
+        box: Where particles may be, (lower, upper) along each axis, in length.
+        domain: What an emulator's grid covers, likewise.
+
+    Raises:
+        ConfigError: if a number is out of range.
     """
 
     solver: ClassVar[str]
-    """By which a preset's file asks for it."""
+    """Its name in a preset's file."""
 
     generator: ClassVar[str]
-    """Name of the method, for the files' provenance."""
+    """Name of the method, written to datasets."""
 
     revision: ClassVar[int]
-    """Raised whenever the same preset and seed would give other numbers."""
+    """Increased whenever the same preset and seed give other numbers."""
 
     name: str
     frames: int
     frame_dt: float
+    substeps: int
+    box: tuple[Interval, ...]
+    domain: tuple[Interval, ...]
+
+    def __post_init__(self) -> None:
+        self._check_positive("frames", "frame_dt", "substeps")
+        self._check_whole("frames", "substeps")
+
+    def _check_whole(self, *keys: str) -> None:
+        for key in keys:
+            check(isinstance(getattr(self, key), int), f"{key} = {getattr(self, key)} must be a whole number.")
+
+    def _check_positive(self, *keys: str) -> None:
+        for key in keys:
+            value = getattr(self, key)
+            check(
+                isinstance(value, int | float) and 0 < value < math.inf, f"{key} = {value} must be positive and finite."
+            )
 
     @abc.abstractmethod
-    def simulate(self, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
-        """A trajectory of `frames` + 1 frames, the same to the bit for the same preset and seed.
+    def draw(self, seed: int) -> InitialState:
+        """The initial state of a seed's trajectory.
 
         Raises:
-            ConfigError: if no initial state is found, or the state is no longer finite.
+            ConfigError: if no arrangement fits into the box.
         """
+
+    @abc.abstractmethod
+    def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
+        """A trajectory of `frames` + 1 frames, the first of which is the given state.
+
+        The preset's own initial states and number of frames are not used.
+
+        Args:
+            start: Within the box and outside of obstacles.
+            frames: Frames to simulate.
+            progress: Called after each frame.
+
+        Raises:
+            DataError: if the arrays do not fit together, or a particle is outside of the box or inside an obstacle.
+            ConfigError: if the simulation becomes unstable; the message names the frame.
+        """
+
+    def simulate(self, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
+        """A trajectory of `self.frames` + 1 frames; the same preset and seed give the same bits.
+
+        Raises:
+            ConfigError: if no initial state fits into the box, or the simulation becomes unstable.
+        """
+        try:
+            trajectory = self.simulate_from(self.draw(seed), self.frames, progress)
+        except ConfigError as error:
+            raise ConfigError(f"Preset {self.name}, seed {seed}: {error}") from error
+        trajectory.attributes["seed"] = seed
+        return trajectory
 
     @property
     @abc.abstractmethod
     def scene(self) -> Scene:
-        """The facts that the preset's trajectories share, without simulating one."""
+        """What the preset's trajectories have in common, known without simulating."""
 
     @property
     @abc.abstractmethod
@@ -58,22 +115,57 @@ class Preset(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def most_particles(self) -> int:
-        """A trajectory has no more particles than that, static ones included."""
+    def max_particles(self) -> int:
+        """Upper bound of a trajectory's particles, static ones included."""
 
-    def lasting(self, frames: int) -> Self:
-        """The same, with another number of frames.
+    @property
+    @abc.abstractmethod
+    def stable_substeps(self) -> int:
+        """Fewest substeps of a frame with which the preset's scenes are stable."""
+
+    @abc.abstractmethod
+    def varied(self, *, speed: float = 1.0, gravity: float = 1.0) -> Self:
+        """The same scenes with initial speeds and gravity times a factor; with more substeps where stability asks it.
+
+        A negative factor reverses gravity.
+        """
+
+    @abc.abstractmethod
+    def widened(self, times: int) -> Self:
+        """Scenes in a domain so many times as wide, with up to as many times as many particles."""
+
+    @abc.abstractmethod
+    def coarsened(self, factor: int) -> Self:
+        """A cheaper simulation, `factor` times as coarse, with `stable_substeps` substeps.
+
+        Raises:
+            ConfigError: if the preset's resolution cannot be divided so.
+        """
+
+    def with_frames(self, frames: int) -> Self:
+        """The same with another number of frames.
 
         Raises:
             ConfigError: if it is not a positive whole number.
         """
-        changed: Self = dataclasses.replace(self, frames=frames)  # type: ignore[type-var]  # (every preset is one)
-        return changed
+        return dataclasses.replace(self, frames=frames)
+
+    def with_substeps(self, substeps: int) -> Self:
+        """The same with another number of substeps.
+
+        Raises:
+            ConfigError: if there are fewer than `stable_substeps`.
+        """
+        check(
+            substeps >= self.stable_substeps,
+            f"{substeps} substeps are unstable for preset {self.name}; take at least {self.stable_substeps}.",
+        )
+        return dataclasses.replace(self, substeps=substeps)
 
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]  # (likewise)
-        return {"solver": self.solver} | {key: _plain(value) for key, value in own.items() if value is not None}
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {"solver": self.solver} | {key: to_plain(value) for key, value in own.items() if value is not None}
 
     @classmethod
     @abc.abstractmethod
@@ -83,50 +175,3 @@ class Preset(abc.ABC):
         Raises:
             ConfigError: if a key is unknown, missing or of the wrong kind.
         """
-
-
-def checked(kind: type[Any], plain: Any, where: str) -> dict[str, Any]:
-    """The entries of a section, if they are the fields of a dataclass; those with defaults may be missing.
-
-    Raises:
-        ConfigError: naming the keys that are unknown or missing.
-    """
-    if not isinstance(plain, Mapping):
-        raise ConfigError(f"{where} must map keys to values; it is {plain!r}.")
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    needed = {name for name, field in fields.items() if _is_required(field)}
-    for problem, keys in (("unknown", set(plain) - set(fields)), ("missing", needed - set(plain))):
-        if keys:
-            raise ConfigError(
-                f"{where}: {problem} {', '.join(sorted(map(str, keys)))}; keys: {', '.join(sorted(fields))}."
-            )
-    return dict(plain)
-
-
-def built(kind: type[Any], plain: Any, where: str) -> Any:
-    """A dataclass from a section's entries, with lists as tuples.
-
-    Raises:
-        ConfigError: if a key is unknown or missing, or a value is wrong.
-    """
-    entries = {key: to_tuples(value) for key, value in checked(kind, plain, where).items()}
-    try:
-        return kind(**entries)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{where}: {error}") from error
-
-
-def require(holds: bool, message: str) -> None:
-    """Raises a ConfigError with the message unless the condition holds."""
-    if not holds:
-        raise ConfigError(message)
-
-
-def _is_required(field: dataclasses.Field[Any]) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return to_lists(value)

@@ -1,4 +1,4 @@
-"""What simulators give back."""
+"""What simulators return."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Progress = Callable[[int], None]
-"""Told how many frames are done, after each."""
+"""Called after each frame with the number of frames done."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class SimulatedTrajectory:
     """T frames of N particles, made by a reference simulator.
 
     Args:
-        position: (T, N, D) float32, in length; the first frame is the initial state. Static particles stand in every
+        position: (T, N, D) float32, in length; the first frame is the initial state. Static particles are in every
             frame.
-        particle_type: (N,) int64, DeepMind's numbers.
-        attributes: What else is known: the seed, gravity (D,) where it varies, the simulator's counts of what should
-            not happen.
+        particle_type: (N,) int64, DeepMind's type ids.
+        attributes: The seed, gravity (D,) where it varies, and the simulator's counts of events that should not
+            happen.
     """
 
     position: NDArray[np.float32]

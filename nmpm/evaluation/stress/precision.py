@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -16,9 +17,7 @@ from nmpm.evaluation.stress.course import SOUND, apart, follow
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject
 from nmpm.particles import Particles
-from nmpm.sim import MpmPreset
-from nmpm.sim.gravity import turned
-from nmpm.sim.mpm import draw_scene, simulate_from
+from nmpm.sim import Preset
 
 NUDGE = 1e-6
 """Of the domain's longest side: standard deviation of a nudge to the initial positions."""
@@ -81,17 +80,14 @@ def growth(distance: Tensor) -> float:
     return 100 * float((centred * logs).sum() / centred.square().sum())
 
 
-def _simulator_growth(subject: Subject, preset: MpmPreset, frames: int, size: Size) -> float:
+def _simulator_growth(subject: Subject, preset: Preset, frames: int, size: Size) -> float:
     rng, slopes = np.random.default_rng(subject.seed), []
     side = max(high - low for low, high in preset.domain)
     for seed in subject.seeds(size.scenes):
-        draw = np.random.default_rng(seed)
-        gravity = turned(preset.gravity, preset.gravity_turn, draw)
-        start, ramps = draw_scene(preset, draw)
-        runs = [
-            simulate_from(preset, position, start.velocity, frames, start.counts, None, gravity, ramps).position[1:]
-            for position in (start.position, start.position + NUDGE * side * rng.standard_normal(start.position.shape))
-        ]
+        start = preset.draw(seed)
+        noise = NUDGE * side * rng.standard_normal(start.position.shape)
+        pair = start, dataclasses.replace(start, position=start.position + noise)
+        runs = [preset.simulate_from(state, frames).position[1:] for state in pair]
         distance = np.sqrt(np.square(runs[0] - runs[1]).sum(-1).mean(-1))
         slopes.append(growth(torch.from_numpy(distance)))
     return float(np.mean(slopes))

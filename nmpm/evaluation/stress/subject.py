@@ -63,8 +63,8 @@ class Subject:
 
 def simulated(preset: Preset, seeds: Sequence[int], frames: int) -> Window:
     """Scenes of a preset with `frames` frames after the two that an emulator starts from."""
-    lasting, reader = preset.lasting(frames + 1), Reader(metadata_of(preset), preset.scene)
-    made = [lasting.simulate(seed) for seed in seeds]
+    longer, reader = preset.with_frames(frames + 1), Reader(metadata_of(preset), preset.scene)
+    made = [longer.simulate(seed) for seed in seeds]
     recordings = [
         reader.recording(Trajectory(each.position, each.particle_type, each.attributes), f"{preset.name}, seed {seed}")
         for each, seed in zip(made, seeds, strict=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from nmpm.sim.compiled import compiled
+from nmpm.sim.jit import jit
 
 SUPPORT = 3.0
 """Reach of the kernel, in smoothing lengths."""
@@ -17,7 +17,7 @@ NORM = 7.0 / (478.0 * math.pi)
 """W = NORM / h² · w(q)."""
 
 
-@compiled
+@jit
 def weight(q: float) -> float:
     """The spline w at q ≥ 0, not normalised."""
     outer, middle, inner = max(0.0, 3.0 - q), max(0.0, 2.0 - q), max(0.0, 1.0 - q)
@@ -25,7 +25,7 @@ def weight(q: float) -> float:
     return outer2 * outer2 * outer - 6.0 * (middle2 * middle2 * middle) + 15.0 * (inner2 * inner2 * inner)
 
 
-@compiled
+@jit
 def slope(q: float) -> float:
     """Its derivative dw / dq at q ≥ 0."""
     outer, middle, inner = max(0.0, 3.0 - q), max(0.0, 2.0 - q), max(0.0, 1.0 - q)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
 
 Indices = NDArray[np.uint32]
 Pairs = tuple[Indices, Indices]
@@ -89,7 +89,7 @@ class PairFinder:
         return self._memory[0, :count], self._memory[1, :count]
 
 
-@compiled
+@jit
 def _sort(
     x: Array,
     y: Array,
@@ -112,7 +112,7 @@ def _sort(
         starts[cells[i] + 1] += 1
 
 
-@compiled
+@jit
 def _pairs_within(
     x: Array,
     y: Array,
@@ -139,7 +139,7 @@ def _pairs_within(
     return count
 
 
-@compiled
+@jit
 def _pairs_between(
     x: Array,
     y: Array,

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
+from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.preset import BOUNDARY, Preset, built, checked, require
-from nmpm.sim.sph.starts import Column, Start, Strewn, Throw
-from nmpm.sim.sph.walls import box_particles
-from nmpm.sim.sph.wcsph import REVISION, Fluid
+from nmpm.sim.config import check, from_section, section_entries
+from nmpm.sim.gravity import draw_gravity
+from nmpm.sim.initial_state import InitialState
+from nmpm.sim.preset import BOUNDARY, Preset
+from nmpm.sim.sph.fluid import Fluid, SphParticles
+from nmpm.sim.sph.layouts import Column, FluidBlocks, FluidLayout
+from nmpm.sim.sph.obstacles import ObstacleRanges, PolygonObstacle
+from nmpm.sim.sph.simulate import check_particles, record_frames
+from nmpm.sim.sph.walls import SolidBoundary, box_particles
+from nmpm.sim.sph.wcsph import REVISION, SphStepper
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
 WATER = 5
-"""Type number of the particles that flow, after DeepMind's scenes."""
+"""Type id of the particles that flow, as in DeepMind's scenes."""
 
 CFL_LIMITS = {"sound": 0.4, "viscosity": 0.125, "gravity": 0.25}
 """Longest step, as a part of h / c, of h² / ν and of √(h / g) (Adami, Hu & Adams 2012, equations 19 to 21).
@@ -27,7 +37,7 @@ at 0.42 too.
 
 @dataclass(frozen=True)
 class SphPreset(Preset):
-    """A family of simulated scenes; `presets/dambreak2d.yaml` and `presets/wbcsph.yaml` comment every entry.
+    """A family of scenes of WCSPH; `presets/dambreak2d.yaml` and `presets/wbcsph.yaml` comment every entry.
 
     Args:
         name: Of the family.
@@ -39,10 +49,10 @@ class SphPreset(Preset):
         spacing: Distance between particles at rest, in length.
         gravity: Acceleration, in length per second squared.
         gravity_turn: Largest angle by which a trajectory's gravity is turned either way, in degrees.
-        fluid: What flows.
+        fluid: Its parameters.
         column: The initial state, if it is a column at rest.
-        blocks: The initial state, if it is thrown blocks.
-        obstacles: What stands in the fluid's way; nothing if left out.
+        blocks: The initial state, if it is moving blocks.
+        obstacles: How obstacles are drawn; none if left out.
 
     Raises:
         ConfigError: if the numbers contradict each other or a step is too long to be stable.
@@ -52,10 +62,6 @@ class SphPreset(Preset):
     generator: ClassVar[str] = "WCSPH"
     revision: ClassVar[int] = REVISION
 
-    name: str
-    frames: int
-    frame_dt: float
-    substeps: int
     box: tuple[Interval, Interval]
     domain: tuple[Interval, Interval]
     spacing: float
@@ -63,36 +69,34 @@ class SphPreset(Preset):
     gravity_turn: float
     fluid: Fluid
     column: Column | None = None
-    blocks: Throw | None = None
-    obstacles: Strewn | None = None
+    blocks: FluidBlocks | None = None
+    obstacles: ObstacleRanges | None = None
 
     def __post_init__(self) -> None:
-        for key in ("frames", "substeps"):
-            require(isinstance(getattr(self, key), int), f"{key} = {getattr(self, key)} must be a whole number.")
-        for key in ("frames", "frame_dt", "substeps", "spacing"):
-            require(0 < getattr(self, key) < math.inf, f"{key} = {getattr(self, key)} must be positive and finite.")
-        require(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
+        super().__post_init__()
+        self._check_positive("spacing")
+        check(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
         (left, right), (bottom, top) = self.box
-        require(left < right and bottom < top, f"box = {self.box} needs (lower, upper) along each axis.")
-        require((self.column is None) != (self.blocks is None), "give either column or blocks, as the initial state.")
+        check(left < right and bottom < top, f"box = {self.box} needs (lower, upper) along each axis.")
+        check((self.column is None) != (self.blocks is None), "give either column or blocks, as the initial state.")
         if self.column is not None:
             columns, rows = self.column.lattice(self.spacing)
             fits = columns * self.spacing <= right - left + 1e-9 and rows * self.spacing <= top - bottom + 1e-9
-            require(fits and columns * rows > 0, f"column = {self.column} does not fit in box = {self.box}.")
-        for cause, least in self.least_substeps.items():
-            require(
+            check(fits and columns * rows > 0, f"column = {self.column} does not fit in box = {self.box}.")
+        for cause, least in self._substep_bounds.items():
+            check(
                 self.substeps >= least,
                 f"substeps = {self.substeps} are too few for {cause}: take at least {least}, or a larger spacing.",
             )
 
     @property
-    def start(self) -> Start:
+    def layout(self) -> FluidLayout:
         """How the initial state is drawn."""
-        return next(start for start in (self.column, self.blocks) if start is not None)
+        return next(layout for layout in (self.column, self.blocks) if layout is not None)
 
     @property
-    def least_substeps(self) -> dict[str, int]:
-        """Fewest steps of a frame that are stable, by what asks for them: sound, viscosity, gravity."""
+    def _substep_bounds(self) -> dict[str, int]:
+        """Fewest steps of a frame that are stable, by cause."""
         h, strength = self.spacing, math.hypot(*self.gravity)
         longest = {
             "sound": h / self.fluid.speed_of_sound,
@@ -102,14 +106,81 @@ class SphPreset(Preset):
         return {cause: math.ceil(self.frame_dt / (CFL_LIMITS[cause] * dt) - 1e-9) for cause, dt in longest.items()}
 
     @property
+    def stable_substeps(self) -> int:
+        """Fewest substeps of a frame that are stable, by `CFL_LIMITS`.
+
+        They hold while the flow is slower than sound, which is ten times the fastest flow in the shipped presets.
+        """
+        return max(self._substep_bounds.values())
+
+    def varied(self, *, speed: float = 1.0, gravity: float = 1.0) -> SphPreset:
+        """As `Preset.varied`; a column starts at rest whatever the factor.
+
+        The speed of sound stays, so that flows which come near it fail as unstable.
+        """
+        x, y = self.gravity
+        many = dataclasses.replace(self._with_layout(self.layout.faster(speed)), substeps=2**31)
+        many = dataclasses.replace(many, gravity=(gravity * x, gravity * y))
+        return dataclasses.replace(many, substeps=max(self.substeps, many.stable_substeps))
+
+    def widened(self, times: int) -> SphPreset:
+        """Scenes in a domain so many times as wide; a column becomes as many times as wide, too.
+
+        The box is as wide as whole spacings allow, its wall layer on the right at least what it was.
+        """
+        (left, right), vertical = self.domain
+        low, high = self.box[0]
+        edge = left + times * (right - left)
+        spacings = math.floor((edge - (right - high) - low) / self.spacing + 1e-9)
+        wide = dataclasses.replace(
+            self, box=((low, low + spacings * self.spacing), self.box[1]), domain=((left, edge), vertical)
+        )
+        return wide._with_layout(self.layout.multiplied(times))
+
+    def coarsened(self, factor: int) -> SphPreset:
+        """The same scenes in particles `factor` times as wide apart, with `stable_substeps` substeps.
+
+        The particles are other ones, `factor`² times fewer: trajectories can be compared as fields, not one by one.
+        Artificial viscosity grows with the spacing.
+
+        Raises:
+            ConfigError: if the scene has no room for particles of that size.
+        """
+        many = dataclasses.replace(self, substeps=2**31, spacing=factor * self.spacing)
+        many = many._with_layout(self.layout.coarsened(factor))
+        return dataclasses.replace(many, substeps=many.stable_substeps)
+
+    def _with_layout(self, layout: FluidLayout) -> SphPreset:
+        changed: dict[str, Any] = {"blocks" if self.column is None else "column": layout}
+        return dataclasses.replace(self, **changed)
+
+    @property
     def particle_volume(self) -> float:
         """Area of one particle at rest."""
         return self.spacing**2
 
-    def simulate(self, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
-        from nmpm.sim.sph.simulate import simulate
+    def draw(self, seed: int) -> InitialState:
+        rng = np.random.default_rng(seed)
+        gravity = draw_gravity(self.gravity, self.gravity_turn, rng)
+        obstacles = () if self.obstacles is None else self.obstacles.draw(self.box, rng)
+        position, velocity = self.layout.draw(self.box, self.spacing, obstacles, rng)
+        return InitialState(position, velocity, gravity, (len(position),), obstacles)
 
-        return simulate(self, seed, progress)
+    def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
+        """As `Preset.simulate_from`; densities start at rest, and accelerations follow from the state."""
+        obstacles = _polygons_of(start)
+        check_particles(start.position, start.velocity, self.box, obstacles)
+        if start.counts not in ((), (len(start.position),)):
+            raise DataError(f"Counts {start.counts} are not those of {len(start.position)} particles of one fluid.")
+        gravity = np.array(self.gravity if start.gravity is None else start.gravity)
+        boundary = SolidBoundary(self.box, obstacles, self.spacing)
+        particles = SphParticles(start.position, start.velocity, self.fluid.density)
+        stepper = SphStepper(self.fluid, boundary, self.spacing, gravity, self.frame_dt / self.substeps)
+        position, deviation = record_frames(stepper, particles, frames, self.substeps, progress)
+        static = position.shape[1] - len(start.position)
+        particle_type = np.repeat([WATER, BOUNDARY], [len(start.position), static]).astype(np.int64)
+        attributes = {"gravity": gravity, "held_back": stepper.held_back, "density_deviation": deviation}
+        return SimulatedTrajectory(position, particle_type, attributes)
 
     @property
     def scene(self) -> Scene:
@@ -129,16 +200,23 @@ class SphPreset(Preset):
         return {BOUNDARY: "boundary", WATER: "water"}
 
     @property
-    def most_particles(self) -> int:
+    def max_particles(self) -> int:
         _, layer = box_particles(self.box, self.spacing)
-        around = 0 if self.obstacles is None else self.obstacles.most_particles(self.spacing)
-        return int((layer == 0).sum()) + around + self.start.most_particles(self.spacing)
+        in_obstacles = 0 if self.obstacles is None else self.obstacles.max_particles(self.spacing)
+        return int((layer == 0).sum()) + in_obstacles + self.layout.max_particles(self.spacing)
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> SphPreset:
-        entries = checked(cls, plain, "the preset")
-        sections = {"fluid": Fluid, "column": Column, "blocks": Throw, "obstacles": Strewn}
+        entries = section_entries(cls, plain, "the preset")
+        sections = {"fluid": Fluid, "column": Column, "blocks": FluidBlocks, "obstacles": ObstacleRanges}
         for key in sections.keys() & entries.keys():
-            entries[key] = built(sections[key], entries[key], key)
-        preset: SphPreset = built(cls, entries, "the preset")
+            entries[key] = from_section(sections[key], entries[key], key)
+        preset: SphPreset = from_section(cls, entries, "the preset")
         return preset
+
+
+def _polygons_of(start: InitialState) -> tuple[PolygonObstacle, ...]:
+    polygons = tuple(obstacle for obstacle in start.obstacles if isinstance(obstacle, PolygonObstacle))
+    if len(polygons) != len(start.obstacles):
+        raise DataError("WCSPH simulates polygons as obstacles; others are not implemented.")
+    return polygons

@@ -1,43 +1,41 @@
-"""Spreading strewn particles evenly over a closed box."""
+"""Spreading particles evenly over a closed box."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from nmpm.sim.materials.base import Array
+from nmpm.sim.arrays import Array
 from nmpm.sim.sph import sums
 from nmpm.sim.sph.kernel import SUPPORT
 from nmpm.sim.sph.neighbours import CellGrid, PairFinder, Pairs
-from nmpm.sim.sph.walls import Solids
+from nmpm.sim.sph.walls import SolidBoundary
 
 # Way along the gradient of particle concentration in a sweep, in spacings squared, and its limit in spacings.
 _STEP = 0.1
 _LIMIT = 0.1
 
 
-def relaxed(
-    position: Array, box: tuple[tuple[float, float], tuple[float, float]], spacing: float, sweeps: int
-) -> Array:
-    """Particles moved, sweep by sweep, from where they are dense to where they are not.
+def relax(position: Array, box: tuple[tuple[float, float], tuple[float, float]], spacing: float, sweeps: int) -> Array:
+    """Move particles, sweep by sweep, from where they are dense to where they are not.
 
     A sweep shifts each by −D ∇C, where C is the concentration Σ V W (Lind, Xu, Stansby & Rogers 2012, equation 24),
     which is what a constant background pressure does in Adami, Hu & Adams (2013).
 
     Args:
-        position: (N, 2); those outside of the box are put back to its sides first.
+        position: (N, 2); those outside of the box are moved to its sides first.
         box: (lower, upper) along x and y, in length, with dummy particles around it.
         spacing: Of the particles, in length.
         sweeps: How many.
     """
-    solids = Solids(box, (), spacing)
-    grid = CellGrid.covering(solids.position.min(0), solids.position.max(0), SUPPORT * spacing)
+    boundary = SolidBoundary(box, (), spacing)
+    grid = CellGrid.covering(boundary.position.min(0), boundary.position.max(0), SUPPORT * spacing)
     finder, wall_finder = PairFinder(grid), PairFinder(grid)
-    order, wall_starts = grid.sorting(*np.ascontiguousarray(solids.position.T))
-    wall_x, wall_y = np.ascontiguousarray(solids.position[order].T)
+    order, wall_starts = grid.sorting(*np.ascontiguousarray(boundary.position.T))
+    wall_x, wall_y = np.ascontiguousarray(boundary.position[order].T)
     x, y = np.ascontiguousarray(position.T)
     identity, still = np.arange(len(x)), np.zeros_like(x)
     for _ in range(sweeps):
-        solids.hold_back(x, y, still, still)
+        boundary.hold_back(x, y, still, still)
         order, starts = grid.sorting(x, y)
         x, y, identity = x[order], y[order], identity[order]
         shift = _concentration_gradient(x, y, finder.within(x, y, starts), spacing)
@@ -45,7 +43,7 @@ def relaxed(
         shift *= -_STEP * spacing**2
         shift *= np.minimum(1.0, _LIMIT * spacing / np.maximum(np.hypot(*shift), 1e-30))
         x, y = x + shift[0], y + shift[1]
-    solids.hold_back(x, y, still, still)
+    boundary.hold_back(x, y, still, still)
     spread = np.empty((len(x), 2))
     spread[identity] = np.stack([x, y], -1)
     return spread

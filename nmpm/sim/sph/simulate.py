@@ -1,4 +1,4 @@
-"""Trajectories of weakly compressible water: from a preset and a seed, or from a given state."""
+"""Runs of weakly compressible SPH, frame by frame."""
 
 from __future__ import annotations
 
@@ -8,115 +8,84 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim.gravity import turned
-from nmpm.sim.preset import BOUNDARY
-from nmpm.sim.sph.preset import WATER, SphPreset
-from nmpm.sim.sph.walls import Obstacle, Solids
-from nmpm.sim.sph.wcsph import State, Stepper
-from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+from nmpm.scene import Interval
+from nmpm.sim.sph.fluid import SphParticles
+from nmpm.sim.sph.obstacles import PolygonObstacle
+from nmpm.sim.sph.wcsph import SphStepper
+from nmpm.sim.trajectory import Progress
 
 DENSITY_LIMIT = 0.5
-"""Largest deviation of a particle's density from that at rest, as a part of it; beyond, the run has blown up."""
+"""Largest deviation of a particle's density from that at rest, as a part of it; beyond, the run is unstable."""
 
 
-def simulate(preset: SphPreset, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
-    """A trajectory of `preset.frames` + 1 frames, the same to the bit for the same preset and seed.
+def record_frames(
+    stepper: SphStepper, particles: SphParticles, frames: int, substeps: int, progress: Progress | None = None
+) -> tuple[NDArray[np.float32], float]:
+    """Positions of `frames` + 1 frames, visible wall particles (M, 2) after the N moving ones: (frames + 1, N + M, 2).
 
-    Raises:
-        ConfigError: if the preset leaves no room for blocks or obstacles, or the simulation blows up.
-    """
-    rng = np.random.default_rng(seed)
-    try:
-        gravity = turned(preset.gravity, preset.gravity_turn, rng)
-        obstacles = preset.obstacles.draw(preset.box, rng) if preset.obstacles is not None else ()
-        position, velocity = preset.start.draw(preset.box, preset.spacing, obstacles, rng)
-        made = simulate_from(preset, position, velocity, preset.frames, gravity, obstacles, progress)
-    except ConfigError as error:
-        raise ConfigError(f"Preset {preset.name}, seed {seed}: {error}") from error
-    made.attributes["seed"] = seed
-    return made
-
-
-def simulate_from(
-    preset: SphPreset,
-    position: NDArray[Any],
-    velocity: NDArray[Any],
-    frames: int,
-    gravity: tuple[float, ...] | None = None,
-    obstacles: tuple[Obstacle, ...] = (),
-    progress: Progress | None = None,
-) -> SimulatedTrajectory:
-    """A trajectory from a given state at rest density, under the preset's physics and resolution.
-
-    Args:
-        preset: Its initial state, obstacles and number of frames are not used.
-        position: (N, 2) within the box, in length.
-        velocity: (N, 2) in length per second.
-        frames: Frames to simulate after the given one; frames + 1 are returned.
-        gravity: Instead of the preset's, in length per second squared.
-        obstacles: What stands in the fluid's way.
-        progress: Told how many frames are done, after each.
+    Returns:
+        The positions, and the largest deviation of density, as a part of that at rest.
 
     Raises:
-        DataError: if the arrays do not fit together, or a particle is outside of the box or in an obstacle.
-        ConfigError: if the simulation blows up; the message names the frame.
+        ConfigError: if the simulation becomes unstable; the message names the frame.
     """
-    _check_state(preset, position, velocity, obstacles)
-    gravity = preset.gravity if gravity is None else gravity
-    solids = Solids(preset.box, obstacles, preset.spacing)
-    state = State(position, velocity, preset.fluid.density)
-    stepper = Stepper(preset.fluid, solids, preset.spacing, np.array(gravity), preset.frame_dt / preset.substeps)
-    stepper.begin(state)
-    shown = solids.position[solids.shown]
-    stored = np.empty((frames + 1, len(position) + len(shown), 2), np.float32)
-    stored[:, len(position) :] = shown
-    stored[0, : len(position)] = state.position
+    stepper.begin(particles)
+    walls = stepper.boundary.position[stepper.boundary.shown]
+    moving = len(particles.identity)
+    recorded = np.empty((frames + 1, moving + len(walls), 2), np.float32)
+    recorded[0, :moving], recorded[:, moving:] = particles.position, walls
     deviation = 0.0
     for frame in range(1, frames + 1):
-        deviation = max(deviation, _advance(stepper, state, preset.substeps, frame))
-        stored[frame, : len(position)] = state.position
+        deviation = max(deviation, _advance_frame(stepper, particles, substeps, frame))
+        recorded[frame, :moving] = particles.position
         if progress is not None:
             progress(frame)
-    kinds = np.repeat([WATER, BOUNDARY], [len(position), len(shown)]).astype(np.int64)
-    attributes = {"gravity": np.array(gravity), "held_back": stepper.held_back, "density_deviation": deviation}
-    return SimulatedTrajectory(stored, kinds, attributes)
+    return recorded, deviation
 
 
-def _advance(stepper: Stepper, state: State, substeps: int, frame: int) -> float:
-    """Simulates one frame and gives the largest deviation of density at its end."""
+def _advance_frame(stepper: SphStepper, particles: SphParticles, substeps: int, frame: int) -> float:
+    """Simulate one frame; returns the largest deviation of density at its end."""
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is found below
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is found below
             for _ in range(substeps):
-                stepper.step(state)
+                stepper.step(particles)
     except FloatingPointError as error:
         raise ConfigError(f"{error} in frame {frame}; take more substeps or a higher speed of sound.") from error
     rest, sound = stepper.fluid.density, stepper.fluid.speed_of_sound
-    deviation = float(np.abs(state.density / rest - 1).max())
-    fastest = float(np.hypot(*state.velocity.T).max())
+    deviation = float(np.abs(particles.density / rest - 1).max())
+    fastest = float(np.hypot(*particles.velocity.T).max())
     if not (deviation <= DENSITY_LIMIT and fastest <= sound):
         raise ConfigError(
             f"The simulation has blown up in frame {frame}: density deviates by {deviation:.0%} (limit "
             f"{DENSITY_LIMIT:.0%}), the fastest particle moves at {fastest:.3g} m/s (sound: {sound:.3g}). Take more "
             "substeps, a higher speed of sound or more viscosity, or leave this seed out."
         )
-    inside = stepper.solids.inside(state.position)
-    if inside:
-        raise ConfigError(f"{inside} particles are outside of the box or in an obstacle in frame {frame}.")
+    outside = stepper.boundary.count_outside(particles.position)
+    if outside:
+        raise ConfigError(f"{outside} particles are outside of the box or in an obstacle in frame {frame}.")
     return deviation
 
 
-def _check_state(
-    preset: SphPreset, position: NDArray[Any], velocity: NDArray[Any], obstacles: tuple[Obstacle, ...]
+def check_particles(
+    position: NDArray[Any],
+    velocity: NDArray[Any],
+    box: tuple[Interval, Interval],
+    obstacles: tuple[PolygonObstacle, ...],
 ) -> None:
+    """Check the shapes of positions and velocities, and that particles are finite, in the box and in no obstacle.
+
+    Raises:
+        DataError: if they are not.
+    """
     if position.ndim != 2 or position.shape[1] != 2 or velocity.shape != position.shape:
         raise DataError(f"Positions {position.shape} and velocities {velocity.shape} must both have shape (N, 2).")
-    low, high = np.array(preset.box).T
-    good = np.all((low <= position) & (position <= high) & np.isfinite(velocity), axis=1)
+    low, high = np.array(box).T
+    valid = np.all((low <= position) & (position <= high) & np.isfinite(velocity), axis=1)
     for obstacle in obstacles:
-        good[good] &= obstacle.depth(position[good]) <= 0
-    if not good.all():
-        worst = int(np.argmin(good))
+        valid[valid] &= obstacle.depth(position[valid]) <= 0
+    if not valid.all():
+        worst = int(np.argmin(valid))
         raise DataError(
             f"Particle {worst} at {position[worst].tolist()} with velocity {velocity[worst].tolist()} is not finite, "
-            f"not within the box {preset.box} or in an obstacle."
+            f"not within the box {box} or in an obstacle."
         )

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
 from nmpm.sim.sph.kernel import NORM, slope, weight
 from nmpm.sim.sph.neighbours import Indices
 
@@ -17,7 +17,7 @@ from nmpm.sim.sph.neighbours import Indices
 _SAME_SPOT = 1e-24
 
 
-@compiled
+@jit
 def pair_geometry(
     x: Array, y: Array, first: Indices, second: Indices, h: float, dx: Array, dy: Array, f: Array
 ) -> None:
@@ -33,7 +33,7 @@ def pair_geometry(
         f[k] = scale * slope(r * inverse) / r
 
 
-@compiled
+@jit
 def wall_geometry(
     x: Array,
     y: Array,
@@ -57,7 +57,7 @@ def wall_geometry(
         f[k], w[k] = scale * slope(r * inverse) / r, norm * weight(r * inverse)
 
 
-@compiled
+@jit
 def expansion(
     first: Indices,
     second: Indices,
@@ -94,7 +94,7 @@ def expansion(
         drag[k] /= dx[k] * dx[k] + dy[k] * dy[k] + soft
 
 
-@compiled
+@jit
 def wall_expansion(
     first: Indices,
     second: Indices,
@@ -112,7 +112,7 @@ def wall_expansion(
         rate[i] += wall_volume[j] * f[k] * (vx[i] * dx[k] + vy[i] * dy[k])
 
 
-@compiled
+@jit
 def push(
     first: Indices,
     second: Indices,
@@ -145,7 +145,7 @@ def push(
         ay[j] -= strength * dy[k]
 
 
-@compiled
+@jit
 def wall_averages(
     first: Indices,
     second: Indices,
@@ -177,7 +177,7 @@ def wall_averages(
                 wall[row, j] /= wall[3, j]
 
 
-@compiled
+@jit
 def wall_push(
     first: Indices,
     second: Indices,

@@ -8,45 +8,17 @@ behind the surface. Obstacles carry closed rings of them, parallel to their edge
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.scene import Interval
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
-
-LAYERS = 3
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
+from nmpm.sim.sph.obstacles import LAYERS, PolygonObstacle
 
 # Distance from a surface, in spacings, at which a particle is held back. Float32 can still tell it from the surface.
 _MARGIN = 1e-3
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """A convex polygon.
-
-    Args:
-        corners: (V, 2) in length, counter-clockwise.
-    """
-
-    corners: Array
-
-    @property
-    def normals(self) -> Array:
-        """(V, 2) unit normals of the edges, outwards; edge k runs from corner k to the next."""
-        edge = np.roll(self.corners, -1, axis=0) - self.corners
-        return np.asarray(np.stack([edge[:, 1], -edge[:, 0]], -1) / np.linalg.norm(edge, axis=1, keepdims=True))
-
-    @property
-    def offsets(self) -> Array:
-        """(V,) such that a point x is inside where normals @ x < offsets."""
-        return np.asarray((self.normals * self.corners).sum(-1))
-
-    def depth(self, points: NDArray[np.floating]) -> Array:
-        """(N,) distance of each point to the nearest edge's line, positive inside and negative outside."""
-        return np.asarray((self.offsets - points @ self.normals.T).min(-1))
 
 
 def box_particles(box: tuple[Interval, Interval], spacing: float) -> tuple[Array, NDArray[np.int64]]:
@@ -67,13 +39,13 @@ def box_particles(box: tuple[Interval, Interval], spacing: float) -> tuple[Array
     return position[layer >= 0], layer[layer >= 0]
 
 
-def obstacle_particles(obstacle: Obstacle, spacing: float) -> Array:
+def obstacle_particles(obstacle: PolygonObstacle, spacing: float) -> Array:
     """Dummy particles within an obstacle, (M, 2): rings at half a spacing, one and a half, … below its surface."""
     rings = [_ring(obstacle, spacing * (layer + 0.5), spacing) for layer in range(LAYERS)]
     return np.concatenate(rings)
 
 
-def _ring(obstacle: Obstacle, depth: float, spacing: float) -> Array:
+def _ring(obstacle: PolygonObstacle, depth: float, spacing: float) -> Array:
     """Points along the polygon that lies `depth` below the surface; none where the obstacle is thinner."""
     normals, offsets = obstacle.normals, obstacle.offsets - depth
     # Each inner corner is where two neighbouring edges, moved inwards, meet.
@@ -89,8 +61,8 @@ def _ring(obstacle: Obstacle, depth: float, spacing: float) -> Array:
     return np.stack([np.interp(along, reached, closed[:, axis]) for axis in range(2)], -1)
 
 
-class Solids:
-    """The box and its obstacles.
+class SolidBoundary:
+    """The box and its obstacles, as dummy particles and as surfaces.
 
     Args:
         box: Where the fluid may be, (lower, upper) along x and y, in length.
@@ -98,11 +70,11 @@ class Solids:
         spacing: Of the particles, in length.
     """
 
-    def __init__(self, box: tuple[Interval, Interval], obstacles: tuple[Obstacle, ...], spacing: float) -> None:
+    def __init__(self, box: tuple[Interval, Interval], obstacles: tuple[PolygonObstacle, ...], spacing: float) -> None:
         low, high = np.array(box, np.float64).T
         self.margin = _MARGIN * spacing
         around, layer = box_particles(box, spacing)
-        inner = _own_particles(obstacles, low, high, spacing)
+        inner = _particles_of_all(obstacles, low, high, spacing)
         self.position: Array = np.concatenate([around, inner])
         """(M, 2) of all dummy particles."""
         self.shown: NDArray[np.bool_] = np.concatenate([layer == 0, np.ones(len(inner), np.bool_)])
@@ -123,7 +95,7 @@ class Solids:
         held: int = _hold_back(x, y, vx, vy, self._low, self._high, self._planes, self._ends, self.margin)
         return held
 
-    def inside(self, points: NDArray[np.floating]) -> int:
+    def count_outside(self, points: NDArray[np.floating]) -> int:
         """How many points (N, 2) lie outside of the box or in an obstacle."""
         low, high = self._box
         wrong = ~np.all((points >= low) & (points <= high), axis=1)
@@ -132,7 +104,7 @@ class Solids:
         return int(wrong.sum())
 
 
-def _own_particles(obstacles: tuple[Obstacle, ...], low: Array, high: Array, spacing: float) -> Array:
+def _particles_of_all(obstacles: tuple[PolygonObstacle, ...], low: Array, high: Array, spacing: float) -> Array:
     """Dummy particles of all obstacles that lie in the box, and in no obstacle before their own."""
     kept = [np.empty((0, 2))]
     for index, obstacle in enumerate(obstacles):
@@ -144,7 +116,7 @@ def _own_particles(obstacles: tuple[Obstacle, ...], low: Array, high: Array, spa
     return np.concatenate(kept)
 
 
-@compiled
+@jit
 def _hold_back(
     x: Array,
     y: Array,

@@ -17,18 +17,15 @@ listed anew once a particle has used up half of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
-from nmpm.sim.compiled import compiled
-from nmpm.sim.materials.base import Array
-from nmpm.sim.preset import require
+from nmpm.sim.arrays import Array
+from nmpm.sim.jit import jit
 from nmpm.sim.sph import sums
+from nmpm.sim.sph.fluid import Fluid, SphParticles
 from nmpm.sim.sph.kernel import SUPPORT
 from nmpm.sim.sph.neighbours import CellGrid, PairFinder
-from nmpm.sim.sph.walls import Solids
+from nmpm.sim.sph.walls import SolidBoundary
 
 REVISION = 1
 """Raised whenever the same preset and seed would give other numbers."""
@@ -43,98 +40,23 @@ _SPRAY = round(np.pi * (SUPPORT + _SKIN) ** 2 / 3)
 _FADING = 10.0
 
 
-@dataclass(frozen=True)
-class Fluid:
-    """What flows.
-
-    Args:
-        density: At rest, in kg / m².
-        speed_of_sound: In m / s; ten times the fastest flow keeps density within one per cent.
-        exponent: Of Tait's equation, p = ρ₀ c² / γ ((ρ / ρ₀)^γ − 1).
-        alpha: Artificial viscosity; it amounts to a kinematic viscosity of α h c / 8.
-        viscosity: Dynamic, in Pa s, which also brakes the fluid at walls; none lets it slip.
-        diffusion: Of density, δ, which smooths what is uneven from particle to particle; 0.1 is usual.
-
-    Raises:
-        ConfigError: if a number is out of range.
-    """
-
-    density: float
-    speed_of_sound: float
-    exponent: float
-    alpha: float
-    viscosity: float
-    diffusion: float
-
-    def __post_init__(self) -> None:
-        for key in ("density", "speed_of_sound", "exponent"):
-            require(getattr(self, key) > 0, f"{key} = {getattr(self, key)} must be positive.")
-        for key in ("alpha", "viscosity", "diffusion"):
-            require(getattr(self, key) >= 0, f"{key} = {getattr(self, key)} must not be negative.")
-
-    def kinematic_viscosity(self, spacing: float) -> float:
-        """Artificial and physical viscosity together, in m² / s."""
-        return self.alpha * spacing * self.speed_of_sound / 8 + self.viscosity / self.density
-
-
-class State:
-    """N particles on the move, in an order that changes as they move.
-
-    Args:
-        position: (N, 2) in length.
-        velocity: (N, 2) in length per second.
-        density: Of all of them, at the start.
-    """
-
-    def __init__(self, position: NDArray[np.floating], velocity: NDArray[np.floating], density: float) -> None:
-        self.table: Array = np.zeros((7, len(position)))
-        self.table[0:2], self.table[2:4], self.table[4] = position.T, velocity.T, density
-        self.identity: NDArray[np.int64] = np.arange(len(position))
-        """(N,) number that each particle had at the start."""
-
-    def sort(self, order: NDArray[np.int64]) -> None:
-        """Bring the particles into another order."""
-        self.table[:] = self.table[:, order]
-        self.identity = self.identity[order]
-
-    @property
-    def position(self) -> Array:
-        """(N, 2) in the first order."""
-        return self._restored(slice(0, 2))
-
-    @property
-    def velocity(self) -> Array:
-        """(N, 2) in the first order."""
-        return self._restored(slice(2, 4))
-
-    @property
-    def density(self) -> Array:
-        """(N,) in the first order."""
-        return self._restored(slice(4, 5))[:, 0]
-
-    def _restored(self, rows: slice) -> Array:
-        restored = np.empty((self.table.shape[1], rows.stop - rows.start))
-        restored[self.identity] = self.table[rows].T
-        return restored
-
-
-class Stepper:
-    """Advances a state by steps of one length.
+class SphStepper:
+    """Advances a particles by steps of one length.
 
     Args:
         fluid: What flows.
-        solids: What it flows around.
+        boundary: What it flows around.
         spacing: Of the particles at rest; also the kernel's smoothing length.
         gravity: (2,) acceleration, in length per second squared.
         dt: Length of a step, in seconds.
     """
 
-    def __init__(self, fluid: Fluid, solids: Solids, spacing: float, gravity: Array, dt: float) -> None:
-        self.fluid, self.solids, self.spacing, self.gravity, self.dt = fluid, solids, spacing, gravity, dt
+    def __init__(self, fluid: Fluid, boundary: SolidBoundary, spacing: float, gravity: Array, dt: float) -> None:
+        self.fluid, self.boundary, self.spacing, self.gravity, self.dt = fluid, boundary, spacing, gravity, dt
         self.mass = fluid.density * spacing**2
         self.held_back = 0
         """Particles held back at surfaces so far."""
-        position = solids.position
+        position = boundary.position
         grid = CellGrid.covering(position.min(0), position.max(0), (SUPPORT + _SKIN) * spacing)
         order, self._wall_starts = grid.sorting(*position.T)
         self._wall_x, self._wall_y = (np.ascontiguousarray(axis) for axis in position[order].T)
@@ -145,43 +67,43 @@ class Stepper:
         self._listed_at = np.empty((2, 0))
         self._spray = np.empty(0, np.int64)
 
-    def begin(self, state: State) -> None:
-        """Accelerations of a state; it must begin so."""
-        state.table[5:7] = 0.0
-        self._hold_back(state)
-        self._list(state)
-        self._interact(state, 0.0)
+    def begin(self, particles: SphParticles) -> None:
+        """Accelerations of a particles; it must begin so."""
+        particles.table[5:7] = 0.0
+        self._hold_back(particles)
+        self._list(particles)
+        self._interact(particles, 0.0)
 
-    def step(self, state: State) -> None:
+    def step(self, particles: SphParticles) -> None:
         """One step, in place.
 
         Raises:
             FloatingPointError: if a position is no longer finite.
         """
-        _kick(state.table, 0.5 * self.dt)
-        _drift(state.table, self.dt)
-        self._hold_back(state)
-        moved = _furthest(state.table, self._listed_at)
+        _kick(particles.table, 0.5 * self.dt)
+        _drift(particles.table, self.dt)
+        self._hold_back(particles)
+        moved = _furthest(particles.table, self._listed_at)
         if not np.isfinite(moved):
             raise FloatingPointError("The state is not finite")
         if moved > 0.5 * _SKIN * self.spacing:
-            self._list(state)
-        self._interact(state, self.dt)
-        _kick(state.table, 0.5 * self.dt)
+            self._list(particles)
+        self._interact(particles, self.dt)
+        _kick(particles.table, 0.5 * self.dt)
 
-    def pressure(self, state: State) -> Array:
+    def pressure(self, particles: SphParticles) -> Array:
         """(N,) in the first order."""
-        return _pressure(state.density, self.fluid.density, self.fluid.speed_of_sound, self.fluid.exponent)
+        return _pressure(particles.density, self.fluid.density, self.fluid.speed_of_sound, self.fluid.exponent)
 
-    def _hold_back(self, state: State) -> None:
-        x, y, vx, vy = state.table[:4]
-        self.held_back += self.solids.hold_back(x, y, vx, vy)
+    def _hold_back(self, particles: SphParticles) -> None:
+        x, y, vx, vy = particles.table[:4]
+        self.held_back += self.boundary.hold_back(x, y, vx, vy)
 
-    def _list(self, state: State) -> None:
-        order, starts = self._grid.sorting(state.table[0], state.table[1])
-        state.sort(order)
-        x, y = state.table[:2]
-        self._listed_at = state.table[:2].copy()
+    def _list(self, particles: SphParticles) -> None:
+        order, starts = self._grid.sorting(particles.table[0], particles.table[1])
+        particles.sort(order)
+        x, y = particles.table[:2]
+        self._listed_at = particles.table[:2].copy()
         self._pairs = self._finder.within(x, y, starts)
         self._wall_pairs = self._wall_finder.between(x, y, self._wall_x, self._wall_y, self._wall_starts)
         neighbours = sum(np.bincount(side, minlength=len(x)) for side in (*self._pairs, self._wall_pairs[0]))
@@ -189,11 +111,11 @@ class Stepper:
         self._memory = _room(self._memory, len(self._pairs[0]))
         self._wall_memory = _room(self._wall_memory, len(self._wall_pairs[0]))
 
-    def _interact(self, state: State, dt: float) -> None:
+    def _interact(self, particles: SphParticles, dt: float) -> None:
         """Density after dt, then accelerations."""
         fluid, h = self.fluid, self.spacing
         rest, sound = fluid.density, fluid.speed_of_sound
-        x, y, vx, vy, density, ax, ay = state.table
+        x, y, vx, vy, density, ax, ay = particles.table
         pairs, walls = self._pairs, self._wall_pairs
         dx, dy, f, drag = self._memory[:, : len(pairs[0])]
         wall_dx, wall_dy, wall_f, wall_w = self._wall_memory[:, : len(walls[0])]
@@ -225,7 +147,7 @@ def _room(memory: Array, count: int) -> Array:
 
 
 def _pressure(density: Array, rest: float, sound: float, exponent: float) -> Array:
-    """Tait's equation of state."""
+    """Tait's equation of particles."""
     return rest * sound**2 / exponent * ((density / rest) ** exponent - 1.0)
 
 
@@ -235,21 +157,21 @@ def _density(pressure: Array, rest: float, sound: float, exponent: float) -> Arr
     return np.asarray(rest * np.maximum(ratio, 0.1**exponent) ** (1.0 / exponent))
 
 
-@compiled
+@jit
 def _kick(table: Array, dt: float) -> None:
     for i in range(table.shape[1]):
         table[2, i] += dt * table[5, i]
         table[3, i] += dt * table[6, i]
 
 
-@compiled
+@jit
 def _drift(table: Array, dt: float) -> None:
     for i in range(table.shape[1]):
         table[0, i] += dt * table[2, i]
         table[1, i] += dt * table[3, i]
 
 
-@compiled
+@jit
 def _furthest(table: Array, listed_at: Array) -> float:
     """Largest way of a particle since the pairs were listed; infinite where one is not finite."""
     most = 0.0

@@ -4,9 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.sim import load_preset
-from nmpm.sim.sph.simulate import simulate_from
-from nmpm.sim.sph.walls import Solids
+from nmpm.sim import InitialState, load_preset
+from nmpm.sim.sph.walls import SolidBoundary
 
 FRAMES = 60
 
@@ -27,7 +26,7 @@ def theirs(recorded):
 @pytest.fixture(scope="module")
 def ours(theirs, preset):
     start = theirs[0][0]
-    return simulate_from(preset, start, np.zeros_like(start), FRAMES).position.astype(np.float64)
+    return preset.simulate_from(InitialState(start, np.zeros_like(start)), FRAMES).position.astype(np.float64)
 
 
 def energy(water, dt):
@@ -35,8 +34,8 @@ def energy(water, dt):
 
 
 def test_walls_are_where_the_recordings_are(preset, theirs):
-    solids = Solids(preset.box, (), preset.spacing)
-    mine = solids.position[solids.shown]
+    boundary = SolidBoundary(preset.box, (), preset.spacing)
+    mine = boundary.position[boundary.shown]
     np.testing.assert_allclose(
         mine[np.lexsort(mine.round(3).T)], theirs[1][np.lexsort(theirs[1].round(3).T)], atol=1e-5
     )

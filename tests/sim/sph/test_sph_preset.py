@@ -6,9 +6,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim import load_preset, preset_from_dict
-from nmpm.sim.sph.simulate import simulate_from
-from nmpm.sim.sph.walls import Obstacle
+from nmpm.sim import InitialState, load_preset, preset_from_dict
+from nmpm.sim.sph.obstacles import PolygonObstacle
 
 DAM, WBC = load_preset("dambreak2d"), load_preset("wbcsph")
 
@@ -30,7 +29,7 @@ def test_round_trip_through_plain_values(preset):
 def test_the_dam_break_has_lagrangebenchs_sizes():
     assert DAM.frames == 400
     assert DAM.frame_dt / DAM.substeps == pytest.approx(3e-4)
-    assert DAM.most_particles == 5740
+    assert DAM.max_particles == 5740
     assert DAM.scene.gravity == (0.0, -1.0)
     assert DAM.scene.obstacles
     assert not DAM.scene.gravity_varies
@@ -90,7 +89,7 @@ def test_trajectories_have_the_frames_and_types_of_their_preset(trajectories):
     for made in trajectories:
         frames, particles, _ = made.position.shape
         assert frames == 41
-        assert particles <= SMALL.most_particles
+        assert particles <= SMALL.max_particles
         assert set(made.particle_type) == {3, 5}
         assert np.all(np.ptp(made.position[:, made.particle_type == 3], axis=0) == 0)
         assert made.position.dtype == np.float32
@@ -138,6 +137,8 @@ def test_tells_of_its_progress():
     ],
 )
 def test_refuses_states_that_cannot_be(position, velocity, message):
-    obstacle = Obstacle(np.array([[0.55, 0.55], [0.7, 0.55], [0.7, 0.7]]))
+    obstacle = PolygonObstacle(np.array([[0.55, 0.55], [0.7, 0.55], [0.7, 0.7]]))
     with pytest.raises(DataError, match=message):
-        simulate_from(SMALL, np.array(position, float), np.array(velocity, float), 1, obstacles=(obstacle,))
+        SMALL.simulate_from(
+            InitialState(np.array(position, float), np.array(velocity, float), obstacles=(obstacle,)), 1
+        )

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from nmpm.sim.sph.walls import LAYERS, Obstacle, Solids, box_particles, obstacle_particles
+from nmpm.sim.sph.walls import LAYERS, PolygonObstacle, SolidBoundary, box_particles, obstacle_particles
 
-SQUARE = Obstacle(np.array([[0.4, 0.4], [0.6, 0.4], [0.6, 0.6], [0.4, 0.6]]))
-RAMP = Obstacle(np.array([[0.3, 0.2], [0.8, 0.3], [0.7, 0.7]]))
+SQUARE = PolygonObstacle(np.array([[0.4, 0.4], [0.6, 0.4], [0.6, 0.6], [0.4, 0.6]]))
+RAMP = PolygonObstacle(np.array([[0.3, 0.2], [0.8, 0.3], [0.7, 0.7]]))
 BOX = ((0.0, 1.0), (0.0, 1.0))
 
 
@@ -43,28 +43,28 @@ def test_obstacle_particles_lie_in_rings_of_even_spacing(obstacle):
 
 
 def test_a_thin_obstacle_has_fewer_rings():
-    plank = Obstacle(np.array([[0.2, 0.5], [0.8, 0.5], [0.8, 0.518], [0.2, 0.518]]))
+    plank = PolygonObstacle(np.array([[0.2, 0.5], [0.8, 0.5], [0.8, 0.518], [0.2, 0.518]]))
     depth = plank.depth(obstacle_particles(plank, 0.01))
     np.testing.assert_allclose(depth, 0.005, atol=1e-9)
 
 
 def test_particles_of_overlapping_obstacles_are_not_doubled():
-    solids = Solids(BOX, (SQUARE, RAMP), 0.01)
-    own = solids.position[SQUARE.depth(solids.position) > 0]
+    boundary = SolidBoundary(BOX, (SQUARE, RAMP), 0.01)
+    own = boundary.position[SQUARE.depth(boundary.position) > 0]
     assert len(own) == len(obstacle_particles(SQUARE, 0.01))
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_held_back_particles_are_outside_of_solids_and_do_not_move_into_them(seed):
+def test_held_back_particles_are_outside_of_boundary_and_do_not_move_into_them(seed):
     rng = np.random.default_rng(seed)
-    solids = Solids(BOX, (RAMP,), 0.01)
+    boundary = SolidBoundary(BOX, (RAMP,), 0.01)
     x, y = rng.uniform(-0.1, 1.1, (2, 50))
     vx, vy = rng.normal(size=(2, 50))
     before = np.stack([x, y, vx, vy], -1)
-    crossed = solids.inside(before[:, :2])
-    held = solids.hold_back(x, y, vx, vy)
-    assert solids.inside(np.stack([x, y], -1).astype(np.float32)) == 0
+    crossed = boundary.count_outside(before[:, :2])
+    held = boundary.hold_back(x, y, vx, vy)
+    assert boundary.count_outside(np.stack([x, y], -1).astype(np.float32)) == 0
     assert held >= crossed
     kept = np.all(before[:, :2] == np.stack([x, y], -1), axis=1)
     np.testing.assert_array_equal(np.stack([vx, vy], -1)[kept], before[kept, 2:])
@@ -76,8 +76,8 @@ def test_held_back_particles_are_outside_of_solids_and_do_not_move_into_them(see
 
 
 def test_shown_particles_are_the_first_layer_and_the_obstacles():
-    solids = Solids(BOX, (SQUARE,), 0.05)
-    shown = solids.position[solids.shown]
+    boundary = SolidBoundary(BOX, (SQUARE,), 0.05)
+    shown = boundary.position[boundary.shown]
     outside = np.any((shown < 0) | (shown > 1), axis=1)
     assert outside.sum() == 4 * 20 + 4
     assert np.all(SQUARE.depth(shown[~outside]) > 0)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from nmpm.errors import ConfigError
-from nmpm.sim.sph.walls import Solids
-from nmpm.sim.sph.wcsph import Fluid, State, Stepper
+from nmpm.sim.sph.fluid import Fluid, SphParticles
+from nmpm.sim.sph.walls import SolidBoundary
+from nmpm.sim.sph.wcsph import SphStepper
 
 H = 0.02
 WATER = Fluid(density=1000.0, speed_of_sound=20.0, exponent=7.0, alpha=0.1, viscosity=0.0, diffusion=0.0)
@@ -19,8 +20,8 @@ def lattice(columns, rows, low):
 
 
 def run(position, velocity, steps, gravity=(0.0, 0.0), fluid=WATER, box=BOX, dt=DT):
-    state = State(position, velocity, fluid.density)
-    stepper = Stepper(fluid, Solids(box, (), H), H, np.array(gravity), dt)
+    state = SphParticles(position, velocity, fluid.density)
+    stepper = SphStepper(fluid, SolidBoundary(box, (), H), H, np.array(gravity), dt)
     stepper.begin(state)
     for _ in range(steps):
         stepper.step(state)
@@ -135,8 +136,8 @@ def front(columns, until):
     fluid = Fluid(1.0, 20.0, 7.0, 0.1, 0.0, 0.0)
     dt = 0.25 * h / 20.0
     nodes = np.stack(np.meshgrid(*[np.arange(columns)] * 2, indexing="ij"), -1).reshape(-1, 2)
-    state = State(h * (nodes + 0.5), np.zeros((columns**2, 2)), 1.0)
-    stepper = Stepper(fluid, Solids(((0.0, 4.0), (0.0, 2.0)), (), h), h, np.array([0.0, -1.0]), dt)
+    state = SphParticles(h * (nodes + 0.5), np.zeros((columns**2, 2)), 1.0)
+    stepper = SphStepper(fluid, SolidBoundary(((0.0, 4.0), (0.0, 2.0)), (), h), h, np.array([0.0, -1.0]), dt)
     stepper.begin(state)
     for _ in range(round(until / dt)):
         stepper.step(state)
@@ -161,8 +162,8 @@ def test_the_dam_breaks_front_is_that_of_martin_and_moyce():
     fluid = Fluid(1.0, 25.0, 7.0, 0.05, 0.0, 0.1)
     dt = 0.25 * h / 25.0
     nodes = np.stack(np.meshgrid(np.arange(16), np.arange(32), indexing="ij"), -1).reshape(-1, 2)
-    state = State(h * (nodes + 0.5), np.zeros((512, 2)), 1.0)
-    stepper = Stepper(fluid, Solids(((0.0, 5.0), (0.0, 3.0)), (), h), h, np.array([0.0, -1.0]), dt)
+    state = SphParticles(h * (nodes + 0.5), np.zeros((512, 2)), 1.0)
+    stepper = SphStepper(fluid, SolidBoundary(((0.0, 5.0), (0.0, 3.0)), (), h), h, np.array([0.0, -1.0]), dt)
     stepper.begin(state)
     fronts, t = [], 0.0
     for late, _ in MARTIN_MOYCE:
@@ -190,8 +191,8 @@ def test_the_list_of_pairs_is_renewed_in_time():
     fluid = dataclasses.replace(WATER, diffusion=0.1)
     states = []
     for always in (False, True):
-        state = State(position, np.zeros_like(position), fluid.density)
-        stepper = Stepper(fluid, Solids(((0.0, 30 * H), (0.0, 1.0)), (), H), H, np.array([4.0, -9.0]), DT)
+        state = SphParticles(position, np.zeros_like(position), fluid.density)
+        stepper = SphStepper(fluid, SolidBoundary(((0.0, 30 * H), (0.0, 1.0)), (), H), H, np.array([4.0, -9.0]), DT)
         stepper.begin(state)
         for _ in range(400):
             if always:

@@ -1,0 +1,306 @@
+"""Presets of the material point method."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+
+from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Interval, Scene
+from nmpm.sim.arrays import Array
+from nmpm.sim.config import check, from_section, section_entries
+from nmpm.sim.gravity import draw_gravity
+from nmpm.sim.initial_state import InitialState
+from nmpm.sim.mpm.blocks import MpmBlockRanges
+from nmpm.sim.mpm.grid import MpmGrid, Walls
+from nmpm.sim.mpm.materials import MATERIALS, Material
+from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
+from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
+from nmpm.sim.mpm.obstacle_field import ObstacleField
+from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.sim.mpm.ramps import Ramp, RampRanges, distance_to_ramps
+from nmpm.sim.mpm.simulate import check_particles, record_frames
+from nmpm.sim.mpm.stability import (
+    CFL_LIMIT,
+    fastest_speed,
+    longest_particle_substep,
+    longest_travel_substep,
+    longest_wave_substep,
+)
+from nmpm.sim.mpm.stepper import REVISION, MpmStepper
+from nmpm.sim.preset import BOUNDARY, Preset
+from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+
+_ARRANGEMENTS = 20
+_STEPPERS: dict[int, type[MpmStepper]] = {2: Stepper2d, 3: Stepper3d}
+
+
+@dataclass(frozen=True)
+class MpmPreset(Preset):
+    """A family of scenes of the material point method; `presets/goop.yaml` comments every entry.
+
+    Args:
+        name: Of the family.
+        frames: Simulated frames of a trajectory after its initial state.
+        frame_dt: Time between frames, in seconds.
+        substeps: Substeps of a frame.
+        box: Where particles may be, (lower, upper) along two or three axes, the second upright, in length; walls that
+            hold let them into a layer around it, see `reach`.
+        domain: What an emulator's grid covers, likewise.
+        cells: Grid cells along x, from side to side of the box.
+        spacing: Distance between particles in the initial lattice, in length.
+        gravity: Acceleration, in length per second squared.
+        wall_friction: Coulomb friction at the walls.
+        materials: What blocks are made of.
+        blocks: How the initial state is drawn.
+        walls: What the walls do with material that leaves them, a value of `Walls`.
+        gravity_turn: Largest angle by which a trajectory's gravity is turned, in degrees; in two dimensions only.
+        ramps: Obstacles; in two dimensions only.
+
+    Raises:
+        ConfigError: if the numbers contradict each other, or a substep is too long for elastic waves at rest.
+    """
+
+    solver: ClassVar[str] = "mls_mpm"
+    generator: ClassVar[str] = "MLS-MPM"
+    revision: ClassVar[int] = REVISION
+
+    cells: int
+    spacing: float
+    gravity: tuple[float, ...]
+    wall_friction: float
+    materials: tuple[Material, ...]
+    blocks: MpmBlockRanges
+    walls: str = Walls.SEPARATE.value
+    gravity_turn: float = 0.0
+    ramps: RampRanges | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_positive("cells", "spacing")
+        self._check_whole("cells")
+        check(self.wall_friction >= 0, f"wall_friction = {self.wall_friction} must not be negative.")
+        known = [kind.value for kind in Walls]
+        check(self.walls in known, f"walls = {self.walls} is not one of {', '.join(map(repr, known))}.")
+        check(bool(self.materials), f"materials is empty; known are {', '.join(MATERIALS)}.")
+        self._check_axes()
+        self._check_dimension()
+        least = self._wave_substeps
+        check(
+            self.substeps >= least,
+            f"substeps = {self.substeps} are too few: at {self.wave_speed:.1f} m/s an elastic wave crosses more than "
+            f"{CFL_LIMIT} cells in one. Take at least {least}, or a softer material.",
+        )
+
+    def _check_axes(self) -> None:
+        check(self.dim in (2, 3), f"box = {self.box} has {self.dim} axes; 2 or 3 are possible.")
+        check(all(low < high for low, high in self.box), f"box = {self.box} needs (lower, upper) along each axis.")
+        for key in ("domain", "gravity"):
+            check(len(getattr(self, key)) == self.dim, f"{key} = {getattr(self, key)} needs {self.dim} entries.")
+        for low, high in self.box:
+            cells = (high - low) / self.cell_size
+            check(
+                abs(cells - round(cells)) < 1e-6,
+                f"cells = {self.cells} along x make {cells:.3f} from {low} to {high}, not a whole number.",
+            )
+
+    def _check_dimension(self) -> None:
+        check(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
+        needs_2d = self.ramps is not None or self.gravity_turn or self.walls == Walls.OPEN_CORNERS.value
+        check(
+            self.dim == 2 or not needs_2d,
+            "ramps, gravity_turn and open corners are implemented in two dimensions, not in three.",
+        )
+        for material in self.materials:
+            material.rest(self.dim)
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return len(self.box)
+
+    @property
+    def cell_size(self) -> float:
+        """Side of a grid cell, in length."""
+        return (self.box[0][1] - self.box[0][0]) / self.cells
+
+    @property
+    def reach(self) -> tuple[Interval, ...]:
+        """How far particles can get: the box, and a cell and a half beyond it where walls hold what touches them."""
+        layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
+        return tuple((low - layer, high + layer) for low, high in self.box)
+
+    @property
+    def particle_volume(self) -> float:
+        """Area of one particle, or volume in three dimensions."""
+        return self.spacing**self.dim
+
+    @property
+    def wave_speed(self) -> float:
+        """Of the fastest elastic wave at rest, in length per second."""
+        return max(material.wave_speed for material in self.materials)
+
+    @property
+    def _wave_substeps(self) -> int:
+        """Fewest substeps of a frame that keep elastic waves at rest within `CFL_LIMIT`: necessary, not sufficient."""
+        longest = min(longest_wave_substep(material, self.cell_size) for material in self.materials)
+        return math.ceil(self.frame_dt / longest - 1e-9)
+
+    @property
+    def stable_substeps(self) -> int:
+        """Fewest substeps of a frame that are stable by every bound of `stability.py`.
+
+        The speeds that go into them are the largest that the preset's initial velocities and falls can add up to.
+        """
+        size, dim = self.cell_size, self.dim
+        speed = fastest_speed(
+            self.blocks.speed, self.gravity, [high - low for low, high in self.box], self.gravity_turn > 0
+        )
+        thickness = math.inf if self.ramps is None else self.ramps.thickness
+        bounds = [longest_travel_substep(size, speed, thickness)]
+        bounds += [longest_particle_substep(material, size, dim, speed) for material in self.materials]
+        return max(self._wave_substeps, math.ceil(self.frame_dt / min(bounds) - 1e-9))
+
+    def _with_stable_substeps(self, least: int) -> MpmPreset:
+        """The same with `stable_substeps`, or `least` if that is more."""
+        many = dataclasses.replace(self, substeps=2**31)  # accepted whatever the cells and speeds
+        return dataclasses.replace(many, substeps=max(least, many.stable_substeps))
+
+    def varied(self, *, speed: float = 1.0, gravity: float = 1.0) -> MpmPreset:
+        changed = dataclasses.replace(
+            self, blocks=self.blocks.faster(speed), gravity=tuple(gravity * pull for pull in self.gravity)
+        )
+        return changed._with_stable_substeps(self.substeps)
+
+    def coarsened(self, factor: int) -> MpmPreset:
+        """The same particles on a grid with cells `factor` times as large, with `stable_substeps` substeps.
+
+        Raises:
+            ConfigError: if the cells do not divide by the factor.
+        """
+        check(self.cells % factor == 0, f"{self.cells} cells cannot be coarsened {factor} times.")
+        many = dataclasses.replace(self, substeps=2**31, cells=self.cells // factor)
+        return many._with_stable_substeps(1)
+
+    def widened(self, times: int) -> MpmPreset:
+        """Scenes in a domain so many times as wide, with up to as many times as many particles and blocks.
+
+        The box is as wide as whole cells of the simulator allow, its wall layer on the right at least what it was.
+        """
+        (left, right), *others = self.domain
+        low, high = self.box[0]
+        edge = left + times * (right - left)
+        cells = math.floor((edge - (right - high) - low) / self.cell_size + 1e-9)
+        return dataclasses.replace(
+            self,
+            box=((low, low + cells * self.cell_size), *self.box[1:]),
+            domain=((left, edge), *others),
+            cells=cells,
+            blocks=self.blocks.multiplied(times),
+        )
+
+    def draw(self, seed: int) -> InitialState:
+        rng = np.random.default_rng(seed)
+        gravity = draw_gravity(self.gravity, self.gravity_turn, rng)
+        for _ in range(_ARRANGEMENTS):
+            drawn = self.blocks.draw(self.box, self.spacing, len(self.materials), rng)
+            try:
+                ramps = () if self.ramps is None else self.ramps.draw(self.box, drawn.extents, rng)
+            except ConfigError as error:  # These blocks leave no room; others may.
+                reason = error
+                continue
+            return InitialState(drawn.position, drawn.velocity, gravity, drawn.counts, ramps)
+        raise reason
+
+    def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
+        check_particles(start.position, start.velocity, self.reach)
+        counts, ramps = self._counts_of(start), _ramps_of(start)
+        gravity = self.gravity if start.gravity is None else start.gravity
+        groups = tuple(zip(self.materials, counts, strict=True))
+        particles = MpmParticles(start.position, start.velocity, groups, self.particle_volume)
+        stepper = _STEPPERS[self.dim](self._grid(gravity, ramps), self.frame_dt / self.substeps)
+        static = np.concatenate([np.empty((0, self.dim)), *(ramp.particles(self.spacing) for ramp in ramps)])
+        position = record_frames(stepper, particles, static, frames, self.substeps, progress)
+        types = [*(material.particle_type for material in self.materials), BOUNDARY]
+        particle_type = np.repeat(types, [*counts, len(static)]).astype(np.int64)
+        attributes: dict[str, Any] = {"held_back": stepper.held_back}
+        if ramps:
+            attributes["pushed_out"] = stepper.pushed_out
+        if self.gravity_turn:
+            attributes["gravity"] = np.array(gravity)
+        return SimulatedTrajectory(position, particle_type, attributes)
+
+    def _counts_of(self, start: InitialState) -> tuple[int, ...]:
+        count, materials = len(start.position), len(self.materials)
+        counts = start.counts or (count,) + (0,) * (materials - 1)
+        if len(counts) != materials or sum(counts) != count:
+            raise DataError(f"Counts {counts} do not divide {count} particles among {materials} materials.")
+        return counts
+
+    def _grid(self, gravity: tuple[float, ...], ramps: tuple[Ramp, ...]) -> MpmGrid:
+        low, high = np.array(self.reach).T
+        shape = tuple(round(cells) for cells in (high - low) / self.cell_size)
+        pull: Array = np.array(gravity, dtype=np.float64)
+        grid = MpmGrid(low, self.cell_size, shape, self.wall_friction, pull, Walls(self.walls))
+        if not ramps:
+            return grid
+        obstacles = ObstacleField.sample(grid, partial(distance_to_ramps, ramps), self.wall_friction)
+        return dataclasses.replace(grid, obstacles=obstacles)
+
+    @property
+    def scene(self) -> Scene:
+        return Scene(
+            bounds=self.reach,
+            domain=self.domain,
+            dt=self.frame_dt,
+            materials=tuple(material.name for material in self.materials),
+            particle_volume=self.particle_volume,
+            gravity=None if self.gravity_turn else self.gravity,
+            gravity_varies=self.gravity_turn > 0,
+            obstacles=self.ramps is not None,
+        )
+
+    @property
+    def type_names(self) -> dict[int, str]:
+        names = {material.particle_type: material.name for material in self.materials}
+        return names if self.ramps is None else names | {BOUNDARY: "boundary"}
+
+    @property
+    def max_particles(self) -> int:
+        static = 0 if self.ramps is None else self.ramps.max_particles(self.spacing)
+        return self.blocks.particles[1] + static
+
+    def to_dict(self) -> dict[str, Any]:
+        return super().to_dict() | {"materials": {material.name: material.to_dict() for material in self.materials}}
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> MpmPreset:
+        entries = section_entries(cls, plain, "the preset")
+        entries["blocks"] = from_section(MpmBlockRanges, entries["blocks"], "blocks")
+        entries["materials"] = _materials_from_section(entries["materials"])
+        if entries.get("ramps") is not None:
+            entries["ramps"] = from_section(RampRanges, entries["ramps"], "ramps")
+        preset: MpmPreset = from_section(cls, entries, "the preset")
+        return preset
+
+
+def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:
+    ramps = tuple(obstacle for obstacle in start.obstacles if isinstance(obstacle, Ramp))
+    if len(ramps) != len(start.obstacles):
+        raise DataError("The material point method simulates ramps; other obstacles are not implemented.")
+    return ramps
+
+
+def _materials_from_section(section: Any) -> tuple[Material, ...]:
+    if not isinstance(section, Mapping):
+        raise ConfigError("materials must map names to parameters.")
+    unknown = sorted(set(section) - set(MATERIALS))
+    if unknown:
+        raise ConfigError(f"Unknown material {', '.join(map(str, unknown))}; known are {', '.join(MATERIALS)}.")
+    return tuple(from_section(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())

@@ -1,0 +1,163 @@
+"""Ramps: slanted bars in the box that do not move, after the setting of DeepMind's WaterRamps and SandRamps scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nmpm.errors import ConfigError
+from nmpm.scene import Interval
+from nmpm.sim.arrays import Array
+from nmpm.sim.config import check
+from nmpm.sim.initial_state import Obstacle
+
+_RESTARTS = 20
+_ATTEMPTS = 500
+_OUTLINE = 96  # points on a bar's outline by which its distance from others is judged
+
+
+@dataclass(frozen=True)
+class Ramp(Obstacle):
+    """A bar: a turned rectangle.
+
+    Args:
+        centre: (x, y) in length.
+        length: Of its longer side.
+        thickness: Of its shorter side.
+        angle: Of the longer side from the x axis, in radians.
+    """
+
+    centre: tuple[float, float]
+    length: float
+    thickness: float
+    angle: float
+
+    @property
+    def _axes(self) -> Array:
+        """(2, 2) unit vectors along and across the bar, as rows."""
+        cos, sin = math.cos(self.angle), math.sin(self.angle)
+        return np.array([[cos, sin], [-sin, cos]])
+
+    @property
+    def _half(self) -> Array:
+        return np.array([self.length, self.thickness]) / 2
+
+    def distance(self, points: Array) -> Array:
+        """(K,) signed distance of points (K, 2) from the bar, negative inside."""
+        beyond = np.abs((points - np.array(self.centre)) @ self._axes.T) - self._half
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+        return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0.0))
+
+    def particles(self, spacing: float) -> Array:
+        """(M, 2) a lattice that fills the bar, parallel to its sides, about `spacing` apart."""
+        numbers = [max(1, round(side / spacing)) for side in (self.length, self.thickness)]
+        along, across = (
+            (np.arange(number) + 0.5) / number * side - side / 2
+            for number, side in zip(numbers, (self.length, self.thickness), strict=True)
+        )
+        local = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
+        return np.asarray(np.array(self.centre) + local @ self._axes)
+
+    def outline(self) -> Array:
+        """(K, 2) points all along the sides, corners included."""
+        corners = self._half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+        place = np.linspace(0, 4, _OUTLINE + 1)[:-1]
+        local = np.stack([np.interp(place, np.arange(5), corners[:, axis]) for axis in range(2)], axis=-1)
+        return np.asarray(np.array(self.centre) + local @ self._axes)
+
+
+@dataclass(frozen=True)
+class RampRanges:
+    """How the ramps of a scene are drawn; lengths in metres.
+
+    Args:
+        number: Least and most of them.
+        length: Least and largest length.
+        thickness: Of all.
+        angle: Least and largest slope, in degrees; to the left or to the right with equal chances.
+        gap: Least distance between them, from the box's sides, and from blocks.
+
+    Raises:
+        ConfigError: if a range is empty or a value is out of range.
+    """
+
+    number: tuple[int, int]
+    length: tuple[float, float]
+    thickness: float
+    angle: tuple[float, float]
+    gap: float
+
+    def __post_init__(self) -> None:
+        check(0 <= self.number[0] <= self.number[1], f"ramps.number = {list(self.number)} needs least and most.")
+        check(0 < self.length[0] <= self.length[1], f"ramps.length = {list(self.length)} needs least and largest.")
+        check(0 <= self.angle[0] <= self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
+        check(0 < self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is not 0 < … ≤ the length.")
+        check(self.gap >= 0, f"ramps.gap = {self.gap} must not be negative.")
+
+    def max_particles(self, spacing: float) -> int:
+        """Upper bound of the particles that the ramps of a scene are made of."""
+        return self.number[1] * max(1, round(self.length[1] / spacing)) * max(1, round(self.thickness / spacing))
+
+    def draw(
+        self, box: tuple[Interval, ...], occupied: Sequence[tuple[Array, Array]], rng: np.random.Generator
+    ) -> tuple[Ramp, ...]:
+        """Random ramps within a box.
+
+        Args:
+            box: (lower, upper) along x and y.
+            occupied: Lower and upper corners, (2,) each, of rectangles to keep clear of.
+            rng: To draw with.
+
+        Raises:
+            ConfigError: if no arrangement fits into the box.
+        """
+        number = int(rng.integers(self.number[0], self.number[1] + 1))
+        for _ in range(_RESTARTS):
+            placed = self._place(number, box, occupied, rng)
+            if placed is not None:
+                return placed
+        raise ConfigError(f"No room for {number} ramps of ramps.length = {list(self.length)} within {box}.")
+
+    def _place(
+        self,
+        number: int,
+        box: tuple[Interval, ...],
+        occupied: Sequence[tuple[Array, Array]],
+        rng: np.random.Generator,
+    ) -> tuple[Ramp, ...] | None:
+        """Bars placed one after the other, or None if the first ones leave no room for the others."""
+        low, high = np.array(box).T
+        placed: list[Ramp] = []
+        for _ in range(_ATTEMPTS):
+            if len(placed) == number:
+                return tuple(placed)
+            angle = math.radians(rng.uniform(*self.angle)) * (1 if rng.random() < 0.5 else -1)
+            x, y = rng.uniform(low, high).tolist()
+            drawn = Ramp((x, y), float(rng.uniform(*self.length)), self.thickness, angle)
+            outline = drawn.outline()
+            inside = np.all((outline >= low + self.gap) & (outline <= high - self.gap))
+            clear = all(other.distance(outline).min() >= self.gap for other in placed)
+            if inside and clear and not any(_too_close(drawn, corners, self.gap) for corners in occupied):
+                placed.append(drawn)
+        return None
+
+
+def _too_close(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
+    """Whether a ramp comes closer to a rectangle than the gap."""
+    low, high = corners
+    beyond = np.maximum(np.maximum(low - ramp.outline(), ramp.outline() - high), 0.0)
+    nearest = np.linalg.norm(beyond, axis=1).min()
+    # Corners of the rectangle may come nearer than any point of the outline, or lie within the bar.
+    points = np.stack(np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij"), axis=-1).reshape(-1, 2)
+    return bool(min(nearest, ramp.distance(points).min()) < gap)
+
+
+def distance_to_ramps(ramps: tuple[Ramp, ...], points: Array) -> Array:
+    """(K,) signed distance of points (K, 2) from the nearest bar, negative inside; infinite where there is none."""
+    found = np.full(len(points), np.inf)
+    for ramp in ramps:
+        found = np.minimum(found, ramp.distance(points))
+    return found

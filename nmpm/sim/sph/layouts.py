@@ -1,0 +1,171 @@
+"""Initial states of the fluid: a relaxed column in the corner, or moving blocks among obstacles."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.errors import ConfigError
+from nmpm.scene import Interval
+from nmpm.sim.arrays import Array
+from nmpm.sim.blocks import BlockRanges
+from nmpm.sim.config import check
+from nmpm.sim.sph.obstacles import PolygonObstacle
+from nmpm.sim.sph.relaxation import relax
+
+Box = tuple[Interval, Interval]
+
+_ATTEMPTS = 10_000
+
+
+class FluidLayout(abc.ABC):
+    """How the fluid's initial state is drawn."""
+
+    @abc.abstractmethod
+    def draw(
+        self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Positions and velocities, (N, 2) each, of particles in the box and in no obstacle.
+
+        Raises:
+            ConfigError: if no arrangement fits into the box.
+        """
+
+    @abc.abstractmethod
+    def max_particles(self, spacing: float) -> int:
+        """Upper bound of a state's particles."""
+
+    @abc.abstractmethod
+    def faster(self, factor: float) -> Self:
+        """The same at initial speeds times a factor."""
+
+    @abc.abstractmethod
+    def multiplied(self, times: int) -> Self:
+        """For a box so many times as wide: up to as many times as many particles."""
+
+    @abc.abstractmethod
+    def coarsened(self, factor: int) -> Self:
+        """The same fluid in particles that are `factor` times as large."""
+
+
+@dataclass(frozen=True)
+class Column(FluidLayout):
+    """A column of fluid at rest in the lower left corner of the box; its particles are displaced and then relaxed.
+
+    Args:
+        width: In length.
+        height: In length.
+        noise: Standard deviation of a particle's displacement off the lattice, in spacings.
+        relaxation: Sweeps that spread the particles evenly again.
+
+    Raises:
+        ConfigError: if a number is out of range.
+    """
+
+    width: float
+    height: float
+    noise: float
+    relaxation: int
+
+    def __post_init__(self) -> None:
+        check(self.width > 0 and self.height > 0, "column.width and column.height must be positive.")
+        check(self.noise >= 0 and self.relaxation >= 0, "column.noise and column.relaxation must not be negative.")
+
+    def faster(self, factor: float) -> Self:  # noqa: ARG002  # (it is at rest)
+        return self
+
+    def multiplied(self, times: int) -> Self:
+        return dataclasses.replace(self, width=times * self.width)
+
+    def coarsened(self, factor: int) -> Self:  # noqa: ARG002  # (its size is given in length)
+        return self
+
+    def lattice(self, spacing: float) -> tuple[int, int]:
+        """Particles along x and y."""
+        return round(self.width / spacing), round(self.height / spacing)
+
+    def max_particles(self, spacing: float) -> int:
+        return math.prod(self.lattice(spacing))
+
+    def draw(
+        self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        shape = self.lattice(spacing)
+        low = np.array([axis[0] for axis in box])
+        high = low + spacing * np.array(shape)
+        displaced = _lattice(low, shape, spacing) + rng.normal(scale=self.noise * spacing, size=(math.prod(shape), 2))
+        column = ((low[0], high[0]), (low[1], high[1]))
+        position = relax(displaced, column, spacing, self.relaxation)
+        free = _clear_of(position, obstacles, spacing)
+        return position[free], np.zeros_like(position[free])
+
+
+@dataclass(frozen=True)
+class FluidBlocks(BlockRanges, FluidLayout):
+    """Rectangular blocks of fluid, each with one velocity; particles that would be inside obstacles are left out."""
+
+    def draw(
+        self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        number = int(rng.integers(self.number[0], self.number[1] + 1))
+        for _ in range(_ATTEMPTS):
+            blocks = self._arrange(box, spacing, number, rng)
+            if blocks is not None:
+                break
+        else:
+            raise ConfigError(f"No room for blocks.particles = {list(self.particles)} in {number} blocks within {box}.")
+        position, velocity = [], []
+        for low, shape in blocks:
+            points = _lattice(low, shape, spacing)
+            points += spacing * rng.uniform(-self.jitter, self.jitter, points.shape)
+            position.append(points[_clear_of(points, obstacles, spacing)])
+            velocity.append(np.broadcast_to(rng.uniform(-self.speed, self.speed, 2), position[-1].shape))
+        return np.concatenate(position), np.concatenate(velocity)
+
+    def max_particles(self, spacing: float) -> int:  # noqa: ARG002
+        return self.particles[1]
+
+    def coarsened(self, factor: int) -> Self:
+        fewest, most = self.particles
+        return dataclasses.replace(self, particles=(max(1, fewest // factor**2), max(1, most // factor**2)))
+
+    def _arrange(
+        self, box: Box, spacing: float, number: int, rng: np.random.Generator
+    ) -> list[tuple[Array, tuple[int, int]]] | None:
+        """Lower corner and lattice of each block; None if they do not fit, meet, or are too small or large."""
+        sizes = self.share + (1 - number * self.share) * rng.dirichlet(np.ones(number))
+        sizes *= rng.uniform(*self.particles)
+        aspects = np.exp(rng.uniform(math.log(self.aspect[0]), math.log(self.aspect[1]), number))
+        shapes = np.maximum(1, np.rint(np.sqrt(np.stack([sizes / aspects, sizes * aspects], -1)))).astype(int)
+        if not self.particles[0] <= shapes.prod(-1).sum() <= self.particles[1]:
+            return None
+        box_low, box_high = np.array(box).T
+        sides = spacing * shapes
+        first, last = box_low + self.gap, box_high - self.gap - sides
+        if np.any(first > last):
+            return None
+        lows = rng.uniform(first, last)
+        for a in range(number):
+            for b in range(a):
+                if np.all((lows[a] < lows[b] + sides[b] + self.gap) & (lows[b] < lows[a] + sides[a] + self.gap)):
+                    return None
+        return [(low, (int(c), int(r))) for low, (c, r) in zip(lows, shapes, strict=True)]
+
+
+def _clear_of(points: Array, obstacles: tuple[PolygonObstacle, ...], spacing: float) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 2) are no nearer to an obstacle than half a spacing."""
+    free = np.ones(len(points), np.bool_)
+    for obstacle in obstacles:
+        free &= obstacle.depth(points) < -0.5 * spacing
+    return free
+
+
+def _lattice(low: Array, shape: tuple[int, int], spacing: float) -> Array:
+    nodes = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
+    return np.asarray(low + spacing * (nodes + 0.5))

@@ -1,0 +1,134 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.errors import DataError
+from nmpm.sim.mpm.grid import MpmGrid, Walls
+from nmpm.sim.mpm.materials import Goop, Sand, Water
+from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
+from nmpm.sim.mpm.obstacle_field import ObstacleField
+from nmpm.sim.mpm.particles import MpmParticles
+
+SIZE, CELLS, DT = 0.0125, 48, 2e-4
+WATER = Water(density=1000.0, bulk_modulus=7e4)
+SAND = Sand(density=1000.0, young=1e5, poisson=0.3, friction_angle=30.0)
+GOOP = Goop(density=1000.0, young=4e5, poisson=0.4, yield_stress=200.0, viscosity=60.0)
+
+
+def strip(centre, angle, length, thickness):
+    """Exact signed distance from a slanted rectangle."""
+    along = np.array([math.cos(angle), math.sin(angle)])
+    across = np.array([-along[1], along[0]])
+
+    def distance(points):
+        arm = points - np.asarray(centre)
+        beyond = np.abs(np.stack([arm @ along, arm @ across], -1)) - np.array([length, thickness]) / 2
+        return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(axis=-1), 0)
+
+    return distance
+
+
+def stepper(distance, friction=0.3, gravity=(0.0, -9.81), walls=Walls.SEPARATE, dt=DT):
+    bare = MpmGrid(np.zeros(2), SIZE, (CELLS, CELLS), friction, np.array(gravity), walls)
+    field = ObstacleField.sample(bare, distance, friction)
+    return Stepper2d(MpmGrid(bare.low, SIZE, bare.shape, friction, bare.gravity, walls, field), dt)
+
+
+def block(columns, rows, low):
+    return np.array(low) + SIZE / 2 * (np.stack(np.meshgrid(range(columns), range(rows)), -1).reshape(-1, 2) + 0.5)
+
+
+def state(position, velocity, material=WATER):
+    return MpmParticles(position, velocity, ((material, len(position)),), (SIZE / 2) ** 2)
+
+
+angles = st.floats(-math.pi / 2, math.pi / 2)
+places = st.tuples(st.floats(0.1, 0.5), st.floats(0.0, 0.35))
+
+
+materials = st.sampled_from([WATER, SAND, GOOP])
+
+
+@settings(max_examples=15, deadline=None)
+@given(places, angles, st.floats(0.1, 0.5), st.floats(0.25, 6), st.floats(0, 6), st.floats(0, 1), materials)
+def test_no_particle_is_ever_inside_an_obstacle_or_outside_of_the_box(
+    centre, angle, length, cells, speed, friction, material
+):
+    distance = strip(centre, angle, length, cells * SIZE)
+    run = stepper(distance, friction)
+    position = block(40, 8, (0.15, 0.5))
+    position = position[distance(position) > SIZE]
+    moving = state(position, np.tile([0.3 * speed, -speed], (len(position), 1)), material)
+    run.enclose(moving)
+    for _ in range(200):
+        run.step(moving)
+        assert distance(moving.position).min() >= 0
+        assert moving.position.min() > 0
+        assert moving.position.max() < CELLS * SIZE
+    assert run.held_back == 0
+
+
+@pytest.mark.parametrize("cells", [0.25, 1.0, 2.0])
+@pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4])
+def test_obstacles_thinner_than_cells_let_no_jet_through(angle, cells):
+    distance = strip((0.3, 0.3), angle, 2.0, cells * SIZE)
+    run = stepper(distance)
+    position = block(16, 16, (0.25, 0.45))
+    moving = state(position, np.tile([0.0, -5.0], (len(position), 1)))
+    for _ in range(500):
+        run.step(moving)
+    above = (moving.position - 0.3) @ np.array([-math.sin(angle), math.cos(angle)])
+    assert above.min() > 0
+
+
+def test_a_particle_that_comes_too_near_is_put_back_without_its_velocity_inwards():
+    field = stepper(strip((0.3, 0.3), 0.0, 0.4, 0.1)).grid.obstacles
+    before = np.array([[0.3, 0.36], [0.3, 0.3535], [0.3, 0.4]])
+    position, velocity = before - [[0.0, 0.012], [0.0, 0.0], [0.0, 0.0]], np.tile([1.0, -2.0], (3, 1))
+    assert field.push_out(before, position, velocity, np.zeros(2), np.ones(2)) == 1
+    np.testing.assert_allclose(position, [[0.3, 0.35 + field.margin], *before[1:].tolist()], atol=1e-3 * SIZE)
+    np.testing.assert_allclose(velocity, [[1.0, 0.0], [1.0, -2.0], [1.0, -2.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("friction", "tolerance"), [(0.0, 0.03), (0.2, 0.06), (0.9, 0.03)])
+def test_a_layer_slides_down_a_ramp_as_coulomb_says(friction, tolerance):
+    angle, time = math.radians(25), 0.2
+    along, out = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    distance = strip(np.array([0.3, 0.2]) - 0.05 * out, angle, 2.0, 0.1)
+    run = stepper(distance, friction)
+    slab = block(24, 2, (0, 0)) - [12 * SIZE / 2, 0]
+    position = np.array([0.35, 0.22]) + slab[:, :1] * along + (slab[:, 1:] + 0.75 * SIZE) * out
+    stiff = Goop(density=1000.0, young=4e5, poisson=0.3, yield_stress=1e9, viscosity=1e9)
+    moving = state(position, np.zeros_like(position), stiff)
+    for _ in range(round(time / DT)):
+        run.step(moving)
+    pull = max(0.0, math.sin(angle) - friction * math.cos(angle))
+    assert -(moving.velocity @ along).mean() == pytest.approx(9.81 * time * pull, abs=tolerance * 9.81 * time)
+
+
+def test_material_leaves_an_obstacle_freely():
+    run = stepper(strip((0.3, 0.1), 0.0, 2.0, 0.1), gravity=(0.0, 0.0))
+    position = block(12, 12, (0.2, 0.155))
+    moving = state(position, np.tile([0.0, 2.0], (len(position), 1)))
+    for _ in range(200):
+        run.step(moving)
+    np.testing.assert_allclose(moving.velocity, np.tile([0.0, 2.0], (len(position), 1)), atol=1e-9)
+
+
+def test_a_state_begins_outside_of_obstacles():
+    distance = strip((0.3, 0.3), 0.4, 0.2, 0.1)
+    run = stepper(distance)
+    position = block(20, 20, (0.25, 0.25))
+    assert distance(position).min() < 0
+    begun = state(position, np.zeros_like(position))
+    run.enclose(begun)
+    assert distance(begun.position).min() >= 0
+
+
+def test_refuses_a_state_without_a_way_out():
+    run = stepper(lambda points: np.full(len(points), -1.0))
+    with pytest.raises(DataError, match=r"Particle 0 at .* inside an obstacle"):
+        run.enclose(state(block(1, 1, (0.3, 0.3)), np.zeros((1, 2))))
