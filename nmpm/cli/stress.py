@@ -39,7 +39,7 @@ def run(words: list[str]) -> None:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
     subject = _subject(chosen.model, chosen.preset, chosen.seed)
     if chosen.free:
-        subject = subject.over(subject.emulator.unconstrained())
+        subject = subject.with_emulator(subject.emulator.unconstrained())
     start = time.monotonic()
     lines = _measured(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS), quiet=chosen.json)
     _hand_out(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)

@@ -1,4 +1,4 @@
-"""All tests of the battery, one after the other."""
+"""All groups of tests, one after the other."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.obstacles import obstacles
 from nmpm.evaluation.stress.poison import poison
 from nmpm.evaluation.stress.precision import precision, sensitivity
+from nmpm.evaluation.stress.settling import settling
 from nmpm.evaluation.stress.sizes import sizes
 from nmpm.evaluation.stress.speeds import speeds
 from nmpm.evaluation.stress.subject import Subject
@@ -22,6 +23,7 @@ Group = Callable[[Subject, Size], Iterator[Line]]
 GROUPS: Mapping[str, Group] = MappingProxyType(
     {
         "long": duration,
+        "settling": settling,
         "speeds": speeds,
         "counts": counts,
         "sizes": sizes,
@@ -34,12 +36,12 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
 
 
 def battery(subject: Subject, size: Size, groups: Mapping[str, Group] = GROUPS) -> Iterator[Line]:
-    """Put an emulator through the extremes.
+    """Run the tests of an emulator.
 
     Args:
         subject: The emulator, and its simulator where there is one.
-        size: How much of everything.
-        groups: Which tests.
+        size: Amount of work.
+        groups: The tests to run, by name.
 
     Yields:
         Each line as soon as it is known.

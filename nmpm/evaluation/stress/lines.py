@@ -1,4 +1,4 @@
-"""What the battery prints: lines that pass or fail by a stated invariant, and figures that are only reported."""
+"""Lines of the battery's report: tests that pass or fail by a stated invariant, and figures without a verdict."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ class Line:
     """One test of the battery.
 
     Args:
-        group: What kind of extreme it is.
-        name: Which one.
+        group: Kind of extreme.
+        name: Name within the group.
         passed: Whether the invariant holds; None for figures that are reported without a verdict.
         figures: What was measured, by name; names end with their unit where there is one.
-        needs: The invariant in words; empty for mere reports.
-        curves: What may be drawn, by name: values evenly spaced over the rollout, and its number of frames.
+        needs: The invariant in words; empty where there is no verdict.
+        curves: Curves to draw, by name: values evenly spaced over the rollout, and its number of frames.
     """
 
     group: str
@@ -29,7 +29,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Size:
-    """How much of everything the battery does.
+    """Amount of work of each kind that the battery does.
 
     Args:
         scenes: Scenes of each kind.
@@ -38,8 +38,9 @@ class Size:
         settling: Length of the simulation after which material counts as settled, in trajectories of the preset.
         settled: Frames over which settled material must keep its volume.
         compared: Frames that are compared with the simulator.
-        particles: Most particles in one scene.
-        bundles: Most bundles that gradients go through.
+        particles: Largest number of particles in one scene.
+        bundles: Largest number of bundles that gradients go through.
+        settling_multiples: Lengths of the settling rollouts, in trajectories of the preset.
     """
 
     scenes: int
@@ -50,9 +51,18 @@ class Size:
     compared: int
     particles: int
     bundles: int
+    settling_multiples: tuple[float, ...] = (1.0, 1.7, 2.5)
 
 
 QUICK = Size(scenes=2, horizons=25, far=4_000, settling=3, settled=1_600, compared=160, particles=100_000, bundles=16)
 FULL = Size(
-    scenes=8, horizons=100, far=100_000, settling=5, settled=12_000, compared=400, particles=10_000_000, bundles=64
+    scenes=8,
+    horizons=100,
+    far=100_000,
+    settling=5,
+    settled=12_000,
+    compared=400,
+    particles=10_000_000,
+    bundles=64,
+    settling_multiples=(1.0, 1.7, 2.5, 20.0),
 )

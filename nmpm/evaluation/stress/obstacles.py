@@ -14,20 +14,20 @@ from torch import Tensor
 from nmpm.data.initial_states import lattice, resting
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
-from nmpm.evaluation.stress.course import outside
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress.trace import is_lost
 from nmpm.particles import Particles
 from nmpm.scene import Interval, Scene
 
 Forbidden = Callable[[Tensor, int], Tensor]
-"""Given (N, D) positions and the number of the bundle: which particles are where nobody may be, (N,) bool."""
+"""Given (N, D) positions and the index of the bundle: which particles are in a forbidden place, (N,) bool."""
 
 Change = Callable[[Particles, int], Particles]
-"""Given a state and the number of the bundle to come: the state with what changes from outside."""
+"""Given a state and the index of the next bundle: the state with obstacles moved or particles added."""
 
 _GROUP = "unseen scenes"
-_DEEP = 0.5  # cells: how far into a solid a particle's centre may be seen
+_DEEP = 0.5  # cells: penetration of a solid that is tolerated
 
 
 def obstacles(subject: Subject, size: Size) -> Iterator[Line]:
@@ -50,10 +50,10 @@ def _floor(emulator: Emulator, name: str, cells: int, speed: float, bundles: int
     state = _block(emulator, slab, speed, bar(scene, slab))
     low, high = slab[1]
     deep = high - _DEEP * emulator.grid.spacing[1]
-    most = _most(emulator, state, bundles, lambda position, _: position[:, 1] < deep)
-    below = _most(emulator, state, bundles, lambda position, _: position[:, 1] < low)
+    most = _max_violations(emulator, state, bundles, lambda position, _: position[:, 1] < deep)
+    below = _max_violations(emulator, state, bundles, lambda position, _: position[:, 1] < low)
     figures = {"in_or_below": most, "below": below, "of": state.position.shape[1]}
-    return Line(_GROUP, name, most == 0, _floats(figures), "nobody half a cell deep in it, nobody below")
+    return Line(_GROUP, name, most == 0, _floats(figures), "no particle half a cell deep in it, none below")
 
 
 def _hole(emulator: Emulator, bundles: int) -> Line:
@@ -69,10 +69,10 @@ def _hole(emulator: Emulator, bundles: int) -> Line:
         upright = (position[:, 1] < high - deep[1]) & (position[:, 1] > low + deep[1])
         return upright & ((position[:, 0] - middle).abs() > half + deep[0])
 
-    most = _most(emulator, state, bundles, within)
-    passed = _most(emulator, state, bundles, lambda position, _: position[:, 1] < low)
+    most = _max_violations(emulator, state, bundles, within)
+    passed = _max_violations(emulator, state, bundles, lambda position, _: position[:, 1] < low)
     figures = {"in_the_floor": most, "through_the_hole": passed, "of": state.position.shape[1]}
-    return Line(_GROUP, "a hole in the floor", most == 0, _floats(figures), "nobody half a cell deep in the floor")
+    return Line(_GROUP, "a hole in the floor", most == 0, _floats(figures), "no particle half a cell deep in the floor")
 
 
 def _moving(emulator: Emulator, bundles: int) -> Line:
@@ -82,7 +82,8 @@ def _moving(emulator: Emulator, bundles: int) -> Line:
     first = (left, left + 3 * h)
     still = bar(scene, (first, (low, (low + high) / 2), *rest))
     block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), scene.particle_spacing)
-    state = resting(scene, block, still)
+    state = resting(scene, block, still).to(emulator.device)
+    still = state.obstacle[0]
 
     def place(bundle: int) -> float:
         return min(0.4 * bundle * h, (right - left) / 2)
@@ -95,9 +96,9 @@ def _moving(emulator: Emulator, bundles: int) -> Line:
         along = (position[:, 0] - place(bundle) - sum(first) / 2).abs() < (1.5 - 2 * _DEEP) * h
         return along & (position[:, 1] < (low + high) / 2 - h)
 
-    most = _most(emulator, state, bundles, within, swept)
+    most = _max_violations(emulator, state, bundles, within, swept)
     figures = {"in_the_bar": most, "of": state.position.shape[1]}
-    return Line(_GROUP, "a bar that moves", most == 0, _floats(figures), "nobody a cell deep in it")
+    return Line(_GROUP, "a bar that moves", most == 0, _floats(figures), "no particle a cell deep in it")
 
 
 def _inlet(emulator: Emulator, bundles: int) -> Line:
@@ -109,17 +110,17 @@ def _inlet(emulator: Emulator, bundles: int) -> Line:
     ]
     if scene.dim > 1:
         sides[1] = (scene.bounds[1][1] - 8 * h[1], scene.bounds[1][1] - 2 * h[1])
-    fresh = resting(scene, lattice(tuple(sides), scene.particle_spacing))
+    fresh = resting(scene, lattice(tuple(sides), scene.particle_spacing)).to(emulator.device)
 
     def fed(state: Particles, bundle: int) -> Particles:
-        return joined(state, fresh) if bundle % 5 == 0 and bundle else state
+        return concatenate_particles(state, fresh) if bundle % 5 == 0 and bundle else state
 
-    most = _most(emulator, fresh, bundles, lambda position, _: outside(scene, position), fed)
-    return Line(_GROUP, "an inlet", most == 0, {"lost": float(most)}, "nobody lost")
+    most = _max_violations(emulator, fresh, bundles, lambda position, _: is_lost(scene, position), fed)
+    return Line(_GROUP, "an inlet", most == 0, {"lost": float(most)}, "no particle lost")
 
 
-def joined(one: Particles, other: Particles) -> Particles:
-    """The particles of both, among the obstacles of the first."""
+def concatenate_particles(one: Particles, other: Particles) -> Particles:
+    """The particles of two states, with the obstacles of the first."""
     names = ("position", "velocity", "material", "mask")
     both = {name: torch.cat([getattr(one, name), getattr(other, name)], dim=1) for name in names}
     return dataclasses.replace(one, **both)
@@ -130,10 +131,10 @@ def bar(scene: Scene, box: tuple[Interval, ...]) -> Tensor:
     return lattice(box, scene.particle_spacing)
 
 
-def _most(
+def _max_violations(
     emulator: Emulator, state: Particles, bundles: int, forbidden: Forbidden, change: Change | None = None
 ) -> int:
-    """The most particles at a time, over all frames, that are where nobody may be, or not finite."""
+    """Largest number of particles at any frame that are in a forbidden place, or non-finite."""
     most = 0
     with torch.no_grad():
         for bundle in range(bundles):
@@ -158,7 +159,7 @@ def _block(emulator: Emulator, slab: tuple[Interval, ...], speed: float, solid: 
     scene, h = emulator.scene, emulator.grid.spacing
     box = [(low + (high - low) / 3, high - (high - low) / 3) for low, high in scene.bounds]
     box[1] = (slab[1][1] + 2 * h[1], slab[1][1] + 16 * h[1])
-    state = resting(scene, lattice(tuple(box), scene.particle_spacing), solid)
+    state = resting(scene, lattice(tuple(box), scene.particle_spacing), solid).to(emulator.device)
     down = state.velocity.new_tensor([0.0, -speed * h[1]] + [0.0] * (scene.dim - 2))
     return state.moved(state.position, state.velocity + down)
 

@@ -1,4 +1,4 @@
-"""Poison: one number that is none must be named where it comes in, and never spread."""
+"""Non-finite inputs: they must be rejected where they enter, by name."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ _GROUP = "poison"
 _BAD = (math.nan, math.inf, -math.inf)
 
 
-def poison(subject: Subject, size: Size) -> Iterator[Line]:  # noqa: ARG001 (every test of the battery is asked so)
+def poison(subject: Subject, size: Size) -> Iterator[Line]:  # noqa: ARG001 (all groups share a signature)
     """NaN and infinity in a particle, a frame, a weight, a statistic."""
-    yield _refused("a position that is no number", partial(_particle, subject, "position"))
-    yield _refused("a velocity that is no number", partial(_particle, subject, "velocity"))
-    yield _refused("a frame of a trajectory with what is no number", partial(_frame, subject))
+    yield _rejection_line("a position that is not finite", partial(_particle, subject, "position"))
+    yield _rejection_line("a velocity that is not finite", partial(_particle, subject, "velocity"))
+    yield _rejection_line("a trajectory with a frame that is not finite", partial(_frame, subject))
     if any(True for _ in subject.emulator.processor.parameters()):
-        yield _refused("a weight that is no number", partial(_weight, subject))
-    yield _refused("a statistic that is no number", partial(_statistic, subject))
+        yield _rejection_line("a weight that is not finite", partial(_weight, subject))
+    yield _rejection_line("a statistic that is not finite", partial(_statistic, subject))
 
 
-def _refused(name: str, attempt: Callable[[float], object]) -> Line:
+def _rejection_line(name: str, attempt: Callable[[float], object]) -> Line:
     passed = 0
     for bad in _BAD:
         try:
             attempt(bad)
         except DataError:
             passed += 1
-    return Line(_GROUP, name, passed == len(_BAD), {"refused": passed, "of": len(_BAD)}, "refused by name")
+    return Line(_GROUP, name, passed == len(_BAD), {"refused": passed, "of": len(_BAD)}, "rejected by name")
 
 
 def _particle(subject: Subject, what: str, bad: float) -> object:
@@ -55,14 +55,14 @@ def _frame(subject: Subject, bad: float) -> object:
 
 
 def _weight(subject: Subject, bad: float) -> object:
-    return _spoilt(subject, lambda emulator: next(iter(emulator.processor.parameters())), bad)
+    return _with_non_finite(subject, lambda emulator: next(iter(emulator.processor.parameters())), bad)
 
 
 def _statistic(subject: Subject, bad: float) -> object:
-    return _spoilt(subject, lambda emulator: emulator.output_scale, bad)
+    return _with_non_finite(subject, lambda emulator: emulator.output_scale, bad)
 
 
-def _spoilt(subject: Subject, choose: Callable[..., Tensor], bad: float) -> object:
+def _with_non_finite(subject: Subject, choose: Callable[..., Tensor], bad: float) -> object:
     emulator = copy.deepcopy(subject.emulator)
     values = choose(emulator).data
     values[(0,) * values.dim()] = bad

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout, unroll
-from nmpm.evaluation.stress.course import SOUND, apart, follow
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress.trace import INVARIANTS, rms_distance, trace_bundles
 from nmpm.particles import Particles
 from nmpm.sim import Preset
 
@@ -32,8 +32,8 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
     plain = rollout(emulator, state, frames)
     nudged = rollout(emulator, nudge(subject, state), frames)
     double = rollout(copy.deepcopy(emulator).double(), state.double(), frames)
-    own = apart(emulator.grid, state.mask, plain, nudged)
-    rounding = apart(emulator.grid, state.mask, plain, double.to(plain.dtype))
+    own = rms_distance(emulator.grid, state.mask, plain, nudged)
+    rounding = rms_distance(emulator.grid, state.mask, plain, double.to(plain.dtype))
     yield Line(
         _GROUP, "float32 beside float64", bool(rounding[-1] <= 10 * own[-1]), _at(subject, rounding, own),
         "no further apart than ten nudges of a millionth of the domain",
@@ -41,10 +41,10 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
     for dtype in (torch.bfloat16, torch.float16):
         with torch.autocast(state.position.device.type, dtype):
             half = rollout(emulator, state, frames)
-        course = follow(emulator, state, [half])
-        figures = _at(subject, apart(emulator.grid, state.mask, plain, half), own) | course.figures()
+        trace = trace_bundles(emulator, state, [half])
+        figures = _at(subject, rms_distance(emulator.grid, state.mask, plain, half), own) | trace.figures()
         name = f"{str(dtype).removeprefix('torch.')} network beside float32"
-        yield Line(_GROUP, name, course.sound, figures, SOUND)
+        yield Line(_GROUP, name, trace.valid, figures, INVARIANTS)
 
 
 def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
@@ -52,9 +52,9 @@ def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
     state, frames = subject.starts(size.scenes), 4 * subject.horizon
     emulator = subject.emulator
     pair = rollout(emulator, state, frames), rollout(emulator, nudge(subject, state), frames)
-    figures = {"growth_per_100_frames": growth(apart(emulator.grid, state.mask, *pair))}
-    if subject.simulator is not None:
-        figures["simulator_growth_per_100_frames"] = _simulator_growth(subject, subject.simulator, frames, size)
+    figures = {"growth_per_100_frames": growth(rms_distance(emulator.grid, state.mask, *pair))}
+    if subject.preset is not None:
+        figures["simulator_growth_per_100_frames"] = _simulator_growth(subject, subject.preset, frames, size)
     yield Line(_GROUP, "growth of a nudge (exponent)", None, figures)
     norms = _gradients(emulator, state.scenes(slice(1)), size.bundles)
     yield Line(

@@ -1,4 +1,4 @@
-"""The battery's outcome as a table, as JSON, and drawn."""
+"""The battery's report: a table, JSON, Markdown and a picture."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def summary(lines: Sequence[Line]) -> str:
 
 
 def as_json(subject: str, size: str, seconds: float, lines: Sequence[Line]) -> str:
-    """Everything, for machines."""
+    """The whole report as JSON."""
     plain: dict[str, Any] = {
         "model": subject,
         "size": size,

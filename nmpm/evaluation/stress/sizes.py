@@ -10,10 +10,10 @@ from torch import Tensor
 
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError
-from nmpm.evaluation.stress.course import SOUND, apart
 from nmpm.evaluation.stress.lines import Line, Size
-from nmpm.evaluation.stress.speeds import judged
-from nmpm.evaluation.stress.subject import Subject, simulated
+from nmpm.evaluation.stress.speeds import compare_window
+from nmpm.evaluation.stress.subject import Subject, simulate_window
+from nmpm.evaluation.stress.trace import INVARIANTS, rms_distance
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 
@@ -25,28 +25,27 @@ def sizes(subject: Subject, size: Size) -> Iterator[Line]:
     for times in (2, 4):
         yield _wide(subject, times, size)
     for name, factor in (("refined", 2), ("coarsened", 0.5)):
-        yield _regridded(subject, name, factor, size)
+        yield _with_cells(subject, name, factor, size)
     yield from _symmetries(subject, size)
 
 
 def _wide(subject: Subject, times: int, size: Size) -> Line:
     name = f"domain {times} × as wide"
-    preset = subject.simulator
-    if preset is not None:
-        window = simulated(preset.widened(times), subject.seeds(size.scenes), size.compared)
-        scene = preset.widened(times).scene
+    if subject.preset is not None:
+        preset = subject.preset.widened(times)
+        window, scene = simulate_window(subject, preset, size.scenes, size.compared), preset.scene
     else:
-        window, scene = Window.of(subject.starts(1)), widened(subject.emulator.scene, times)
+        window, scene = Window.of(subject.starts(1)), widen_scene(subject.emulator.scene, times)
     try:
-        wide = subject.over(subject.emulator.over(scene))
+        wide = subject.with_emulator(subject.emulator.over(scene))
     except ConfigError as error:
         return Line(_GROUP, f"{name}: {error}", None, {})
-    course, figures = judged(wide, window)
-    return Line(_GROUP, name, course.sound, figures, SOUND)
+    trace, figures = compare_window(wide, window)
+    return Line(_GROUP, name, trace.valid, figures, INVARIANTS)
 
 
-def widened(scene: Scene, times: int) -> Scene:
-    """A scene whose domain is so many times as wide, the wall layers as they were."""
+def widen_scene(scene: Scene, times: int) -> Scene:
+    """A scene whose domain is `times` as wide, with the same wall layers."""
     longer = (times - 1) * (scene.domain[0][1] - scene.domain[0][0])
     return dataclasses.replace(
         scene,
@@ -55,8 +54,8 @@ def widened(scene: Scene, times: int) -> Scene:
     )
 
 
-def _regridded(subject: Subject, name: str, factor: float, size: Size) -> Line:
-    """The same weights on cells of another size: particles then move more or fewer cells per frame than was learnt."""
+def _with_cells(subject: Subject, name: str, factor: float, size: Size) -> Line:
+    """The same weights on cells of another size: particles then move more or fewer cells per frame than in training."""
     mine = subject.emulator
     cells = [max(1, round(factor * n)) for n in mine.grid.shape]
     try:
@@ -66,8 +65,8 @@ def _regridded(subject: Subject, name: str, factor: float, size: Size) -> Line:
     if subject.preset is None:
         window = Window.of(subject.starts(1))
     else:
-        window = simulated(subject.preset, subject.seeds(size.scenes), size.compared)
-    _, figures = judged(subject.over(other), window)
+        window = simulate_window(subject, subject.preset, size.scenes, size.compared)
+    _, figures = compare_window(subject.with_emulator(other), window)
     return Line(_GROUP, f"grid {name}", None, figures)
 
 
@@ -76,7 +75,7 @@ def _symmetries(subject: Subject, size: Size) -> Iterator[Line]:
     frames = 4 * subject.horizon
     straight = rollout(subject.emulator, state, frames)
     centre = state.position.new_tensor(scene.bounds).mean(1)
-    mirror = torch.ones(scene.dim)
+    mirror = centre.new_ones(scene.dim)
     mirror[0] = -1
 
     def mirrored(values: Tensor) -> Tensor:
@@ -119,6 +118,6 @@ def _shifted(subject: Subject, state: Particles, straight: Tensor) -> Line:
 
 
 def _difference(subject: Subject, name: str, state: Particles, one: Tensor, other: Tensor) -> Line:
-    distance = apart(subject.emulator.grid, state.mask, one, other)
+    distance = rms_distance(subject.emulator.grid, state.mask, one, other)
     figures = {f"apart_cells_at_{frame}": float(distance[frame - 1]) for frame in (subject.horizon, len(distance))}
     return Line(_GROUP, name, None, figures)

@@ -1,20 +1,22 @@
-"""What is put through the battery: a trained emulator, and the simulator of its scenes where there is one."""
+"""The model under test, and the simulator of its scenes where there is one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+import torch
 
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import derived_seed, metadata_of
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.recording import Reader
 from nmpm.data.shelf import collate
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import Emulator
 from nmpm.particles import Particles, Window
-from nmpm.sim import MpmPreset, Preset
+from nmpm.sim import Preset
 
-_STREAM = 7  # apart from the seeds of the datasets
+_STREAM = 7
+"""Keeps these scenes' seeds apart from those of the datasets."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +24,11 @@ class Subject:
     """A trained emulator under test.
 
     Args:
-        name: What it is called in reports.
-        emulator: In evaluation mode.
+        name: Its name in reports.
+        emulator: In evaluation mode, on the device that the battery runs on.
         horizon: Frames that its training unrolled.
-        preset: The simulator that made its training data; None where they were recorded.
-        seed: Of the scenes.
+        preset: The simulator of its training data; None where they were recorded.
+        seed: Decides the scenes.
     """
 
     name: str
@@ -36,37 +38,37 @@ class Subject:
     seed: int = 0
 
     @property
-    def simulator(self) -> MpmPreset | None:
-        """The simulator, if its scenes can be varied."""
-        return self.preset if isinstance(self.preset, MpmPreset) else None
+    def device(self) -> torch.device:
+        """Where the battery runs."""
+        return self.emulator.device
 
     def starts(self, count: int) -> Particles:
-        """Initial states of the scenes that the model was trained for: the simulator's, else one thrown block.
+        """Initial states of scenes of the kind that the model was trained on: the simulator's, else one thrown block.
 
         Args:
             count: Scenes; without a simulator there is one.
         """
         if self.preset is not None:
-            return simulated(self.preset, self.seeds(count), 0).initial
+            return simulate_window(self, self.preset, count, 0).initial
         scene = self.emulator.scene
         few = max(1, min(1000, int(0.1 * scene.volume / scene.particle_volume)))
-        return thrown_blocks(scene, count=few, seed=self.seed)
+        return thrown_blocks(scene, count=few, seed=self.seed).to(self.device)
 
     def seeds(self, count: int) -> list[int]:
         """Seeds of scenes that no dataset holds."""
         return [derived_seed(self.seed, _STREAM, index) for index in range(count)]
 
-    def over(self, emulator: Emulator) -> Subject:
-        """The same with another emulator."""
+    def with_emulator(self, emulator: Emulator) -> Subject:
+        """The same test of another emulator."""
         return replace(self, emulator=emulator)
 
 
-def simulated(preset: Preset, seeds: Sequence[int], frames: int) -> Window:
-    """Scenes of a preset with `frames` frames after the two that an emulator starts from."""
+def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -> Window:
+    """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the subject's device."""
     longer, reader = preset.with_frames(frames + 1), Reader(metadata_of(preset), preset.scene)
-    made = [longer.simulate(seed) for seed in seeds]
-    recordings = [
-        reader.recording(Trajectory(each.position, each.particle_type, each.attributes), f"{preset.name}, seed {seed}")
-        for each, seed in zip(made, seeds, strict=True)
-    ]
-    return collate(recordings, preset.scene)
+    recordings = []
+    for seed in subject.seeds(count):
+        trajectory = longer.simulate(seed)
+        stored = Trajectory(trajectory.position, trajectory.particle_type, trajectory.attributes)
+        recordings.append(reader.recording(stored, f"{preset.name}, seed {seed}"))
+    return collate(recordings, preset.scene).to(subject.device)

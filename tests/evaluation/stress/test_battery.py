@@ -12,16 +12,24 @@ from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import beyond_walls, rollout
 from nmpm.evaluation.stress import GROUPS, Line, Size, Subject, battery
-from nmpm.evaluation.stress.course import Course, apart, energy_above_lowest, filled, follow, outside
 from nmpm.evaluation.stress.precision import growth, nudge
 from nmpm.evaluation.stress.report import as_json, summary, write
-from nmpm.evaluation.stress.sizes import widened
-from nmpm.evaluation.stress.subject import simulated
+from nmpm.evaluation.stress.sizes import widen_scene
+from nmpm.evaluation.stress.subject import simulate_window
+from nmpm.evaluation.stress.trace import Trace, energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
 from nmpm.processors import Pointwise
 from nmpm.sim import load_preset
 
 TINY = Size(
-    scenes=1, horizons=2, far=16, settling=1, settled=16, compared=8, particles=100, bundles=4
+    scenes=1,
+    horizons=2,
+    far=16,
+    settling=1,
+    settled=16,
+    compared=8,
+    particles=100,
+    bundles=4,
+    settling_multiples=(0.5, 1.0),
 )  # fmt: skip
 QUIET = Constraints(energy=True, rest_speed=0.05)
 
@@ -83,21 +91,21 @@ def test_a_course_knows_gains_losses_and_first_failures():
     steps = torch.full((2, 6, 4, 2), 1e-3)
     steps[0, 3:] = 2e-3  # four times the energy from the fourth frame on
     path = start.position.unsqueeze(1) + steps.cumsum(1)
-    course = follow(emulator, start, path.split(2, dim=1), every=2)
-    assert course.gain[0].tolist() == pytest.approx([0, 0, 0, 3, 3, 3], abs=1e-3)
-    assert course.gain[1].abs().max() < 1e-3
-    assert course.steps_to_failure() == [4, 7]
-    assert course.filled.shape == (2, 3)
-    assert not course.sound
-    assert course.speed[1].tolist() == pytest.approx([math.sqrt(2) * 1e-3 / emulator.grid.spacing[0]] * 6, rel=1e-3)
+    trace = trace_bundles(emulator, start, path.split(2, dim=1), every=2)
+    assert trace.gain[0].tolist() == pytest.approx([0, 0, 0, 3, 3, 3], abs=1e-3)
+    assert trace.gain[1].abs().max() < 1e-3
+    assert trace.steps_to_failure() == [4, 7]
+    assert trace.filled.shape == (2, 3)
+    assert not trace.valid
+    assert trace.speed[1].tolist() == pytest.approx([math.sqrt(2) * 1e-3 / emulator.grid.spacing[0]] * 6, rel=1e-3)
 
 
 def test_who_is_outside_or_nowhere_is_lost():
     scene = box()
     position = torch.tensor([[0.5, 0.5], [0.95, 0.5], [0.5, 0.0], [float("nan"), 0.5], [0.08, 0.92]])
-    assert outside(scene, position).tolist() == [False, True, True, True, False]
+    assert is_lost(scene, position).tolist() == [False, True, True, True, False]
     assert beyond_walls(scene, position).tolist() == [False, True, True, False, False]
-    assert not outside(box(boundary=("periodic", "wall")), position[1])
+    assert not is_lost(box(boundary=("periodic", "wall")), position[1])
 
 
 def test_energy_is_that_of_a_stone():
@@ -112,8 +120,8 @@ def test_clumped_particles_fill_less():
     scene = box(particle_volume=0.01**2)
     emulator = emulator_of(scene)
     state = resting(scene, lattice(((0.3, 0.6), (0.3, 0.6)), 0.01))
-    apart = filled(emulator, state, state.position).item()
-    together = filled(emulator, state, 0.45 + 0.5 * (state.position - 0.45)).item()
+    apart = filled_volume(emulator, state, state.position).item()
+    together = filled_volume(emulator, state, 0.45 + 0.5 * (state.position - 0.45)).item()
     assert apart == pytest.approx(1.0, abs=0.05)
     assert together == pytest.approx(0.25, abs=0.1)  # its rim spreads over the cells beside
 
@@ -132,13 +140,13 @@ def test_a_nudge_is_a_millionth_of_the_domain():
 
 def test_scenes_of_a_subject_are_its_simulators():
     subject = goop()
-    window = simulated(subject.preset, subject.seeds(2), 5)
+    window = simulate_window(subject, subject.preset, 2, 5)
     assert window.target.shape[1] == 5
     torch.testing.assert_close(window.initial.position, subject.starts(2).position)
 
 
 def test_a_wider_scene_has_the_same_wall_layers():
-    wide = widened(box(), 3)
+    wide = widen_scene(box(), 3)
     assert wide.domain[0] == pytest.approx((0.08, 0.92 + 2 * 0.84))
     assert wide.domain[0][1] - wide.bounds[0][1] == pytest.approx(0.02)
     assert wide.bounds[1] == (0.1, 0.9)
@@ -175,9 +183,9 @@ def test_lattice_fills_a_box():
 def test_what_fails_is_not_hidden_by_a_mean():
     gain = torch.tensor([[0.0, 0.0], [0.0, 0.5]])
     none = torch.zeros(2, 2)
-    course = Course(gain, none, none, none, torch.zeros(2, 1, 2))
-    assert course.steps_to_failure() == [3, 2]
-    assert course.figures()["energy_gain_percent"] == 50.0
+    trace = Trace(gain, none, none, none, torch.zeros(2, 1, 2))
+    assert trace.steps_to_failure() == [3, 2]
+    assert trace.figures()["energy_gain_percent"] == 50.0
 
 
 def test_one_in_the_way_of_a_model_without_walls_is_left_out():
@@ -203,5 +211,5 @@ def test_how_far_apart_two_rollouts_are_is_in_cells_and_of_real_particles():
     other = one.clone()
     other[:, 1, 0, 0] += 2 * emulator.grid.spacing[0]
     other[1, :, 1] = float("nan")
-    values = apart(emulator.grid, mask, one, other).tolist()
+    values = rms_distance(emulator.grid, mask, one, other).tolist()
     assert values == pytest.approx([0.0, 2 * math.sqrt(2 / 3), 0.0], rel=1e-5)

@@ -1,4 +1,4 @@
-"""What happens along a rollout: energy, speed, escapes and volume, frame by frame, kept without the positions."""
+"""Measures along a rollout, frame by frame, kept without the positions: energy, speed, lost particles, volume."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 
-SOUND = f"nobody lost, energy never more than {MOST_GAIN:.0%} above the start"
-"""What `Course.sound` says, in words."""
+INVARIANTS = f"no particle lost, energy never more than {MOST_GAIN:.0%} above the start"
+"""The invariants of `Trace.valid`, in words."""
 
 
 @dataclass(frozen=True)
-class Course:
+class Trace:
     """The measures of a rollout of B scenes over T frames.
 
     Args:
         gain: (B, T) kinetic and potential energy above the start's, over the start's.
         speed: (B, T) of the fastest particle, in cells per frame.
-        lost: (B, T) particles that are outside of the domain or nowhere.
-        filled: (B, V) volume that the particles fill over their own, at the V frames at which `follow` measures it.
+        lost: (B, T) number of particles outside of the domain, or non-finite.
+        filled: (B, V) volume that the particles fill over their own, at the V frames at which it is measured.
         last: (B, N, D) positions at the end.
     """
 
@@ -49,8 +49,8 @@ class Course:
         return (self.lost > 0) | (self.gain > MOST_GAIN) | self.gain.isnan()
 
     @property
-    def sound(self) -> bool:
-        """Whether no invariant is ever broken."""
+    def valid(self) -> bool:
+        """Whether the invariants hold at every frame."""
         return not bool(self.failures.any())
 
     def steps_to_failure(self) -> list[int]:
@@ -59,7 +59,7 @@ class Course:
         return torch.where(self.failures.any(1), first, self.frames + 1).tolist()
 
     def figures(self) -> dict[str, float]:
-        """What a line of the battery reports."""
+        """The figures that a line of the battery reports."""
         return {
             "energy_gain_percent": 100 * float(self.gain.max()),
             "lost": float(self.lost.max()),
@@ -67,8 +67,8 @@ class Course:
         }
 
 
-def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], every: int = 0) -> Course:
-    """Measure a rollout as it is made.
+def trace_bundles(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], every: int = 0) -> Trace:
+    """Measure a rollout bundle by bundle.
 
     Args:
         emulator: Gives scene and grid.
@@ -84,22 +84,24 @@ def follow(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], ever
     for bundle in bundles:
         path = torch.cat([last.unsqueeze(1), bundle], dim=1)
         steps = path.diff(dim=1)
-        gains.append((energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=_tiny(scene)))
+        gains.append(
+            (energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=_negligible_energy(scene))
+        )
         speeds.append(_largest((steps / spacing).norm(dim=-1), real))
-        losses.append((outside(scene, bundle) & real.unsqueeze(1)).sum(-1))
+        losses.append((is_lost(scene, bundle) & real.unsqueeze(1)).sum(-1))
         last = bundle[:, -1]
         if every and (frame + bundle.shape[1]) // every > frame // every:
-            volumes.append(filled(emulator, start, last))
+            volumes.append(filled_volume(emulator, start, last))
         frame += bundle.shape[1]
     none = start.position.new_zeros(len(real), 0)
     gain, speed, lost = (torch.cat(parts, dim=1) if parts else none for parts in (gains, speeds, losses))
     volume = torch.stack(volumes, dim=1) if volumes else none
-    return Course(gain, speed, lost, volume, last)
+    return Trace(gain, speed, lost, volume, last)
 
 
-def run(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Course:
-    """Roll out, keeping no positions but the last, and measure as `follow` does."""
-    return follow(emulator, start, stream(emulator, start, frames), every)
+def trace_rollout(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Trace:
+    """Roll out and measure, keeping the last positions only."""
+    return trace_bundles(emulator, start, stream(emulator, start, frames), every)
 
 
 def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
@@ -123,12 +125,12 @@ def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, veloci
     return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)
 
 
-def outside(scene: Scene, position: Tensor) -> Tensor:
+def is_lost(scene: Scene, position: Tensor) -> Tensor:
     """Whether positions (..., D) are beyond the domain's walls, or not finite."""
     return beyond_walls(scene, position) | ~position.isfinite().all(-1)
 
 
-def apart(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
+def rms_distance(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
     """Root mean square distance of the same particles in two rollouts, over all scenes.
 
     Args:
@@ -144,7 +146,7 @@ def apart(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
     return (torch.where(mask.unsqueeze(1), squared, 0.0).sum((0, 2)) / mask.sum()).sqrt()
 
 
-def filled(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
+def filled_volume(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
     """(B,) volume of what the particles fill over their own volume: less than at the start where they clump.
 
     A cell counts with the share of it that particles fill, and a crowded one as full.
@@ -163,6 +165,6 @@ def _largest(values: Tensor, real: Tensor) -> Tensor:
     return torch.where(real.unsqueeze(1), values, 0.0).amax(-1)
 
 
-def _tiny(scene: Scene) -> float:
-    """An energy that nobody would see: of a speed of a millionth of the domain per frame."""
+def _negligible_energy(scene: Scene) -> float:
+    """A negligible energy: that of a speed of a millionth of the domain per frame."""
     return 0.5 * (1e-6 * max(high - low for low, high in scene.domain)) ** 2
