@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from nmpm.advection import Advection, Flight
-from nmpm.constraints import Constraints, energy, equal_shares
+from nmpm.constraints import Constraints, energy, mass_shares
 from nmpm.decoders import Decoder, Residual
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
@@ -105,9 +105,7 @@ class Emulator(nn.Module):
         self.register_buffer("input_high", torch.full((inputs, *column), UNLIMITED))
         self.register_buffer("output_scale", torch.ones(frames, outputs, *column))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
-        limits = torch.tensor(scene.bounds, dtype=torch.float64)
-        lower, spacing = torch.tensor(self.grid.lower).double(), torch.tensor(self.grid.spacing).double()
-        self.register_buffer("bounds", ((limits.T - lower) / spacing).float(), persistent=False)
+        self.register_buffer("bounds", self.grid.bounds_in_cells(scene), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
 
     @property
@@ -183,7 +181,8 @@ class Emulator(nn.Module):
         if not self.constraints.energy or self.training:
             return None
         cells, velocity, gravity = self.in_cells(particles)
-        return energy(*self.grid.alike(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
+        share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
+        return energy(*self.grid.isotropic_units(cells, velocity, gravity), share)
 
     def normalised(self, state: Tensor) -> Tensor:
         """What the processor sees of a grid state (B, C_in, *S) in grid units."""
@@ -212,9 +211,9 @@ class Emulator(nn.Module):
             advection = self.advection
             smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried(velocity, smoothed)
-            share = equal_shares(particles.mask, cells.dtype)
-            flight = Flight(cells, carried, gravity, particles.material, fields, share)
-            path = advection.free(flight) if self.training else advection.constrained(flight, solid, budget)
+            share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
+            flight = Flight(cells, velocity, carried, gravity, particles.material, fields, share)
+            path = advection.free_path(flight) if self.training else advection.constrained_path(flight, solid, budget)
             steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
             precision = particles.position.dtype
             return Bundle(
