@@ -143,7 +143,8 @@ class Advection:
         for chunk in chunks(path.shape[2], path.device):
             part, own = flight.part(chunk), path[:, :, chunk]
             steps = own.diff(dim=1, prepend=part.cells.unsqueeze(1))
-            parts.append(energy(*self.grid.isotropic_units(own, steps, flight.gravity), part.share))
+            own, steps, gravity = self.grid.isotropic_units(own, steps, flight.gravity)
+            parts.append(energy(own, steps, gravity, part.share))
         return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
 
     def _limited(self, flight: Flight, budget: Tensor) -> Tensor:
@@ -157,8 +158,8 @@ class Advection:
             moved = [self._moved(part, field, cells[:, own], velocity[:, own], frame) for part, own in parts]
             proposed = torch.cat(moved, dim=1) if len(moved) > 1 else moved[0]
             step = proposed - cells
-            units = self.grid.isotropic_units(cells, step, before, flight.gravity)
-            factor = affordable(*units, flight.share, budget)
+            place, way, last, gravity = self.grid.isotropic_units(cells, step, before, flight.gravity)
+            factor = affordable(place, way, last, gravity, flight.share, budget)
             arrived = torch.where(factor < 1, self._confined(cells + factor * step), proposed)
             velocity = before = arrived - cells
             cells = arrived

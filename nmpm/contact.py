@@ -206,7 +206,8 @@ def _inward(depth: Depth, places: Tensor) -> Tensor:
 
 def _length(steps: Tensor) -> Tensor:
     """(...) lengths of steps (..., D), without gradient; 0 for those that are not finite, as they have no pieces."""
-    return steps.detach().norm(dim=-1).nan_to_num(0.0, 0.0, 0.0)
+    lengths: Tensor = steps.detach().norm(dim=-1)
+    return lengths.nan_to_num(0.0, 0.0, 0.0)
 
 
 def _pieces(lengths: Tensor) -> Tensor:

@@ -180,9 +180,9 @@ class Emulator(nn.Module):
         """The energy (B,) that a rollout from this state is held to; None where it is not."""
         if not self.constraints.energy or self.training:
             return None
-        cells, velocity, gravity = self.in_cells(particles)
+        cells, velocity, gravity = self.grid.isotropic_units(*self.in_cells(particles))
         share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
-        return energy(*self.grid.isotropic_units(cells, velocity, gravity), share)
+        return energy(cells, velocity, gravity, share)
 
     def normalised(self, state: Tensor) -> Tensor:
         """What the processor sees of a grid state (B, C_in, *S) in grid units."""

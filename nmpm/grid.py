@@ -122,10 +122,8 @@ class Grid:
 
         Computed in float64, which not every device has, on the CPU.
         """
-        limits, lower, spacing = (
-            torch.tensor(values, dtype=torch.float64, device="cpu")
-            for values in (scene.bounds, self.lower, self.spacing)
-        )
+        known = (scene.bounds, self.lower, self.spacing)
+        limits, lower, spacing = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in known)
         return ((limits.T - lower) / spacing).float().to(torch.get_default_device())
 
     def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:

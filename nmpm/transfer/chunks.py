@@ -1,4 +1,4 @@
-"""Chunks of particles, so that temporary memory is bounded and time stays linear; and when code may read values back."""
+"""Chunks of particles, so that temporary memory is bounded and time linear; and when code may read values back."""
 
 from __future__ import annotations
 
