@@ -1,4 +1,4 @@
-"""Errors of rollouts, as torchmetrics that add up over batches and processes.
+"""Errors of rollouts, as torchmetrics that accumulate over batches and processes.
 
 *MSE at h*: the mean over predicted frames 1 … h, particles that move and dimensions, of the squared position error, in
 domain length squared, from a rollout that starts with frames 0 and 1; *full* is h = T - 2. Averaged over trajectories.
@@ -42,7 +42,8 @@ class RolloutError(Metric):
             target: (B, T, N, D), likewise.
             mask: (B, N) bool, particles that count.
         """
-        squared = (predicted.double() - target.double()).square().mean(-1) * mask.unsqueeze(1)
+        # Each frame in the positions' precision, as not every device has float64; sums over frames follow in `curves`.
+        squared = (predicted - target).square().mean(-1) * mask.unsqueeze(1)
         per_frame = squared.sum(-1) / mask.sum(-1, keepdim=True)
         self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
         self.lengths.append(  # type: ignore[union-attr]  # (likewise)
@@ -50,11 +51,11 @@ class RolloutError(Metric):
         )
 
     def curves(self) -> list[Tensor]:
-        """One (T,) curve of squared error against frame for each trajectory."""
+        """One (T,) curve of squared error against frame for each trajectory, on the CPU."""
         if not len(self.lengths):
             return []
         lengths: list[int] = dim_zero_cat(self.lengths).tolist()
-        return list(dim_zero_cat(self.squared).split(lengths))
+        return list(dim_zero_cat(self.squared).cpu().split(lengths))
 
     def per_trajectory(self) -> list[dict[str, float]]:
         """MSE at each horizon that the trajectory reaches, and over the full rollout ("mse")."""
@@ -83,35 +84,35 @@ class EarthMover(Metric):
     """
 
     full_state_update = False
-    total: Tensor
-    count: Tensor
+    distances: list[Tensor] | Tensor  # one tensor once gathered from several processes
 
     def __init__(self, every: int = 10) -> None:
         super().__init__()
         self.every = every
-        self.add_state("total", default=torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", default=torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
+        self.add_state("distances", default=[], dist_reduce_fx="cat")
 
     def update(self, predicted: Tensor, target: Tensor, mask: Tensor, material: Tensor) -> None:
-        """Take in rollouts: (B, T, N, D) positions, (B, N) mask and material."""
-        for ours, theirs, real, kinds in zip(predicted, target, mask, material, strict=True):
-            frames = slice(self.every - 1, None, self.every)
-            distances = [
-                earth_mover(ours[frames][:, real & (kinds == kind)], theirs[frames][:, real & (kinds == kind)])
-                for kind in kinds[real].unique()
-            ]
-            self.total += float(np.mean(distances))
-            self.count += 1
+        """Take in rollouts: (B, T, N, D) positions, (B, N) mask and material. Computed on the CPU."""
+        frames = slice(self.every - 1, None, self.every)
+        on_cpu = (values.cpu() for values in (predicted[:, frames], target[:, frames], mask, material))
+        means = []
+        for ours, theirs, real, kinds in zip(*on_cpu, strict=True):
+            each = [real & (kinds == kind) for kind in kinds[real].unique()]
+            means.append(np.mean([earth_mover(ours[:, chosen], theirs[:, chosen]) for chosen in each]))
+        found = torch.tensor(means, dtype=torch.float32, device=predicted.device)
+        self.distances.append(found)  # type: ignore[union-attr]  # (a list until gathered)
 
     def compute(self) -> dict[str, Tensor]:
-        """The mean over trajectories, by the name "emd"; nothing where no trajectory was seen."""
-        return {"emd": (self.total / self.count).float()} if self.count else {}
+        """The mean over trajectories, by the name "emd"; nothing if there were none."""
+        if not len(self.distances):
+            return {}
+        return {"emd": dim_zero_cat(self.distances).cpu().double().mean().float()}
 
 
 def earth_mover(ours: Tensor, theirs: Tensor) -> float:
-    """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of as many particles."""
+    """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size."""
     values = []
-    for left, right in zip(ours.double().cpu().numpy(), theirs.double().cpu().numpy(), strict=True):
+    for left, right in zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), strict=True):
         cost = cdist(left, right)
         values.append(cost[linear_sum_assignment(cost)].mean())
     return float(np.mean(values))
