@@ -11,7 +11,6 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Self
 
 import torch
@@ -110,17 +109,27 @@ class Grid:
         """Displacements (..., D) in cells → domain length."""
         return per_axis(operator.mul, cells, self.spacing)
 
-    def alike(self, cells: Tensor, velocity: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The same (..., D) in units of the first axis' cells: cells need not be square, energies need one unit."""
+    def isotropic_units(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """Convert (..., D) values in cells to widths of the first axis' cells: energies need one unit for all axes."""
         first, *others = self.spacing
         if all(abs(other / first - 1) < 1e-6 for other in others):
-            return cells, velocity, gravity
-        scaled = partial(per_axis, operator.mul, numbers=[spacing / first for spacing in self.spacing])
-        return scaled(cells), scaled(velocity), scaled(gravity)
+            return values
+        ratios = [spacing / first for spacing in self.spacing]
+        return tuple(per_axis(operator.mul, value, ratios) for value in values)
+
+    def bounds_in_cells(self, scene: Scene) -> Tensor:
+        """(2, D) lowest and highest positions of a scene, in cells, float32 on torch's default device.
+
+        Computed in float64, which not every device has, on the CPU.
+        """
+        known = (scene.bounds, self.lower, self.spacing)
+        limits, lower, spacing = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in known)
+        return ((limits.T - lower) / spacing).float().to(torch.get_default_device())
 
     def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Cell centres along an axis, (n,), in domain length."""
-        return self.lower[axis] + (torch.arange(self.shape[axis], dtype=dtype) + 0.5) * self.spacing[axis]
+        """Cell centres along an axis, (n,), in domain length, on the CPU."""
+        index = torch.arange(self.shape[axis], dtype=dtype, device="cpu")
+        return self.lower[axis] + (index + 0.5) * self.spacing[axis]
 
 
 def per_axis(operation: Callable[[Tensor, float], Tensor], values: Tensor, numbers: Sequence[float]) -> Tensor:

@@ -1,8 +1,7 @@
-"""What a dataset's scenes have in common: where particles may be, what they are made of, what varies.
+"""The fixed facts of a dataset's scenes: bounds, domain, materials, gravity, and which of them vary.
 
-A `Scene` says which grid channels a model needs and nothing else does: a scene of one material in a box has a
-velocity, a volume fraction and a wall channel; gravity becomes channels only where it varies, obstacles only where
-there are any.
+A `Scene` alone decides the grid channels of a model: a scene of one material in a box has a velocity, a volume fraction
+and a wall channel; gravity becomes channels only where it varies, obstacles only where there are any.
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ class Scene:
         gravity: External acceleration in length per second squared; None where it is not known.
         gravity_varies: Whether each trajectory has its own gravity, so that the model must be told.
         obstacles: Whether there are particles that do not move.
+        densities: Mass density of each material, in kg per length ** dim; all the same when left out.
 
     Raises:
         ConfigError: if the facts contradict each other.
@@ -48,6 +48,7 @@ class Scene:
     gravity: tuple[float, ...] | None = None
     gravity_varies: bool = False
     obstacles: bool = False
+    densities: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.boundary:
@@ -72,6 +73,10 @@ class Scene:
             raise ConfigError(f"dt = {self.dt} and particle_volume = {self.particle_volume} must be positive.")
         if not self.materials or len(set(self.materials)) != len(self.materials):
             raise ConfigError(f"A scene needs at least one material, each named once; got {self.materials}.")
+        if self.densities and len(self.densities) != len(self.materials):
+            raise ConfigError(f"Scene.densities = {self.densities} needs one entry for each of {self.materials}.")
+        if not all(0 < density < math.inf for density in self.densities):
+            raise ConfigError(f"Scene.densities = {self.densities} must be positive and finite.")
 
     @property
     def dim(self) -> int:
@@ -85,12 +90,12 @@ class Scene:
 
     @property
     def walled(self) -> bool:
-        """Whether the domain shows a solid: a wall layer or obstacles."""
+        """Whether the grid has a solid channel: for a wall layer or obstacles."""
         return self.obstacles or self.bounds != self.domain
 
     @property
     def gravity_known(self) -> bool:
-        """Whether the gravity that states carry is the scene's, not zero for want of knowledge."""
+        """Whether states carry the scene's gravity; otherwise theirs is zero because it is unknown."""
         return self.gravity is not None or self.gravity_varies
 
     @property
@@ -115,7 +120,7 @@ class Scene:
 
     @property
     def output_channels(self) -> tuple[str, ...]:
-        """Names of the velocity channels the processor gives for each frame, in order."""
+        """Names of the velocity channels that the processor predicts for each frame, in order."""
         return self.input_channels[: self.dim * len(self.materials)]
 
     def material_index(self, name: str) -> int:
@@ -129,9 +134,10 @@ class Scene:
         return self.materials.index(name)
 
     def differences(self, other: Scene) -> tuple[str, ...]:
-        """The facts in which a model's scene and that of its data may not differ, and do.
+        """Names of the facts that differ between a model's scene and its data's, and may not.
 
-        Names of materials are only names; volumes of particles, which may be estimates, count beyond a twentieth.
+        Names of materials and their densities are not compared; volumes of particles, which may be estimates, are
+        compared to 5%.
         """
         facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles")
         found = [name for name in facts if getattr(self, name) != getattr(other, name)]
@@ -142,13 +148,15 @@ class Scene:
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """The scene as plain lists, strings and numbers."""
+        """The scene as plain lists, strings and numbers; without densities if there are none, as in older files."""
         plain = dataclasses.asdict(self)
+        if not self.densities:
+            del plain["densities"]
         return {key: to_lists(value) for key, value in plain.items()}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
-        """The scene that `to_dict` described.
+        """The scene described by `to_dict`.
 
         Raises:
             ConfigError: if a key is unknown or missing.

@@ -2,6 +2,7 @@
 
     class TestMine(ProcessorContract):
         recipe = Mine(width=8)
+        device = "cuda"  # "cpu" when left out
 
 They need pytest, which the package itself does not.
 """
@@ -9,6 +10,7 @@ They need pytest, which the package itself does not.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -26,36 +28,42 @@ class ProcessorContract:
     Args:
         recipe: The processor under test.
         shapes: Grids that it takes, among them odd and elongated ones.
+        device: Where it is tested.
     """
 
     recipe: ClassVar[Processor]
+    device: ClassVar[str] = "cpu"
     shapes: ClassVar[tuple[tuple[int, ...], ...]] = ((16, 16), (13, 21), (16, 8, 11))
 
     def network(self, shape: tuple[int, ...], inputs: int = 4, frames: int = 3) -> GridProcessor:
         """A network for walls all around, with reproducible weights."""
         torch.manual_seed(0)
-        return self.recipe.build(GridLayout(inputs, len(shape), frames, (False,) * len(shape)))
+        return self.recipe.build(GridLayout(inputs, len(shape), frames, (False,) * len(shape))).to(self.device)
+
+    def grid(self, *shape: int) -> Tensor:
+        """Random values (B, C, *S), drawn on the CPU, so that they are the same on all devices."""
+        return torch.randn(shape).to(self.device)
 
     def test_output_shape(self) -> None:
         for shape in self.shapes:
             for inputs, frames in ((1, 1), (5, 3)):
-                out = self.network(shape, inputs, frames)(torch.randn(2, inputs, *shape))
+                out = self.network(shape, inputs, frames)(self.grid(2, inputs, *shape))
                 assert out.shape == (2, frames, len(shape), *shape)
                 assert out.isfinite().all()
 
     def test_scenes_of_a_batch_do_not_see_each_other(self) -> None:
         for shape in self.shapes:
-            network, grid = self.network(shape).eval(), torch.randn(3, 4, *shape)
+            network, grid = self.network(shape).eval(), self.grid(3, 4, *shape)
             torch.testing.assert_close(network(grid)[1:2], network(grid[1:2]), rtol=1e-4, atol=1e-5)
 
     def test_is_deterministic(self) -> None:
         for shape in self.shapes:
-            network, grid = self.network(shape).eval(), torch.randn(2, 4, *shape)
+            network, grid = self.network(shape).eval(), self.grid(2, 4, *shape)
             assert torch.equal(network(grid), network(grid))
 
     def test_gradient_reaches_every_parameter_and_the_input(self) -> None:
         for shape in self.shapes:
-            network, grid = self.network(shape), torch.randn(2, 4, *shape, requires_grad=True)
+            network, grid = self.network(shape), self.grid(2, 4, *shape).requires_grad_()
             network(grid).square().sum().backward()
             silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
             assert not silent
@@ -65,26 +73,26 @@ class ProcessorContract:
     def test_takes_tiny_and_huge_inputs(self) -> None:
         for scale in (0.0, 1e-20, 1e6):
             for shape in self.shapes:
-                assert self.network(shape)(scale * torch.randn(1, 4, *shape)).isfinite().all()
+                assert self.network(shape)(scale * self.grid(1, 4, *shape)).isfinite().all()
 
     def test_half_precision_stays_near_full_precision(self) -> None:
         for shape in self.shapes:
-            network, grid = self.network(shape).eval(), torch.randn(2, 4, *shape)
+            network, grid = self.network(shape).eval(), self.grid(2, 4, *shape)
             full = network(grid)
-            with torch.autocast("cpu", torch.bfloat16):
+            with torch.autocast(self.device, torch.bfloat16):
                 half = network(grid).float()
             assert (half - full).abs().max() < 0.05 * full.abs().max() + 1e-6
 
     def test_exports_as_a_program_that_computes_the_same(self) -> None:
         for shape in self.shapes:
-            network, grid = self.network(shape).eval(), torch.randn(1, 4, *shape)
+            network, grid = self.network(shape).eval(), self.grid(1, 4, *shape)
             program = torch.export.export(network, (grid,)).module()
             torch.testing.assert_close(program(grid), network(grid), rtol=1e-5, atol=1e-6)
 
     def test_memory_format_does_not_matter(self) -> None:
         for shape in self.shapes:
             if len(shape) == 2:
-                network, grid = self.network(shape).eval(), torch.randn(2, 4, *shape)
+                network, grid = self.network(shape).eval(), self.grid(2, 4, *shape)
                 plain = network(grid)
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
                 last = network(grid.contiguous(memory_format=torch.channels_last))
@@ -92,11 +100,11 @@ class ProcessorContract:
 
     def test_weights_survive_saving(self) -> None:
         shape = self.shapes[0]
-        first, grid = self.network(shape).eval(), torch.randn(1, 4, *shape)
+        first, grid = self.network(shape).eval(), self.grid(1, 4, *shape)
         state = {name: value.clone() for name, value in first.state_dict().items()}
         assert all(isinstance(value, Tensor) for value in state.values())
         torch.manual_seed(1)
-        second = self.recipe.build(GridLayout(4, len(shape), 3, (False,) * len(shape))).eval()
+        second = self.recipe.build(GridLayout(4, len(shape), 3, (False,) * len(shape))).to(self.device).eval()
         second.load_state_dict(state)
         assert torch.equal(first(grid), second(grid))
 
@@ -110,9 +118,11 @@ class TransferContract:
     Args:
         transfer: The transfer under test.
         one_kernel: Whether p2g and g2p use the same kernel, so that they are adjoint.
+        device: Where it is tested; it must have float64.
     """
 
     transfer: ClassVar[Transfer]
+    device: ClassVar[str] = "cpu"
     one_kernel: ClassVar[bool] = True
     grids: ClassVar[tuple[Grid, ...]] = (
         Grid((9, 14), (0.0, 0.0), (0.1, 0.2), (False, False)),
@@ -124,26 +134,30 @@ class TransferContract:
         """(2, N, D) positions in the domain, at least `margin` cells from its faces."""
         generator = torch.Generator().manual_seed(0)
         unit = torch.rand(2, count, grid.dim, generator=generator, dtype=torch.float64)
-        return margin + unit * (torch.tensor(grid.shape) - 2 * margin)
+        return (margin + unit * (torch.tensor(grid.shape) - 2 * margin)).to(self.device)
+
+    def random(self, *shape: int) -> Tensor:
+        """Random values, drawn on the CPU, so that they are the same on all devices."""
+        return torch.randn(shape, dtype=torch.float64).to(self.device)
 
     def edges(self, grid: Grid) -> Tensor:
         """(1, N, D) positions on faces, corners, cell borders and outside."""
         n = torch.tensor(grid.shape, dtype=torch.float64)
         zero = torch.zeros_like(n)
         places = [zero, n, n / 2, n.floor() / 2, zero + 0.5, n - 0.5, zero - 1e-9, n + 1e-9, zero - 1e6, n + 1e6]
-        return torch.stack(places)[None]
+        return torch.stack(places)[None].to(self.device)
 
     def test_p2g_conserves_what_it_scatters(self) -> None:
         for grid in self.grids:
             for cells in (self.cells(grid), self.edges(grid)):
-                values = torch.randn(*cells.shape[:2], 3, dtype=torch.float64)
+                values = self.random(*cells.shape[:2], 3)
                 total = self.transfer.p2g(values, cells, grid).flatten(2).sum(-1)
                 torch.testing.assert_close(total, values.sum(1), rtol=1e-12, atol=1e-12)
 
     def test_g2p_of_a_constant_is_that_constant_everywhere(self) -> None:
         for grid in self.grids:
             for cells in (self.cells(grid), self.edges(grid)):
-                field = torch.full((len(cells), 1, *grid.shape), 3.7, dtype=torch.float64)
+                field = cells.new_full((len(cells), 1, *grid.shape), 3.7)
                 gathered = self.transfer.g2p(field, cells, grid)
                 torch.testing.assert_close(gathered, torch.full_like(gathered, 3.7), rtol=1e-12, atol=1e-12)
 
@@ -151,7 +165,7 @@ class TransferContract:
         for grid in self.grids:
             cells = self.cells(grid, margin=1.5)
             for axis in range(grid.dim):
-                centre = torch.arange(grid.shape[axis], dtype=torch.float64) + 0.5
+                centre = torch.arange(grid.shape[axis], dtype=torch.float64, device=self.device) + 0.5
                 shape = [1] * grid.dim
                 shape[axis] = -1
                 field = (2 * centre - 1).reshape(1, 1, *shape).expand(2, 1, *grid.shape)
@@ -163,8 +177,8 @@ class TransferContract:
             return
         for grid in self.grids:
             cells = self.cells(grid)
-            values = torch.randn(2, cells.shape[1], 2, dtype=torch.float64)
-            field = torch.randn(2, 2, *grid.shape, dtype=torch.float64)
+            values = self.random(2, cells.shape[1], 2)
+            field = self.random(2, 2, *grid.shape)
             on_grid = (self.transfer.p2g(values, cells, grid) * field).sum()
             on_particles = (values * self.transfer.g2p(field, cells, grid)).sum()
             assert math.isclose(on_grid, on_particles, rel_tol=1e-10, abs_tol=1e-10)
@@ -172,17 +186,17 @@ class TransferContract:
     def test_order_of_particles_does_not_matter(self) -> None:
         for grid in self.grids:
             cells = self.cells(grid)
-            values = torch.randn(2, cells.shape[1], 1, dtype=torch.float64)
-            order = torch.randperm(cells.shape[1])
+            values = self.random(2, cells.shape[1], 1)
+            order = torch.randperm(cells.shape[1]).to(self.device)
             one = self.transfer.p2g(values, cells, grid)
             other = self.transfer.p2g(values[:, order], cells[:, order], grid)
             torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
     def test_periodic_axes_wrap(self) -> None:
         for grid in self.grids:
-            shift = 3.0 * torch.tensor(grid.shape) * torch.tensor(grid.periodic)
+            shift = (3.0 * torch.tensor(grid.shape) * torch.tensor(grid.periodic)).to(self.device)
             cells = self.cells(grid)
-            field = torch.randn(2, 2, *grid.shape, dtype=torch.float64)
+            field = self.random(2, 2, *grid.shape)
             one, other = self.transfer.g2p(field, cells, grid), self.transfer.g2p(field, cells + shift, grid)
             torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
 
@@ -190,14 +204,15 @@ class TransferContract:
         for grid in self.grids:
             cells = self.cells(grid, margin=0.6, count=3)
             fixed = cells.clone()
-            field = torch.randn(2, 1, *grid.shape, dtype=torch.float64)
-            values = torch.randn(2, 3, 1, dtype=torch.float64)
+            field = self.random(2, 1, *grid.shape)
+            values = self.random(2, 3, 1)
             for tensor in (cells, field, values):
                 tensor.requires_grad_()
-            assert torch.autograd.gradcheck(lambda c, f, g=grid: self.transfer.g2p(f, c, g), (cells, field))
-            assert torch.autograd.gradcheck(lambda v, c=fixed, g=grid: self.transfer.p2g(v, c, g), (values,))
+            check = partial(torch.autograd.gradcheck, nondet_tol=1e-10)  # a GPU adds in no fixed order
+            assert check(lambda c, f, g=grid: self.transfer.g2p(f, c, g), (cells, field))
+            assert check(lambda v, c=fixed, g=grid: self.transfer.p2g(v, c, g), (values,))
             if self.one_kernel:
-                assert torch.autograd.gradcheck(lambda c, v=values, g=grid: self.transfer.p2g(v, c, g), (cells,))
+                assert check(lambda c, v=values, g=grid: self.transfer.p2g(v, c, g), (cells,))
 
     def test_survives_as_plain_data(self) -> None:
         assert from_spec(to_spec(self.transfer), Transfer) == self.transfer

@@ -46,6 +46,16 @@ def test_volume_is_that_of_the_bounds_and_spacing_that_of_a_lattice():
 def test_survives_as_plain_data():
     scene = dataclasses.replace(BOX, boundary=("periodic", "wall"), obstacles=True)
     assert Scene.from_dict(scene.to_dict()) == scene
+    assert "densities" not in scene.to_dict()  # as in files from before there were any
+    weighed = dataclasses.replace(BOX, densities=(1000.0,))
+    assert weighed.to_dict()["densities"] == [1000.0]
+    assert Scene.from_dict(weighed.to_dict()) == weighed
+
+
+def test_densities_change_neither_channels_nor_what_a_model_suits():
+    weighed = dataclasses.replace(BOX, densities=(1000.0,))
+    assert weighed.input_channels == BOX.input_channels
+    assert weighed.differences(BOX) == ()
 
 
 @pytest.mark.parametrize(
@@ -58,6 +68,10 @@ def test_survives_as_plain_data():
         ({"materials": ("goop", "goop")}, "once"),
         ({"boundary": ("wall", "mirror")}, "mirror"),
         ({"particle_volume": float("nan")}, "particle_volume"),
+        ({"densities": (1.0, 2.0)}, "densities"),
+        ({"densities": (0.0,)}, "positive and finite"),
+        ({"densities": (float("inf"),)}, "positive and finite"),
+        ({"densities": (float("nan"),)}, "positive and finite"),
     ],
 )
 def test_contradictions_are_named(changes, complaint):

@@ -1,6 +1,7 @@
-"""How particles move through a bundle, once the network has said what the grid's velocities are.
+"""Advection: moves the particles through a bundle with the grid velocities that the network predicts.
 
-All in grid units: positions in cells, velocities in cells per frame.
+All in grid units: positions in cells, velocities in cells per frame. Nothing is read back from the device, except with
+the bounds' rule "error", once per bundle.
 """
 
 from __future__ import annotations
@@ -12,38 +13,47 @@ import torch
 from torch import Tensor
 
 from nmpm.decoders import Decoder
-from nmpm.emulator.constraints import BOUNDS, Constraints, affordable, at_rest, energy, otherwise_if
+from nmpm.emulator.constraints import (
+    BOUNDS,
+    Constraints,
+    affordable,
+    at_rest,
+    check_within_bounds,
+    energy,
+)
 from nmpm.emulator.contact import Contact
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
-from nmpm.transfer.pieces import pieces
+from nmpm.transfer.chunks import can_branch, chunks
 
 
 @dataclass(frozen=True)
 class Flight:
-    """What one bundle's frames start from.
+    """The state at the start of a bundle and the fields predicted for it.
 
     Args:
         cells: (B, N, D) positions.
+        velocity: (B, N, D) the particles' own velocities.
         carried: (B, N, D) velocities that the decoder lets particles keep.
         gravity: (B, 1, D), what a frame adds to a velocity.
         material: (B, N) indices into the scene's materials.
         fields: (B, m, materials * D, *S), what the network predicts.
-        share: (B, N) weights of the particles in sums over a scene, 0 for padding.
+        share: (B, N, 1) each particle's share of its scene's mass, 0 for padding.
     """
 
     cells: Tensor
+    velocity: Tensor
     carried: Tensor
     gravity: Tensor
     material: Tensor
     fields: Tensor
     share: Tensor
 
-    def part(self, piece: slice) -> Flight:
-        """The same for a piece of the particles."""
-        own = {name: getattr(self, name)[:, piece] for name in ("cells", "carried", "material", "share")}
-        return dataclasses.replace(self, **own)
+    def part(self, chunk: slice) -> Flight:
+        """The same for some of the particles."""
+        names = ("cells", "velocity", "carried", "material", "share")
+        return dataclasses.replace(self, **{name: getattr(self, name)[:, chunk] for name in names})
 
 
 @dataclass(frozen=True)
@@ -51,13 +61,13 @@ class Advection:
     """Moves the particles of one family of scenes over one grid.
 
     Args:
-        scene: Says which axes are periodic, which materials there are, and whether obstacles can be.
+        scene: Gives periodic axes, materials, and whether there can be obstacles.
         grid: Where the predicted velocities live.
-        transfer: How they come to the particles.
-        decoder: What they mean.
-        constraints: What no frame may do.
+        transfer: Interpolates them at the particles.
+        decoder: Makes velocities of them.
+        constraints: What paths must obey.
         bounds: (2, D), the lowest and highest positions.
-        walls: (1, C_solid, *S), what of each cell is wall.
+        walls: (1, C_solid, *S), the share of each cell that is wall.
     """
 
     scene: Scene
@@ -68,30 +78,31 @@ class Advection:
     bounds: Tensor
     walls: Tensor
 
-    def free(self, flight: Flight) -> Tensor:
-        """(B, m, N, D) positions by the network's velocities alone, within the walls."""
-        parts = [self._path(flight.part(piece)) for piece in pieces(flight.cells.shape[1], flight.cells.device)]
-        return torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
+    def free_path(self, flight: Flight) -> Tensor:
+        """(B, m, N, D) positions by the network's velocities alone, within the bounds.
 
-    def constrained(self, flight: Flight, solid: Tensor, budget: Tensor | None) -> Tensor:
-        """(B, m, N, D) positions as the constraints let them be.
+        Raises:
+            DataError: as `constrained_path`.
+        """
+        return self._checked(self._free(flight))
+
+    def constrained_path(self, flight: Flight, solid: Tensor, budget: Tensor | None) -> Tensor:
+        """(B, m, N, D) positions that obey the constraints.
 
         Args:
             flight: What to start from.
-            solid: (B, C_solid, *S), what of each cell is wall or obstacle.
+            solid: (B, C_solid, *S), the share of each cell that is wall or obstacle.
             budget: (B,) energy that no frame may exceed; None for no such limit.
+
+        Raises:
+            DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
         """
-        path = self._clear(flight, self.free(flight), solid)
-        if budget is not None:
-            steps = path.diff(dim=1, prepend=flight.cells.unsqueeze(1))
-            spent = energy(*self.grid.alike(path, steps, flight.gravity), flight.share)
-            # Seldom: then all frames once more, each within it.
-            excess = (spent > budget.unsqueeze(1)).any()
-            path = otherwise_if(excess, lambda: self._clear(flight, self._path(flight, budget), solid), path)
+        path = self._free(flight) if budget is None else self._within_energy(flight, budget)
+        path = self._clear_of_obstacles(flight, path, solid)
         if self.constraints.rest_speed:
             still = at_rest(flight.cells, path, self.constraints.rest_speed, flight.gravity)
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
-        return path
+        return self._checked(path)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
@@ -103,22 +114,66 @@ class Advection:
         own: Tensor = split.gather(2, chosen).squeeze(2)
         return own
 
-    def _path(self, flight: Flight, budget: Tensor | None = None) -> Tensor:
-        """(B, m, N, D) positions, within an energy (B,) if one is given."""
+    def _free(self, flight: Flight) -> Tensor:
+        parts = [self._path(flight.part(chunk)) for chunk in chunks(flight.cells.shape[1], flight.cells.device)]
+        return torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
+
+    def _path(self, flight: Flight) -> Tensor:
+        """(B, m, N, D) positions, frame by frame."""
         cells, velocity, path = flight.cells, flight.carried, []
         fields = flight.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
         for frame, field in enumerate(fields, start=1):
-            known = self.decoder.known(flight.carried, velocity, flight.gravity, frame)
-            step = known + self.gather(field, cells, flight.material)
-            if budget is not None:
-                step = step * affordable(*self.grid.alike(cells, step, flight.gravity), flight.share, budget)
-            arrived = self._confined(cells + step)
-            velocity = arrived - cells
+            arrived = self._moved(flight, field, cells, velocity, frame)
+            velocity, cells = arrived - cells, arrived
+            path.append(cells)
+        return torch.stack(path, dim=1)
+
+    def _moved(self, flight: Flight, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
+        """(B, N, D) positions after a frame, from cells (B, N, D) and the velocity (B, N, D) of the frame before."""
+        known = self.decoder.known(flight.carried, velocity, flight.gravity, frame)
+        return self._confined(cells + (known + self.gather(field, cells, flight.material)))
+
+    def _within_energy(self, flight: Flight, budget: Tensor) -> Tensor:
+        """(B, m, N, D) positions of which no frame exceeds an energy (B,).
+
+        On a CPU the free path is tried first: it rarely exceeds the energy, and is the same to the bit if it does not.
+        """
+        if can_branch(budget):
+            path = self._free(flight)
+            if not bool((self._energies(flight, path) > budget.unsqueeze(1)).any()):
+                return path
+        return self._limited(flight, budget)
+
+    def _energies(self, flight: Flight, path: Tensor) -> Tensor:
+        """(B, m) energy of each frame of a path (B, m, N, D)."""
+        parts = []
+        for chunk in chunks(path.shape[2], path.device):
+            part, own = flight.part(chunk), path[:, :, chunk]
+            steps = own.diff(dim=1, prepend=part.cells.unsqueeze(1))
+            own, steps, gravity = self.grid.isotropic_units(own, steps, flight.gravity)
+            parts.append(energy(own, steps, gravity, part.share))
+        return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
+
+    def _limited(self, flight: Flight, budget: Tensor) -> Tensor:
+        """(B, m, N, D) positions, each frame within an energy (B,): all particles advance together, as they share it.
+
+        Chunks only bound the memory of interpolation.
+        """
+        cells, velocity, before, path = flight.cells, flight.carried, flight.velocity, []
+        parts = [(flight.part(chunk), chunk) for chunk in chunks(cells.shape[1], cells.device)]
+        for frame, field in enumerate(flight.fields.unbind(1), start=1):
+            moved = [self._moved(part, field, cells[:, own], velocity[:, own], frame) for part, own in parts]
+            proposed = torch.cat(moved, dim=1) if len(moved) > 1 else moved[0]
+            step = proposed - cells
+            place, way, last, gravity = self.grid.isotropic_units(cells, step, before, flight.gravity)
+            factor = affordable(place, way, last, gravity, flight.share, budget)
+            arrived = torch.where(factor < 1, self._confined(cells + factor * step), proposed)
+            velocity = before = arrived - cells
             cells = arrived
             path.append(cells)
         return torch.stack(path, dim=1)
 
-    def _clear(self, flight: Flight, path: Tensor, solid: Tensor) -> Tensor:
+    def _clear_of_obstacles(self, flight: Flight, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), clear of obstacles."""
         if not (self.constraints.solids and self.scene.obstacles):
             return path
@@ -127,12 +182,20 @@ class Advection:
         return self._confined(Contact(share, self.grid).hold(flight.cells, path))
 
     def _confined(self, cells: Tensor) -> Tensor:
-        """Within the walls; periodic axes go on (positions there are unwrapped, transfers wrap)."""
+        """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""
         if all(self.scene.periodic):
             return cells
-        low, high = self.bounds
+        low, high = self.bounds.unbind(0)
         rule = BOUNDS[self.constraints.bounds]
         if not any(self.scene.periodic):
             return rule(cells, low, high)
-        wraps = torch.tensor(self.scene.periodic, device=cells.device)
-        return torch.where(wraps, cells, rule(torch.where(wraps, (low + high) / 2, cells), low, high))
+        columns = [
+            column if wraps else rule(column, low[axis], high[axis])
+            for axis, (column, wraps) in enumerate(zip(cells.unbind(-1), self.scene.periodic, strict=True))
+        ]
+        return torch.stack(columns, dim=-1)
+
+    def _checked(self, path: Tensor) -> Tensor:
+        if self.constraints.bounds == "error":
+            check_within_bounds(path, self.bounds, self.scene.periodic)
+        return path

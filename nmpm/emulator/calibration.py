@@ -13,13 +13,13 @@ from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Window
 
-_LEEWAY = 0.5
-"""Of the range seen, on either side: what the network is shown beyond it, the sample being only a sample."""
+_MARGIN = 0.5
+"""Inputs are clipped to the sampled range, widened by this fraction of it on either side."""
 
 
 @dataclass(frozen=True)
 class _Inputs:
-    """The grid states of a sample: how many cells there are, and (C,) figures of what is in them."""
+    """Statistics of a sample's grid states, on the CPU: the number of cells, and (C,) figures of their values."""
 
     cells: int
     mean: Tensor
@@ -30,7 +30,7 @@ class _Inputs:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """What is left of the true velocities of one material: of how many particles, and (m, D) its mean square."""
+    """What the decoder leaves of one material's true velocities, on the CPU: (m, D) mean square over particles."""
 
     particles: int
     square: Tensor
@@ -40,24 +40,26 @@ class _Unknowns:
 def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     """Set the normalisation statistics from training windows of at least m + 2 frames.
 
-    Inputs get mean and standard deviation per channel over all cells, and the limits beyond which the network is shown
-    the limit; outputs the root mean square of what is left of the true velocities once the decoder's known part is
-    taken out, per frame of the bundle and component. Where several processes train together, all of them call this,
-    each with windows of its own, and get the statistics of all windows.
+    Inputs get mean and standard deviation per channel over all cells, and the limits to which they are clipped; outputs
+    the root mean square of what is left of the true velocities once the decoder's known part is taken out, per frame of
+    the bundle and component. Where several processes train together, all of them call this, each with windows of its
+    own, and get the statistics of all windows. The windows may be on any device.
 
     Raises:
         ValueError: if there is no window or one is too short.
     """
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
-    inputs = _pooled(all_gather(_inputs(emulator, windows)))
+    device = emulator.input_mean.device
+    windows = [window.to(device) for window in windows]
+    inputs = _combined(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
     spread = inputs.high - inputs.low
-    leeway = torch.where(spread > 1e-12, _LEEWAY * spread, UNLIMITED)
-    emulator.input_low.copy_((inputs.low - leeway).reshape_as(emulator.input_low))
-    emulator.input_high.copy_((inputs.high + leeway).reshape_as(emulator.input_high))
+    margin = torch.where(spread > 1e-12, _MARGIN * spread, UNLIMITED)
+    emulator.input_low.copy_((inputs.low - margin).reshape_as(emulator.input_low))
+    emulator.input_high.copy_((inputs.high + margin).reshape_as(emulator.input_high))
     materials = zip(*all_gather(_unknowns(emulator, windows)), strict=True)
     scale = torch.cat([_root_mean_square(parts) for parts in materials], dim=-1)
     emulator.output_scale.copy_(_nonzero(scale).reshape_as(emulator.output_scale))
@@ -68,11 +70,12 @@ def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:
     state = torch.cat([_state(emulator, window) for window in windows])
     axes = (0, *range(2, state.dim()))
     cells = state.numel() // state.shape[1]
-    return _Inputs(cells, state.mean(axes), state.std(axes), state.amin(axes), state.amax(axes))
+    figures = (state.mean(axes), state.std(axes), state.amin(axes), state.amax(axes))
+    return _Inputs(cells, *(values.cpu() for values in figures))  # processes have devices of their own
 
 
-def _pooled(parts: Sequence[_Inputs]) -> _Inputs:
-    """Several samples as one."""
+def _combined(parts: Sequence[_Inputs]) -> _Inputs:
+    """The statistics of several samples together."""
     if len(parts) == 1:
         return parts[0]
     cells = sum(part.cells for part in parts)
@@ -95,13 +98,13 @@ def _state(emulator: Emulator, window: Window) -> Tensor:
 
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
-    """For each material, the part of the velocity that the network has to give."""
+    """For each material, the part of the velocity that the network has to predict."""
     unknown = [_unknown(emulator, window) for window in windows]
     found = []
     for index in range(len(emulator.scene.materials)):
         chosen = [window.mask & (window.material == index) for window in windows]
         values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(unknown, chosen, strict=True)])
-        found.append(_Unknowns(len(values), values.square().mean(0)))
+        found.append(_Unknowns(len(values), values.square().mean(0).cpu()))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Networks compiled by torch.compile where that works, left as they are where it does not."""
+"""Compiling networks by torch.compile where that works."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def compile_network(network: GridProcessor, grid: Tensor) -> bool:
 
     Args:
         network: What to compile.
-        grid: (B, C_in, *S), an input as it will be, to try it with.
+        grid: (B, C_in, *S), an example of the input, to try it with.
 
     Returns:
-        Whether it is compiled: no compiler, or a network that cannot be traced, leaves it as it was.
+        Whether it is compiled. Without a compiler, or if the network cannot be traced, it stays as it was.
     """
     network.compile()
     try:
         with torch.no_grad():
             network(grid)
-    except Exception as error:  # (what a compiler may raise is nobody's contract)
+    except Exception as error:  # (compilers document no exceptions)
         network._compiled_call_impl = None
         _LOG.warning("The network is not compiled: %s", str(error).splitlines()[0][:200])
         return False

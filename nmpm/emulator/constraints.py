@@ -1,15 +1,15 @@
-"""What a rollout may not do, whatever the network says.
+"""Constraints: facts about the scenes that rollouts obey whatever the network predicts.
 
-Each rule is a fact about the scenes, to be switched on where it holds. But for the bounds, none acts in training, which
-has to see the network's own mistakes.
+Each is switched on where it holds. Except for the bounds, none acts in training, which has to see the network's own
+errors. Nothing here reads values back from the device, except `check_within_bounds`.
 
 All quantities are in grid units: cells, cells per frame. Energies may be in any unit of length that is the same along
-each axis, as cells need not be.
+each axis, as cells need not be square.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -22,55 +22,71 @@ from nmpm.scene import Scene
 MOST_GAIN = 0.01
 """Share of the initial energy, counted from `lowest_potential`, that may be gained where nothing is fed in."""
 
+FREE_FALL_SHARE = 0.8
+"""A particle falls freely if it is accelerated by at least this share of gravity."""
 
-FREELY = 0.8
-"""Share of gravity's acceleration from which on a particle counts as falling."""
+_UNLIMITED = 1e18  # energy: stands for an infinite budget, whose gradient would be NaN
+
+BoundsRule = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""From positions and the bounds' lower and upper ends, which broadcast, to positions."""
 
 
 def stop(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """What gets beyond the bounds is stopped there."""
+    """Stop positions beyond the bounds there."""
     return torch.maximum(torch.minimum(cells, high), low)
 
 
 def reflect(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """What gets beyond the bounds is mirrored back, as by an elastic wall; stopped if that is beyond the other side."""
+    """Mirror positions beyond the bounds, as an elastic wall does; stop those that this takes beyond the other side."""
     mirrored = torch.where(cells < low, 2 * low - cells, torch.where(cells > high, 2 * high - cells, cells))
     return stop(mirrored, low, high)
 
 
-def refuse(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """What gets beyond the bounds by less than a cell is stopped there, as rounding errors are; more is an error.
+def stop_within_a_cell(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Stop positions that are beyond the bounds by at most a cell; leave the others for `check_within_bounds`."""
+    return torch.where((cells < low - 1) | (cells > high + 1), cells, stop(cells, low, high))
+
+
+BOUNDS: Mapping[str, BoundsRule] = MappingProxyType({"stop": stop, "reflect": reflect, "error": stop_within_a_cell})
+"""Rules for positions beyond the bounds, by name. With "error", `check_within_bounds` is called once per bundle."""
+
+
+def check_within_bounds(path: Tensor, bounds: Tensor, periodic: Sequence[bool]) -> None:
+    """Raise an error if a bundle leads more than a cell beyond the bounds. Reads one value back from the device.
+
+    Args:
+        path: (B, m, N, D) in cells.
+        bounds: (2, D) lowest and highest positions.
+        periodic: Whether each axis wraps, and so has no bounds.
 
     Raises:
-        DataError: naming the first particle.
+        DataError: naming scene, particle and frame of the first such position.
     """
-    beyond = ((cells < low - 1) | (cells > high + 1)).any(-1)
-    if beyond.any():
-        scene, particle = map(int, beyond.nonzero()[0])
-        raise DataError(
-            f"Scene {scene} of the batch, particle {particle}: predicted at {cells[scene, particle].tolist()} cells,"
-            f" more than one beyond {low.tolist()} … {high.tolist()}; constraints.bounds = stop would hold it there."
-        )
-    return stop(cells, low, high)
-
-
-BOUNDS: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = MappingProxyType(
-    {"stop": stop, "reflect": reflect, "error": refuse}
-)
-"""What happens to positions (B, N, D) beyond the bounds (D,), by name."""
+    low, high = bounds.unbind(0)
+    walls = [axis for axis, wraps in enumerate(periodic) if not wraps]
+    sides = [(path[..., axis] < low[axis] - 1) | (path[..., axis] > high[axis] + 1) for axis in walls]
+    beyond = torch.stack(sides).any(0) if sides else None
+    if beyond is None or not bool(beyond.any()):
+        return
+    frame, scene, particle = map(int, beyond.transpose(0, 1).nonzero()[0])
+    raise DataError(
+        f"Scene {scene} of the batch, particle {particle}: predicted at {path[scene, frame, particle].tolist()} cells"
+        f" in frame {frame + 1} of the bundle, more than one beyond {low.tolist()} … {high.tolist()};"
+        " constraints.bounds = stop would hold it there."
+    )
 
 
 @dataclass(frozen=True)
 class Constraints:
-    """Facts that rollouts are held to.
+    """The constraints of an emulator's rollouts.
 
     Args:
         energy: Kinetic and potential energy never exceed those of the rollout's first state: nothing feeds the scene,
             neither moving walls nor inlets, and its gravity is known.
-        rest_speed: What moves less than so many cells per frame, on average over a bundle, and does not fall freely,
-            stays where it is. To be set to the speed that the model sees in material that is at rest.
-        solids: Nobody gets into obstacles.
-        bounds: What happens to what would leave the scene's bounds, one of `BOUNDS`; in training too.
+        rest_speed: Particles that move fewer cells per frame than this, on average over a bundle, and do not fall
+            freely, stay where they are. Set it to the speed that the model predicts in material that is at rest.
+        solids: Particles do not enter obstacles.
+        bounds: Rule for particles that would leave the scene's bounds, one of `BOUNDS`; in training too.
 
     Raises:
         ConfigError: if the speed is negative, or the bounds' rule unknown.
@@ -89,13 +105,13 @@ class Constraints:
 
 
 def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> Tensor:
-    """Mean kinetic and potential energy per mass of each scene, up to a constant.
+    """Kinetic and potential energy per mass of each scene, up to a constant.
 
     Args:
         cells: (B, ..., N, D).
         velocity: (B, ..., N, D).
         gravity: (B, 1, D).
-        share: (B, N, 1), each particle's part of the mean.
+        share: (B, N, 1), each particle's share of the scene's mass, from `mass_shares`.
 
     Returns:
         (B, ...).
@@ -107,10 +123,24 @@ def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> T
     return (each * share.reshape(batch, *extra, count, 1)).sum((-2, -1))
 
 
-def equal_shares(mask: Tensor, dtype: torch.dtype) -> Tensor:
-    """(B, N, 1): each real particle's part of a scene's mean, all of a mass; mask (B, N) bool."""
-    real = mask.to(dtype)
-    return (real / real.sum(-1, keepdim=True).clamp(min=1)).unsqueeze(-1)
+def mass_shares(scene: Scene, material: Tensor, mask: Tensor, dtype: torch.dtype) -> Tensor:
+    """Each particle's share of its scene's mass, zero for padding; all particles have the same volume.
+
+    Args:
+        scene: Gives the materials' densities; without them all particles have the same mass.
+        material: (B, N) index of each particle's material.
+        mask: (B, N) bool, False for padding.
+        dtype: Of the result.
+
+    Returns:
+        (B, N, 1), summing to one over the particles of a scene that has any.
+    """
+    mass = mask.to(dtype)
+    if len(set(scene.densities)) > 1:
+        for index, density in enumerate(scene.densities):
+            mass = torch.where(material == index, mass * (density / max(scene.densities)), mass)
+    total = mass.sum(-1, keepdim=True)
+    return (mass / torch.where(total > 0, total, 1.0)).unsqueeze(-1)
 
 
 def lowest_potential(scene: Scene, gravity: Tensor) -> Tensor:
@@ -123,38 +153,78 @@ def lowest_potential(scene: Scene, gravity: Tensor) -> Tensor:
     Returns:
         (B,) in length² per frame².
     """
-    low, high = gravity.new_tensor(scene.bounds).T
-    return -torch.maximum(gravity * low, gravity * high).sum(-1)
+    sides = zip(gravity.unbind(-1), scene.bounds, strict=True)
+    return -torch.stack([torch.maximum(along * low, along * high) for along, (low, high) in sides]).sum(0)
 
 
-def affordable(cells: Tensor, step: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
-    """By what factor a scene's steps of a frame may be taken without exceeding its energy.
+def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
+    """Factors for the particles' steps in a frame with which their scene does not exceed its energy.
 
-    With the factor s the energy after the frame is a parabola in s; the largest s in [0, 1] within the budget is taken.
+    With a factor s for some of the steps the energy after the frame is a parabola in s; the largest s in [0, 1] within
+    the budget is taken. In a scene that exceeds its budget s applies to the particles that gain energy in this frame;
+    if that cannot suffice, to all. In other scenes all factors are exactly 1.
 
     Args:
-        cells: (B, N, D) where from.
-        step: (B, N, D) steps proposed.
+        cells: (B, N, D) positions before the frame.
+        step: (B, N, D) proposed steps.
+        before: (B, N, D) steps of the frame before.
         gravity: (B, 1, D).
-        share: (B, N, 1).
+        share: (B, N, 1), each particle's share of its scene's mass.
         budget: (B,) energy that is allowed.
 
     Returns:
-        (B, 1, 1).
+        (B, N, 1).
     """
-    square = (step.square() * share).sum((-2, -1)) / 2
-    slope = -(step * gravity * share).sum((-2, -1))
-    excess = -(cells * gravity * share).sum((-2, -1)) - budget
-    root = (slope.square() - 4 * square * excess).clamp(min=0).sqrt()
-    tiny = torch.finfo(step.dtype).tiny
-    factor = ((root - slope) / (2 * square).clamp(min=tiny)).clamp(0, 1)
-    return factor[:, None, None]
+    kinetic = step.square().sum(-1, keepdim=True) / 2
+    work = (step * gravity).sum(-1, keepdim=True)
+    height = -(cells * gravity).sum(-1, keepdim=True)
+    terms = torch.cat([kinetic, -work, height], dim=-1) * share
+    gains = _gains(cells, step, before, work)
+    square, slope, rest = terms.sum(1).unbind(-1)
+    excess = (rest - budget).clamp(min=-_UNLIMITED)  # of the scene if nobody moved
+    fixed = torch.where(gains, 0.0, terms)[..., :2].sum((1, 2))
+    own_square, own_slope, _ = torch.where(gains, terms, 0.0).sum(1).unbind(-1)
+    own = _largest_root(own_square, own_slope, excess + fixed)
+    every = _largest_root(square, slope, excess)
+    lowest = _lowest(square, slope)
+    exceeds = square + slope + excess > 0
+    suffices = (own >= 0) & (own <= 1)
+    everybody = torch.where(every.isnan(), lowest, every).clamp(0, 1)
+    factor = torch.where(suffices, own, everybody)[:, None, None]
+    applies = exceeds[:, None, None] & (gains | ~suffices[:, None, None])
+    return torch.where(applies, factor, 1.0)
+
+
+def _gains(cells: Tensor, step: Tensor, before: Tensor, work: Tensor) -> Tensor:
+    """(B, N, 1): whether a particle gains energy by a step, beyond the rounding of positions that steps come from.
+
+    Without the large terms that cancel: v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
+    """
+    gain = ((step - before) * (step + before)).sum(-1, keepdim=True) / 2 - work
+    rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs().sum(-1, keepdim=True)
+    return gain > rounding
+
+
+def _largest_root(square: Tensor, slope: Tensor, constant: Tensor) -> Tensor:
+    """(B,) largest s with square · s² + slope · s + constant = 0; NaN where there is none or `square` vanishes."""
+    tiny = torch.finfo(square.dtype).tiny
+    inner = slope.square() - 4 * square * constant
+    moves = square > tiny**0.5  # so that neither the quotient nor its gradient overflows
+    root = (inner.clamp(min=tiny).sqrt() - slope) / torch.where(moves, 2 * square, 1.0)
+    return torch.where(moves & (inner >= 0), root, torch.nan)
+
+
+def _lowest(square: Tensor, slope: Tensor) -> Tensor:
+    """(B,) the s at which square · s² + slope · s is lowest, 0 where `square` vanishes."""
+    moves = square > torch.finfo(square.dtype).tiny ** 0.5
+    return torch.where(moves, -slope / torch.where(moves, 2 * square, 1.0), 0.0)
 
 
 def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tensor:
-    """Which particles move too little in a bundle to be more than the model's error.
+    """Whether particles move no more in a bundle than the model's error.
 
-    What falls freely is not at rest, however little it moves: at the top of its flight it would be held in the air.
+    A particle in free fall is not at rest, however little it moves: at the top of its flight it would be held in the
+    air.
 
     Args:
         start: (B, N, D) where the bundle starts.
@@ -172,18 +242,5 @@ def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tenso
     half = frames // 2
     middle = path[:, half - 1]
     gained = (path[:, -1] - middle) / (frames - half) - (middle - start) / half
-    falling = (gained * gravity).sum(-1) > FREELY * frames / 2 * gravity.square().sum(-1)
+    falling = (gained * gravity).sum(-1) > FREE_FALL_SHARE * frames / 2 * gravity.square().sum(-1)
     return still & ~falling
-
-
-def otherwise_if(condition: Tensor, otherwise: Callable[[], Tensor], path: Tensor) -> Tensor:
-    """A path, or another one that is only computed if a condition holds; an exported program computes both.
-
-    Args:
-        condition: () bool.
-        otherwise: Gives the other path, of the same shape.
-        path: (B, m, N, D).
-    """
-    if torch.compiler.is_exporting():  # a program has no branches that depend on its data
-        return torch.where(condition, otherwise(), path)
-    return otherwise() if condition else path

@@ -1,29 +1,39 @@
-"""Contact: particles do not get into obstacles, however fast they are and whatever the network says.
+"""Contact: particles do not enter obstacles, however fast they are and whatever the network predicts.
 
 An obstacle is where the solid fraction of the grid, interpolated linearly, exceeds `SURFACE`. A path stops before it
-gets deeper than that, and goes on straight along the surface as far as it can; what an obstacle has moved over is
-pushed out. Paths are looked at in pieces of at most half a cell, so that nobody jumps over a wall of one cell. Only
-steps of more than 32 cells, and slides of more in a bundle, fall into longer ones, lest one runaway costs all memory.
+gets deeper than that, and goes on straight along the surface as far as it can; particles that an obstacle has moved
+over are pushed out. Frames are sampled in pieces of at most half a cell, so that nothing jumps over a wall of one cell.
+Only steps of more than 32 cells, and slides of more in a bundle, fall into longer pieces, which bounds time and memory.
+
+There are two forms of the same arithmetic. On a CPU only particles that touch an obstacle are treated, in as many
+pieces as the fastest needs. Elsewhere branching on values would halt the device: all particles are treated, in the
+largest number of pieces, with masks. In both, a scene's result does not depend on the others of the batch.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from nmpm.grid import Grid
+from nmpm.transfer.chunks import can_branch, chunks
 from nmpm.transfer.linear import linear_g2p, linear_stencil
 
 SURFACE = 0.4
 """Solid fraction at an obstacle's surface: walls of one cell reach 0.5 at least, wherever they lie between nodes."""
 
 _PIECE = 0.5  # cells
-_MOST_PIECES = 64
-_WAYS_OUT = (0.5, 1.0, 1.5, 2.0)  # cells: the first that leads out of an obstacle is taken
+_MAX_PIECES = 64
+_EVEN = 1e-5  # solid fraction per cell: smaller slopes are rounding, and point anywhere
+_WAYS_OUT = 4  # places that are tried to get out of an obstacle, `_PIECE` cells from one to the next
+
+Depth = Callable[[Tensor], Tensor]
+"""Solid fraction (n, K) at places (n, K, D): each particle's places in its own scene."""
 
 
 @dataclass(frozen=True)
@@ -48,65 +58,69 @@ class Contact:
         Returns:
             (B, m, N, D): the path itself for particles that keep clear of obstacles.
         """
+        return self.hold_touching(start, path) if can_branch(start) else self.hold_all(start, path)
+
+    def hold_touching(self, start: Tensor, path: Tensor) -> Tensor:
+        """`hold` for a CPU: treats the particles that touch, and returns the same tensor if there are none."""
         steps = path.diff(dim=1, prepend=start.unsqueeze(1))
-        pieces = _pieces(steps)
-        inside = self._depths(start) > SURFACE
+        pieces = _pieces(_length(steps).amax(1))
+        inside = self._scene_depth(start) > SURFACE
         touching = inside.clone()
-        for piece in range(pieces):
-            places = (path - steps * (piece / pieces)).flatten(1, 2)
-            touching |= (self._depths(places).unflatten(1, path.shape[1:3]) > SURFACE).any(1)
-        if not touching.any():
+        for piece in range(_largest(pieces)):
+            share = (piece / pieces).clamp(max=1).view(-1, 1, 1, 1)
+            places = (path - steps * share).flatten(1, 2)
+            touching |= (self._scene_depth(places).unflatten(1, path.shape[1:3]) > SURFACE).any(1)
+        if not bool(touching.any()):
             return path
         scene, particle = touching.nonzero().unbind(1)
-        mine, begin = path[scene, :, particle], start[scene, particle]
-        held, stuck = self._slid(scene, begin, mine, pieces), inside[scene, particle]
-        if stuck.any():
-            held = held.clone()
-            held[stuck] = self._pushed_out(scene[stuck], begin[stuck], path.shape[1])
+        depth, own = partial(self._depth, scene), pieces[scene]
+        mine, begin, stuck = path[scene, :, particle], start[scene, particle], inside[scene, particle]
+        touch = _touch(depth, begin, mine, own, _largest(pieces))
+        longest = path.new_zeros(len(path)).scatter_reduce(0, scene, _length(touch.along), "amax")
+        finer = _pieces(longest.unsqueeze(1))[scene]
+        held = _slid(depth, mine, touch, own, finer, _largest(finer))
+        if bool(stuck.any()):
+            held[stuck] = _pushed_out(partial(self._depth, scene[stuck]), begin[stuck], path.shape[1])
         path = path.clone()
         path[scene, :, particle] = held
         return path
 
-    def _slid(self, scene: Tensor, start: Tensor, path: Tensor, pieces: int) -> Tensor:
-        """(n, m, D): paths of particles of scenes (n,) up to where they touch, and along the surface from there.
+    def hold_all(self, start: Tensor, path: Tensor) -> Tensor:
+        """`hold` without reading values back: treats all particles, in chunks that bound the memory."""
+        batch, frames, count, _ = path.shape
+        if not count:
+            return path
+        pieces = _pieces(_length(path.diff(dim=1, prepend=start.unsqueeze(1))).amax(1))
+        parts = chunks(count, path.device, values=batch * frames * _MAX_PIECES)
+        touches, rows = [], []
+        for part in parts:
+            begin, mine = start[:, part].flatten(0, 1), path[:, :, part].transpose(1, 2).flatten(0, 1)
+            own = _spread(pieces, len(begin))
+            touch = _touch(self._depth_of_all, begin, mine, own, _MAX_PIECES)
+            inside = (self._depth_of_all(begin.unsqueeze(1)) > SURFACE).squeeze(1)
+            rows.append((begin, mine, own, inside))
+            touches.append(touch)
+        lengths = [
+            torch.where(inside | touch.hits, _length(touch.along), 0.0).view(batch, -1).amax(1, keepdim=True)
+            for (*_, inside), touch in zip(rows, touches, strict=True)
+        ]
+        finer = _pieces(torch.cat(lengths, dim=1))
+        paths = []
+        for (begin, mine, own, inside), touch in zip(rows, touches, strict=True):
+            held = _slid(self._depth_of_all, mine, touch, own, _spread(finer, len(begin)), _MAX_PIECES)
+            out = _pushed_out(self._depth_of_all, begin, frames)
+            held = torch.where(inside[:, None, None], out, torch.where(touch.hits[:, None, None], held, mine))
+            paths.append(held.unflatten(0, (batch, -1)).transpose(1, 2))
+        return torch.cat(paths, dim=2)
 
-        What is left of the way at the touch loses its part into the solid, and is gone straight, evenly over the frames
-        left, until the surface bends into it.
-        """
-        count, frames, _ = path.shape
-        before = torch.cat([start.unsqueeze(1), path[:, :-1]], dim=1)
-        shares = torch.arange(1, pieces + 1, device=path.device, dtype=path.dtype) / pieces
-        points = (before.unsqueeze(2) + (path - before).unsqueeze(2) * shares[:, None]).flatten(1, 2)
-        free = (self._depth(scene, points) <= SURFACE).cumprod(1).sum(1)  # pieces before the first that is too deep
-        row = torch.arange(count, device=path.device)
-        touch = torch.where((free > 0).unsqueeze(-1), points[row, free - 1], start)
-        blocked = points[row, free.clamp(max=points.shape[1] - 1)]
-        rest = path[:, -1] - touch
-        inward = self._inward(scene, blocked)
-        along = rest - (rest * inward).sum(-1, keepdim=True).clamp(min=0) * inward
-        finer = _pieces(along)
-        ahead = torch.arange(1, finer + 1, device=path.device, dtype=path.dtype) / finer
-        depth = self._depth(scene, touch.unsqueeze(1) + along.unsqueeze(1) * ahead[:, None])
-        share = (depth <= SURFACE).cumprod(1).sum(1) / finer
-        passed = torch.arange(1, frames + 1, device=path.device) * pieces - free.unsqueeze(1)
-        time = passed / (frames * pieces - free).clamp(min=1).unsqueeze(1)
-        onward = touch.unsqueeze(1) + along.unsqueeze(1) * torch.minimum(time, share.unsqueeze(1)).unsqueeze(-1)
-        return torch.where((passed <= 0).unsqueeze(-1), path, onward)
-
-    def _pushed_out(self, scene: Tensor, start: Tensor, frames: int) -> Tensor:
-        """(n, m, D): straight out of the obstacle, as far as needed or to where it is least deep."""
-        ways = torch.tensor((0.0, *_WAYS_OUT), device=start.device, dtype=start.dtype)
-        places = start.unsqueeze(1) - self._inward(scene, start).unsqueeze(1) * ways[:, None]
-        depth = self._depth(scene, places)
-        out = (depth <= SURFACE).int()
-        best = torch.where(out.any(1), out.argmax(1), depth.argmin(1))
-        way = places[torch.arange(len(start), device=start.device), best] - start
-        shares = torch.arange(1, frames + 1, device=start.device, dtype=start.dtype) / frames
-        return start.unsqueeze(1) + way.unsqueeze(1) * shares[:, None]
-
-    def _depths(self, places: Tensor) -> Tensor:
+    def _scene_depth(self, places: Tensor) -> Tensor:
         """(B, K): solid fraction at places (B, K, D)."""
         return linear_g2p(self.solid.to(places.dtype), places, self.grid).squeeze(-1)
+
+    def _depth_of_all(self, places: Tensor) -> Tensor:
+        """(n, K): solid fraction at places (n, K, D) of as many particles of each scene, one scene after the other."""
+        scenes = places.reshape(len(self.solid), -1, places.shape[-1])
+        return self._scene_depth(scenes).reshape(places.shape[:2])
 
     def _depth(self, scene: Tensor, places: Tensor) -> Tensor:
         """(n, K): solid fraction at places (n, K, D) of scenes (n,)."""
@@ -114,15 +128,107 @@ class Contact:
         values = self.solid.flatten(1)[scene[:, None, None], stencil.node]
         return (values * stencil.weight).sum(-1)
 
-    def _inward(self, scene: Tensor, places: Tensor) -> Tensor:
-        """(n, D): unit vectors at places (n, D) along which the solid gets deeper; zero where it is even."""
-        half = 0.5 * torch.eye(places.shape[-1], device=places.device, dtype=places.dtype)
-        ends = torch.cat([places.unsqueeze(1) + half, places.unsqueeze(1) - half], dim=1)
-        ahead, behind = self._depth(scene, ends).chunk(2, dim=1)
-        return functional.normalize(ahead - behind, dim=-1)
+
+@dataclass(frozen=True)
+class _Touch:
+    """Where n particles first get too deep into an obstacle in a bundle.
+
+    Args:
+        hits: (n,) bool, whether they do.
+        free: (n,) pieces before that, counted over the frames; all of them for particles that keep clear.
+        place: (n, D) the last place that is not too deep.
+        along: (n, D) the rest of the way from there, without its part into the solid.
+    """
+
+    hits: Tensor
+    free: Tensor
+    place: Tensor
+    along: Tensor
 
 
-def _pieces(steps: Tensor) -> int:
-    """Into how many pieces of at most half a cell the longest of steps (..., D) falls; `_MOST_PIECES` at most."""
-    longest = float(steps.detach().norm(dim=-1).max()) if steps.numel() else 0.0
-    return min(_MOST_PIECES, max(1, math.ceil(longest / _PIECE)))
+def _touch(depth: Depth, start: Tensor, path: Tensor, pieces: Tensor, most: int) -> _Touch:
+    """Follow paths (n, m, D) from start (n, D), each frame in pieces (n,), of which there are `most` at most."""
+    frames = path.shape[1]
+    before = torch.cat([start.unsqueeze(1), path[:, :-1]], dim=1)
+    order = torch.arange(most, device=path.device)
+    share = ((order + 1) / pieces.unsqueeze(1)).clamp(max=1)
+    points = (before.unsqueeze(2) + (path - before).unsqueeze(2) * share[:, None, :, None]).flatten(1, 2)
+    counts = (order < pieces.unsqueeze(1)).repeat(1, frames)
+    first = _first(counts & ~(depth(points) <= SURFACE))
+    row = torch.arange(len(start), device=path.device)
+    place = torch.where((first > 0).unsqueeze(-1), points[row, first - 1], start)
+    rest = path[:, -1] - place
+    inward = _inward(depth, points[row, first.clamp(max=frames * most - 1)])
+    along = rest - (rest * inward).sum(-1, keepdim=True).clamp(min=0) * inward
+    free = first.div(most, rounding_mode="floor") * pieces + first.remainder(most)
+    return _Touch(first < frames * most, free, place, along)
+
+
+def _slid(depth: Depth, path: Tensor, touch: _Touch, pieces: Tensor, finer: Tensor, most: int) -> Tensor:
+    """(n, m, D): paths up to where they touch, and along the surface from there.
+
+    What is left of the way at the touch loses its part into the solid, and is gone straight, evenly over the frames
+    left, until the surface bends into it: looked at in `finer` (n,) pieces, `most` at most.
+    """
+    frames = path.shape[1]
+    order = torch.arange(most, device=path.device)
+    ahead = ((order + 1) / finer.unsqueeze(1)).clamp(max=1)
+    blocked = ~(depth(touch.place.unsqueeze(1) + touch.along.unsqueeze(1) * ahead.unsqueeze(-1)) <= SURFACE)
+    share = torch.minimum(_first(blocked), finer) / finer
+    passed = torch.arange(1, frames + 1, device=path.device) * pieces.unsqueeze(1) - touch.free.unsqueeze(1)
+    time = passed / (frames * pieces - touch.free).clamp(min=1).unsqueeze(1)
+    gone = torch.minimum(time, share.unsqueeze(1)).unsqueeze(-1)
+    onward = touch.place.unsqueeze(1) + touch.along.unsqueeze(1) * gone
+    return torch.where((passed <= 0).unsqueeze(-1), path, onward)
+
+
+def _pushed_out(depth: Depth, start: Tensor, frames: int) -> Tensor:
+    """(n, m, D): paths straight out of the obstacle, as far as needed or to where it is least deep."""
+    ways = _PIECE * torch.arange(_WAYS_OUT + 1, device=start.device, dtype=start.dtype)
+    places = start.unsqueeze(1) - _inward(depth, start).unsqueeze(1) * ways[:, None]
+    deep = depth(places)
+    out = deep <= SURFACE
+    best = torch.where(out.any(1), _first(out), deep.argmin(1))
+    way = places[torch.arange(len(start), device=start.device), best] - start
+    shares = torch.arange(1, frames + 1, device=start.device, dtype=start.dtype) / frames
+    return start.unsqueeze(1) + way.unsqueeze(1) * shares[:, None]
+
+
+def _inward(depth: Depth, places: Tensor) -> Tensor:
+    """(n, D): unit vectors at places (n, D) along which the solid gets deeper; zero where it is even."""
+    half = 0.5 * torch.eye(places.shape[-1], device=places.device, dtype=places.dtype)
+    ends = torch.cat([places.unsqueeze(1) + half, places.unsqueeze(1) - half], dim=1)
+    ahead, behind = depth(ends).chunk(2, dim=1)
+    slope = ahead - behind
+    even = (slope.abs() < _EVEN).all(-1, keepdim=True)
+    return torch.where(even, 0.0, functional.normalize(slope, dim=-1))
+
+
+def _length(steps: Tensor) -> Tensor:
+    """(...) lengths of steps (..., D), without gradient; 0 for those that are not finite, as they have no pieces."""
+    lengths: Tensor = steps.detach().norm(dim=-1)
+    return lengths.nan_to_num(0.0, 0.0, 0.0)
+
+
+def _pieces(lengths: Tensor) -> Tensor:
+    """(B,): pieces of at most half a cell in the longest of each scene's lengths (B, N), `_MAX_PIECES` at most."""
+    if not lengths.shape[1]:
+        return lengths.new_ones(len(lengths))
+    return (lengths.amax(1) / _PIECE).ceil().clamp(1, _MAX_PIECES)
+
+
+def _spread(values: Tensor, count: int) -> Tensor:
+    """(n,): values (B,) repeated for the n / B rows of each scene."""
+    return values.unsqueeze(1).expand(-1, count // len(values)).flatten()
+
+
+def _first(found: Tensor) -> Tensor:
+    """(n,): index of the first True in each row (n, K), K where there is none. Deterministic on every device."""
+    size = found.shape[1]
+    order = torch.arange(size, device=found.device)
+    return torch.where(found, order, size).amin(1)
+
+
+def _largest(pieces: Tensor) -> int:
+    """The largest of (n,) numbers of pieces, read back."""
+    return int(pieces.max())

@@ -17,10 +17,9 @@ from torch import Tensor, nn
 from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection, Flight
-from nmpm.emulator.constraints import Constraints, energy, equal_shares
+from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.errors import ConfigError
-from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
 from nmpm.scene import Scene
@@ -92,7 +91,7 @@ class Emulator(nn.Module):
         self.register_buffer("input_high", torch.full((inputs, *column), UNLIMITED))
         self.register_buffer("output_scale", torch.ones(frames, outputs, *column))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("bounds", _bounds_in_cells(scene, self.grid), persistent=False)
+        self.register_buffer("bounds", self.grid.bounds_in_cells(scene), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
 
     @property
@@ -196,8 +195,9 @@ class Emulator(nn.Module):
         """Energy per mass (B,) of a state, in grid units; None where it is not constrained, as in training."""
         if not self.constraints.energy or self.training:
             return None
-        cells, velocity, gravity = self.in_cells(particles)
-        return energy(*self.grid.alike(cells, velocity, gravity), equal_shares(particles.mask, cells.dtype))
+        cells, velocity, gravity = self.grid.isotropic_units(*self.in_cells(particles))
+        share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
+        return energy(cells, velocity, gravity, share)
 
     def normalised(self, state: Tensor) -> Tensor:
         """The processor's input for a grid state (B, C_in, *S) in grid units."""
@@ -212,7 +212,7 @@ class Emulator(nn.Module):
             particles: The state to start from.
             context: From `context` of the rollout's first state; of this state when left out.
         """
-        context = context or self.context(particles)
+        context = self.context(particles) if context is None else context
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self.in_cells(particles)
@@ -226,12 +226,12 @@ class Emulator(nn.Module):
             advection = self.advection
             smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried(velocity, smoothed)
-            share = equal_shares(particles.mask, cells.dtype)
-            flight = Flight(cells, carried, gravity, particles.material, fields, share)
+            share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
+            flight = Flight(cells, velocity, carried, gravity, particles.material, fields, share)
             if self.training:
-                path = advection.free(flight)
+                path = advection.free_path(flight)
             else:
-                path = advection.constrained(flight, context.solid, context.budget)
+                path = advection.constrained_path(flight, context.solid, context.budget)
             steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
             precision = particles.position.dtype
             return Bundle(
@@ -246,10 +246,3 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
-
-
-def _bounds_in_cells(scene: Scene, grid: Grid) -> Tensor:
-    """(2, D) lowest and highest positions in cells, rounded to float32 only at the end."""
-    limits = torch.tensor(scene.bounds, dtype=torch.float64).T
-    lower, spacing = (torch.tensor(values, dtype=torch.float64) for values in (grid.lower, grid.spacing))
-    return ((limits - lower) / spacing).float()

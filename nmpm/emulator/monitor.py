@@ -1,22 +1,26 @@
-"""Watching a rollout: speed, energy, crowding, particles at the walls, and what is no number, while it is made."""
+"""Monitor: watches a rollout's speed, energy, crowding, non-finite values and particles at the walls as it is made."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
 import torch
 from torch import Tensor
 
-from nmpm.emulator.constraints import MOST_GAIN, energy, equal_shares, lowest_potential
+from nmpm.emulator.constraints import MOST_GAIN, energy, lowest_potential, mass_shares
 from nmpm.emulator.model import Bundle, Emulator
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.errors import NmpmError
 from nmpm.particles import Particles
+from nmpm.transfer.chunks import can_branch
 
-_CROWDING_EVERY = 16  # bundles: its sum over particles is as dear as all the rest
+_CROWDING_EVERY = 16  # bundles: its sum over particles costs as much as all the rest
+_READ_EVERY = 16  # bundles, where reading measures back halts the device
+_AT_WALLS, _CROWDING_LIMIT = "particles at the walls", "crowding limit"
 
 
 class Policy(Enum):
@@ -28,7 +32,7 @@ class Policy(Enum):
 
 
 class RolloutStoppedError(NmpmError):
-    """A rollout passed a limit of its monitor; what was made until then has been handed out."""
+    """A rollout passed a limit of its monitor; the frames predicted until then have been yielded."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Incident:
     Args:
         what: "speed", "energy", "crowding" or "not finite".
         frame: Last frame of the bundle in which it was seen, from 1.
-        scene: Of the batch.
+        scene: Index in the batch.
         value: What was measured.
         limit: What is allowed.
     """
@@ -55,7 +59,7 @@ class Incident:
 
 @dataclass(frozen=True)
 class _Reference:
-    """The first state's energy (B,), how far it is above the lowest possible (B,), and the shares (B, N, 1)."""
+    """The first state's energy (B,), how far it is above the lowest possible (B,), and the mass shares (B, N, 1)."""
 
     energy: Tensor
     above_lowest: Tensor
@@ -66,17 +70,20 @@ class _Reference:
 class Monitor:
     """Limits that a rollout is watched for, once per bundle.
 
+    On a CPU each bundle's measures are read at once. On other devices, which reading halts, they stay there and are
+    read every 16 bundles and at the rollout's end, in one transfer: warnings and stops come so much later.
+
     Args:
         policy: To warn, once for each kind of incident, to stop, or only to record.
         speed: Largest step of a particle along an axis, in the last frame of a bundle, in the narrowest cells.
         energy_gain: Largest share of the first state's energy that may be gained; not watched where gravity is unknown.
-        crowding: Largest volume fraction of a cell, looked at every 16th bundle; the largest that the network is shown
+        crowding: Largest volume fraction of a cell, measured every 16th bundle; the largest that the network is shown
             when left out.
 
     Attributes:
         incidents: The first of each kind in this rollout.
         peaks: The largest value of each measure in this rollout, by the names that incidents have.
-        at_walls: Particles at the scene's bounds or beyond, when crowding was last looked at.
+        at_walls: Particles at the scene's bounds or beyond, when crowding was last measured.
     """
 
     policy: Policy = Policy.WARN
@@ -90,24 +97,26 @@ class Monitor:
     _bundles: int = 0
     _padded: bool = False
     _reference: _Reference | None = None
+    _unread: list[tuple[int, dict[str, Tensor]]] = field(default_factory=list)
 
     def start(self, emulator: Emulator, particles: Particles) -> None:
-        """Forget what was seen, and take a state as the one that a rollout starts from."""
+        """Reset, and take a state as the one that a rollout starts from."""
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
-        self._padded = not bool(particles.mask.all())
+        self._unread = []
+        self._padded = not can_branch(particles.mask) or not bool(particles.mask.all())
         if not emulator.scene.gravity_known:
             self._reference = None
             return
-        share = equal_shares(particles.mask, particles.position.dtype)
+        share = mass_shares(emulator.scene, particles.material, particles.mask, particles.position.dtype)
         begun = energy(particles.position, particles.velocity, particles.gravity.unsqueeze(1), share)
         above = begun - lowest_potential(emulator.scene, particles.gravity)
         self._reference = _Reference(begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share)
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
-        """Look at a bundle.
+        """Measure a bundle.
 
         Args:
-            emulator: That made it.
+            emulator: Predicted it.
             particles: The state that it started from.
             bundle: Its frames.
 
@@ -118,41 +127,78 @@ class Monitor:
         self._bundles += 1
         if not particles.position.shape[1]:
             return
-        last, moving = bundle.position[:, -1], bundle.velocity
+        measures = self._measures(emulator, particles, bundle)
+        if self._bundles % _CROWDING_EVERY == 1:
+            measures |= self._crowding_and_walls(emulator, particles, bundle.position[:, -1])
+        self._unread.append((self._frames, measures))
+        if can_branch(bundle.position) or len(self._unread) == _READ_EVERY:
+            self.read()
+
+    def read(self) -> None:
+        """Read the measures that are still on the device, in one transfer; `unroll` calls this at a rollout's end.
+
+        Raises:
+            RolloutStoppedError: under the policy "stop", if a limit is passed.
+        """
+        unread, self._unread = self._unread, []
+        if not unread:
+            return
+        rows = [values for _, measures in unread for values in measures.values()]
+        read = iter(torch.stack(rows).cpu())
+        for frame, measures in unread:
+            self._judge(frame, {name: next(read) for name in measures})
+
+    def _measures(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> dict[str, Tensor]:
+        """(B,) measures of a bundle by name."""
+        moving = bundle.velocity
         if self._padded:
             moving = moving.masked_fill(~particles.mask.unsqueeze(-1), 0.0)
-        way = moving.abs().amax((1, 2)) / min(emulator.grid.spacing)
-        # What is no number in a position is none in the velocity, the last step, and none in its largest.
-        if not math.isfinite(float(way.max())):
-            self._note("not finite", (~way.isfinite()).float(), 0.0)
-        self._note("speed", way, self.speed)
+        # A NaN position makes the last velocity NaN, and with it the largest, so checking that suffices.
+        found = {"speed": moving.abs().amax((1, 2)) / min(emulator.grid.spacing)}
         if self._reference is not None:
-            now = energy(last, bundle.velocity, particles.gravity.unsqueeze(1), self._reference.share)
-            self._note("energy", (now - self._reference.energy) / self._reference.above_lowest, self.energy_gain)
-        if self._bundles % _CROWDING_EVERY == 1:
-            self._see_crowding_and_walls(emulator, particles, last)
+            last, fall = bundle.position[:, -1], particles.gravity.unsqueeze(1)
+            now = energy(last, bundle.velocity, fall, self._reference.share)
+            found["energy"] = (now - self._reference.energy) / self._reference.above_lowest
+        return found
 
-    def _see_crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> None:
+    def _crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> dict[str, Tensor]:
+        """(B,) measures of positions (B, N, D) by name."""
         grid, scene = emulator.grid, emulator.scene
         fraction = volume_fraction(scene, grid, emulator.transfer, particles.mask, grid.to_cells(last.nan_to_num()))
-        channels = [i for i, name in enumerate(scene.input_channels) if name.endswith(".volume")]
-        limit = float(emulator.input_high[channels].max()) if self.crowding is None else self.crowding
-        self._note("crowding", fraction.flatten(1).amax(1), limit)
-        low, high = last.new_tensor(scene.bounds).T
-        self.at_walls = int((((last <= low) | (last >= high)).any(-1) & particles.mask).sum())
+        sides = [(x <= low) | (x >= high) for x, (low, high) in zip(last.unbind(-1), scene.bounds, strict=True)]
+        at_walls = torch.stack(sides).any(0) & particles.mask
+        found = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}
+        if self.crowding is None:
+            first, count = scene.input_channels.index(f"{scene.materials[0]}.volume"), len(scene.materials)
+            limit = emulator.input_high[first : first + count].amax()
+            found[_CROWDING_LIMIT] = limit.to(last).expand(len(last))
+        return found
 
-    def _note(self, what: str, values: Tensor, limit: float) -> None:
+    def _judge(self, frame: int, measures: Mapping[str, Tensor]) -> None:
+        """Take in the (B,) measures of the bundle that ends with a frame, on the CPU."""
+        speed = measures["speed"]
+        if not math.isfinite(float(speed.max())):
+            self._note("not finite", frame, (~speed.isfinite()).float(), 0.0)
+        self._note("speed", frame, speed, self.speed)
+        if "energy" in measures:
+            self._note("energy", frame, measures["energy"], self.energy_gain)
+        if "crowding" in measures:
+            limit = float(measures[_CROWDING_LIMIT][0]) if self.crowding is None else self.crowding
+            self._note("crowding", frame, measures["crowding"], limit)
+            self.at_walls = int(measures[_AT_WALLS].sum())
+
+    def _note(self, what: str, frame: int, values: Tensor, limit: float) -> None:
         """Take in a (B,) measure."""
         worst = float(values.max())
         self.peaks[what] = max(self.peaks.get(what, -math.inf), worst)
         if not worst > limit or any(incident.what == what for incident in self.incidents):
             return
-        incident = Incident(what, self._frames, int(values.argmax()), worst, limit)
+        incident = Incident(what, frame, int(values.argmax()), worst, limit)
         self.incidents.append(incident)
         if self.policy is Policy.STOP:
             raise RolloutStoppedError(f"The rollout was stopped: {incident}. {self.report()}")
         if self.policy is Policy.WARN:
-            warnings.warn(f"The rollout leaves what it is known for: {incident}.", stacklevel=4)
+            warnings.warn(f"The rollout passed a limit: {incident}.", stacklevel=6)
 
     def report(self) -> str:
         """What was seen, in a sentence or two."""

@@ -58,7 +58,7 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
 
 
 def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, mask: Tensor, cells: Tensor) -> Tensor:
-    """The share of each cell taken by particles of whatever kind, (B, 1, *S); above 1 where they are crowded.
+    """The share of each cell taken by particles of all kinds, (B, 1, *S); above 1 where they are crowded.
 
     Args:
         scene: Gives the particles' volume.
@@ -72,15 +72,18 @@ def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, mask: Tensor, 
 
 
 def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
-    """The share of each cell beyond the scene's bounds, (*S), exact for the box."""
-    free = torch.ones((), dtype=torch.float64)
+    """The share of each cell beyond the scene's bounds, (*S), exact for the box; on torch's default device.
+
+    Computed in float64, which not every device has, on the CPU.
+    """
+    free = torch.ones((), dtype=torch.float64, device="cpu")
     for axis, (low, high) in enumerate(scene.bounds):
         centre = grid.centres(axis)
         half = grid.spacing[axis] / 2
         overlap = (centre + half).clamp(max=high) - (centre - half).clamp(min=low)
         share = (overlap / grid.spacing[axis]).clamp(0, 1)
         free = free.unsqueeze(-1) * share
-    return (1 - free).float()
+    return (1 - free).float().to(torch.get_default_device())
 
 
 def _membership(particles: Particles, materials: int) -> Tensor:

@@ -21,84 +21,81 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
         emulator: Predicts m frames a call.
         particles: The state to start from.
         bundles: How many calls to make.
-        monitor: Looks at each bundle before it is handed out.
+        monitor: Measures each bundle before it is yielded.
     """
     if monitor is not None:
         monitor.start(emulator, particles)
     context = emulator.context(particles)
-    for _ in range(bundles):
+    for remaining in reversed(range(bundles)):
         bundle = emulator(particles, context)
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
+            if not remaining:
+                monitor.read()
         yield bundle
         particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
 
-def check_state(scene: Scene, particles: Particles) -> None:
-    """Refuse a state that a rollout could only spread or hide.
+def check_inputs(emulator: Emulator, particles: Particles) -> None:
+    """Reject emulators with non-finite weights, and states that are non-finite or outside of the domain.
+
+    All checks are read back from the device at once; details are computed only if one fails.
 
     Args:
-        scene: What it should be a state of.
-        particles: The state.
+        emulator: Is to predict.
+        particles: The state to start from.
 
     Raises:
-        DataError: naming scene, particle and value, if a position or velocity is not finite, or a position beyond the
-            domain's walls.
+        DataError: naming the weight or statistic; or scene, particle and value.
     """
     real = particles.mask
-    for name in ("position", "velocity"):
-        values: Tensor = getattr(particles, name)
-        bad = ~values.isfinite().all(-1) & real
+    states = {name: ~getattr(particles, name).isfinite().all(-1) & real for name in ("position", "velocity")}
+    beyond = beyond_walls(emulator.scene, particles.position) & real
+    weights = emulator.state_dict()
+    unsound = [~values.isfinite().all() for values in weights.values()]
+    checks = [torch.stack(unsound).any(), *(bad.any() for bad in states.values()), beyond.any()]
+    if not bool(torch.stack(checks).any()):
+        return
+    for name, bad in zip(weights, unsound, strict=True):
+        if bad:
+            raise DataError(f"The emulator's {name} holds values that are not finite: load a sound checkpoint.")
+    for name, bad in states.items():
         if bad.any():
-            scene_index, particle = map(int, bad.nonzero()[0])
+            scene, particle = map(int, bad.nonzero()[0])
             raise DataError(
-                f"Scene {scene_index} of the batch, particle {particle}: its {name} is"
-                f" {values[scene_index, particle].tolist()}; it must be finite."
+                f"Scene {scene} of the batch, particle {particle}: its {name} is"
+                f" {getattr(particles, name)[scene, particle].tolist()}; it must be finite."
             )
-    beyond = beyond_walls(scene, particles.position) & real
-    if beyond.any():
-        scene_index, particle = map(int, beyond.nonzero()[0])
-        raise DataError(
-            f"Scene {scene_index} of the batch, particle {particle}: it is at"
-            f" {particles.position[scene_index, particle].tolist()}, outside of the domain {list(scene.domain)}"
-            f" ({int(beyond.sum())} particles are)."
-        )
+    scene, particle = map(int, beyond.nonzero()[0])
+    raise DataError(
+        f"Scene {scene} of the batch, particle {particle}: it is at {particles.position[scene, particle].tolist()},"
+        f" outside of the domain {list(emulator.scene.domain)} ({int(beyond.sum())} particles are)."
+    )
 
 
 def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
-    """Which positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
-    lower, upper = position.new_tensor(scene.domain).T
-    walls = torch.tensor([not wraps for wraps in scene.periodic], device=position.device)
-    beyond: Tensor = (((position < lower) | (position > upper)) & walls).any(-1)
-    return beyond
-
-
-def check_weights(emulator: Emulator) -> None:
-    """Refuse an emulator that can only predict nonsense.
-
-    Raises:
-        DataError: naming the weight or statistic that holds what is not a finite number.
-    """
-    for name, values in emulator.state_dict().items():
-        if not values.isfinite().all():
-            raise DataError(f"The emulator's {name} holds numbers that are not finite: load a sound checkpoint.")
+    """Whether positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
+    sides = [
+        torch.zeros_like(column, dtype=torch.bool) if wraps else (column < low) | (column > high)
+        for column, (low, high), wraps in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True)
+    ]
+    return torch.stack(sides).any(0)
 
 
 def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Iterator[Tensor]:
-    """Predict `frames` frames without gradients, handing out each bundle as it is made.
+    """Predict `frames` frames without gradients, yielding each bundle as it is made.
 
     Yields:
         (B, <= m, N, D) positions in domain length; the last bundle is cut to the frames asked for.
 
     Raises:
         ValueError: if `frames` is negative.
-        DataError: if the state or a weight holds what is not a finite number, or a particle is outside of the domain.
-        RolloutStoppedError: if the monitor says so.
+        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+        RolloutStoppedError: if the monitor stops the rollout.
     """
     if frames < 0:
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
-    check_weights(emulator)
-    check_state(emulator.scene, particles)
+    check_inputs(emulator, particles)
     bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor)
     made = 0
     while made < frames:
@@ -116,8 +113,8 @@ def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Moni
 
     Raises:
         ValueError: if `frames` is negative.
-        DataError: if the state or a weight holds what is not a finite number, or a particle is outside of the domain.
-        RolloutStoppedError: if the monitor says so.
+        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+        RolloutStoppedError: if the monitor stops the rollout.
     """
     bundles = list(stream(emulator, particles, frames, monitor))
     if not bundles:

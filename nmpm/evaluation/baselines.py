@@ -10,7 +10,7 @@ from nmpm.scene import Scene
 
 
 def still(particles: Particles, frames: int) -> Tensor:
-    """Nothing moves: (B, frames, N, D) positions."""
+    """Positions (B, frames, N, D) if nothing moves."""
     return particles.position.unsqueeze(1).expand(-1, frames, -1, -1)
 
 
@@ -32,9 +32,13 @@ def free_fall(scene: Scene, particles: Particles, frames: int) -> Tensor:
 
 
 def _stopped(path: Tensor, low: float, high: float) -> Tensor:
-    """A path (B, T, N) held at the first bound it reaches."""
-    below = (path <= low).cummax(dim=1).values
-    above = (path >= high).cummax(dim=1).values
-    first_below = below & (below.cumsum(1) >= above.cumsum(1))
-    path = torch.where(below | above, torch.full_like(path, high), path)
-    return torch.where(first_below, torch.full_like(path, low), path)
+    """A path (B, T, N) held at the first bound it reaches; at the lower one if it reaches both at once."""
+    frames = torch.arange(path.shape[1], device=path.device).view(1, -1, 1)
+    below, above = _first(path <= low, frames), _first(path >= high, frames)
+    held = torch.where(below <= above, torch.full_like(path[:, :1], low), high)
+    return torch.where(frames >= torch.minimum(below, above), held, path)
+
+
+def _first(found: Tensor, frames: Tensor) -> Tensor:
+    """(B, 1, N): the first of the frames (1, T, 1) at which something (B, T, N) is found; T where it never is."""
+    return torch.where(found, frames, found.shape[1]).amin(1, keepdim=True)

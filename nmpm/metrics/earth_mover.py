@@ -9,6 +9,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from torch import Tensor
+from torchmetrics.utilities import dim_zero_cat
 
 from nmpm.metrics.base import RolloutMetric
 from nmpm.particles import Window
@@ -27,35 +28,34 @@ class EarthMover(RolloutMetric):
     cheap: ClassVar[bool] = False
     compared: ClassVar[bool] = False
 
-    total: Tensor
-    count: Tensor
+    distances: list[Tensor] | Tensor  # one tensor once gathered from several processes
 
     def __init__(self, every: int = 10) -> None:
         super().__init__()
         self.every = every
-        self.add_state("total", default=torch.zeros(()), dist_reduce_fx="sum")
-        self.add_state("count", default=torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
+        self.add_state("distances", default=[], dist_reduce_fx="cat")
 
     def update(self, window: Window, predicted: Tensor) -> None:
         frames = slice(self.every - 1, None, self.every)
-        rows = zip(predicted, window.target, window.mask, window.material, strict=True)
-        for ours, theirs, real, kinds in rows:
-            distances = [
-                earth_mover(ours[frames][:, real & (kinds == kind)], theirs[frames][:, real & (kinds == kind)])
-                for kind in kinds[real].unique()
-            ]
-            self.total += float(np.mean(distances))
-            self.count += 1
+        on_cpu = (v.cpu() for v in (predicted[:, frames], window.target[:, frames], window.mask, window.material))
+        means = []
+        for ours, theirs, real, kinds in zip(*on_cpu, strict=True):
+            each = [real & (kinds == kind) for kind in kinds[real].unique()]
+            means.append(np.mean([earth_mover(ours[:, chosen], theirs[:, chosen]) for chosen in each]))
+        found = torch.tensor(means, dtype=torch.float32, device=predicted.device)
+        self.distances.append(found)  # type: ignore[union-attr]  # (a list until gathered)
 
     def compute(self) -> dict[str, Tensor]:
         """The mean over trajectories, by the name "emd"; empty where no trajectory was added."""
-        return {"emd": self.total / self.count} if self.count else {}
+        if not len(self.distances):
+            return {}
+        return {"emd": dim_zero_cat(self.distances).cpu().double().mean().float()}
 
 
 def earth_mover(ours: Tensor, theirs: Tensor) -> float:
-    """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of as many particles."""
+    """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size."""
     values = []
-    for left, right in zip(ours.double().cpu().numpy(), theirs.double().cpu().numpy(), strict=True):
+    for left, right in zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), strict=True):
         cost = cdist(left, right)
         values.append(cost[linear_sum_assignment(cost)].mean())
     return float(np.mean(values))

@@ -35,7 +35,8 @@ class MSE(RolloutMetric):
 
     def update(self, window: Window, predicted: Tensor) -> None:
         mask = window.mask
-        squared = (predicted.double() - window.target.double()).square().mean(-1) * mask.unsqueeze(1)
+        # Each frame in the positions' precision, as not every device has float64; sums over frames follow in `curves`.
+        squared = (predicted - window.target).square().mean(-1) * mask.unsqueeze(1)
         per_frame = squared.sum(-1) / mask.sum(-1, keepdim=True)
         self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
         self.lengths.append(  # type: ignore[union-attr]  # (likewise)
@@ -43,11 +44,11 @@ class MSE(RolloutMetric):
         )
 
     def curves(self) -> list[Tensor]:
-        """One (T,) curve of squared error against frame for each trajectory."""
+        """One (T,) curve of squared error against frame for each trajectory, on the CPU."""
         if not len(self.lengths):
             return []
         lengths: list[int] = dim_zero_cat(self.lengths).tolist()
-        return list(dim_zero_cat(self.squared).split(lengths))
+        return list(dim_zero_cat(self.squared).cpu().split(lengths))
 
     def per_trajectory(self) -> list[dict[str, float]]:
         """MSE at each horizon that the trajectory reaches, and over the full rollout ("mse")."""

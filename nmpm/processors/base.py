@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from nmpm.grid import Grid
@@ -58,8 +59,13 @@ class Processor(ABC):
         """
 
     def check_grid(self, grid: Grid) -> None:  # noqa: B027 (a processor without demands need say nothing)
-        """Say no, with the mend, to a grid that the network cannot take. Any grid is welcome unless overridden.
+        """Raise ConfigError for an unsuitable grid, suggesting one that fits. Any grid is accepted unless overridden.
 
         Raises:
             ConfigError: if the grid does not suit.
         """
+
+
+def full_precision(grid: Tensor) -> Tensor:
+    """The grid in float32, or in float64 if it is: Fourier transforms take nothing less on most devices."""
+    return grid.to(torch.promote_types(grid.dtype, torch.float32))

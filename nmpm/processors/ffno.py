@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import CONVOLUTIONS
 from nmpm.processors.padding import cropped
 from nmpm.processors.places import places
@@ -95,9 +95,9 @@ class Layer(nn.Module):
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (B, C, *S) to the same shape."""
         with torch.autocast(hidden.device.type, enabled=False):
-            full = hidden.float()
+            full = full_precision(hidden)
             mixed = torch.stack([self._along(full, axis) for axis in range(self.dim)]).sum(0)
-        out: Tensor = hidden + self.perceptron(mixed)
+        out: Tensor = hidden + self.perceptron(mixed.to(hidden.dtype))
         return out
 
     def _along(self, hidden: Tensor, axis: int) -> Tensor:
@@ -106,7 +106,7 @@ class Layer(nn.Module):
         spectrum = torch.fft.rfft(moved, dim=-2, norm="ortho")
         kept, first = min(spectrum.shape[-2], self.modes), axis * self.modes
         width = spectrum.shape[-1]
-        matrix = torch.view_as_complex(self.weight[first : first + kept]).unflatten(-1, (width, width))
+        matrix = torch.view_as_complex(self.weight[first : first + kept].to(hidden.dtype)).unflatten(-1, (width, width))
         mixed = torch.einsum("...kc,kcd->...kd", spectrum[..., :kept, :], matrix)
         back: Tensor = torch.fft.irfft(mixed, n=moved.shape[-2], dim=-2, norm="ortho")
         return back.movedim((-1, -2), (1, axis + 2))

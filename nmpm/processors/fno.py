@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.places import places
 
 
@@ -65,7 +65,7 @@ class TFNO(FNO):
 
 
 class FNONetwork(GridProcessor):
-    """`neuralop.models.FNO` behind the contract."""
+    """`neuralop.models.FNO` behind the contract, in float32 whatever autocast says: its transforms need it."""
 
     def __init__(self, recipe: FNO, layout: GridLayout, weights: dict[str, Any]) -> None:
         super().__init__()
@@ -86,8 +86,10 @@ class FNONetwork(GridProcessor):
         self.register_state_dict_post_hook(_without_metadata)  # type: ignore[no-untyped-call]  # (torch's own)
 
     def forward(self, grid: Tensor) -> Tensor:
-        placed = torch.cat([grid, places(grid, self.periodic)], dim=1)
-        out: Tensor = self.operator(placed).unflatten(1, (self.frames, -1))
+        with torch.autocast(grid.device.type, enabled=False):
+            grid = full_precision(grid)
+            placed = torch.cat([grid, places(grid, self.periodic)], dim=1)
+            out: Tensor = self.operator(placed).unflatten(1, (self.frames, -1))
         return out
 
 

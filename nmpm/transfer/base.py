@@ -20,7 +20,7 @@ from torch import Tensor
 
 from nmpm.grid import Grid
 from nmpm.transfer.backends import add
-from nmpm.transfer.pieces import pieces
+from nmpm.transfer.chunks import chunks
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Transfer(ABC):
     def p2g(self, values: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Sum particle values (B, N, C) at `cells` (B, N, D) onto the nodes, (B, C, *S)."""
         first, *others = (
-            scatter(self.scatter_stencil(cells[:, piece], grid), values[:, piece], grid.size)
-            for piece in pieces(cells.shape[1], cells.device)
+            scatter(self.scatter_stencil(cells[:, chunk], grid), values[:, chunk], grid.size)
+            for chunk in chunks(cells.shape[1], cells.device)
         )
         summed = sum(others, start=first)
         return summed.transpose(1, 2).reshape(summed.shape[0], -1, *grid.shape)

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box, cloud
 
-from nmpm.decoders import Absolute, Residual
-from nmpm.emulator import Emulator, EmulatorRecipe
-from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, equal_shares, lowest_potential
+from nmpm.decoders import Absolute, Acceleration, Residual
+from nmpm.emulator import Emulator, EmulatorRecipe, RolloutContext
+from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, lowest_potential, mass_shares
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import Pointwise, UNet
@@ -46,11 +46,154 @@ def test_steps_stay_within_the_budget_and_are_left_alone_below_it(seed, fall, al
     step = torch.randn(1, 7, 2, generator=generator, dtype=torch.float64)
     gravity, share = torch.tensor([[[0.3 * fall, fall]]], dtype=torch.float64), shares(7)
     budget = energy(cells, torch.zeros_like(cells), gravity, share) + allowed
-    held = step * affordable(cells, step, gravity, share, budget)
+    before = torch.randn(1, 7, 2, generator=generator, dtype=torch.float64)
+    held = step * affordable(cells, step, before, gravity, share, budget)
     proposed = energy(cells + step, step, gravity, share)
     assert (energy(cells + held, held, gravity, share) <= budget + 1e-9).all()
     if (proposed <= budget).all():
-        torch.testing.assert_close(held, step)
+        assert torch.equal(held, step)
+
+
+DOWN = torch.tensor([[[0.0, -0.01]]], dtype=torch.float64)
+
+
+def one_frame(cells, before, step, budget, share=None):
+    """Steps of one scene as the energy allows them: lists of (x, y), in float64."""
+    cells, before, step = (torch.tensor([rows], dtype=torch.float64) for rows in (cells, before, step))
+    share = shares(cells.shape[1]) if share is None else share
+    budget = torch.tensor([budget], dtype=torch.float64)
+    held = step * affordable(cells, step, before, DOWN, share, budget)
+    return held[0], energy(cells + held, held, DOWN, share).item(), step[0]
+
+
+def test_a_body_that_gains_nothing_is_left_alone_to_the_bit():
+    falling, fallen = [0.1, -0.3], [0.1, -0.31]  # free fall: a frame adds the gravity
+    resting, gaining = [0.0, 0.0], [0.5, 0.0]
+    cells, before = [[9.0, 40.0], [3.0, 0.5], [50.0, 0.5]], [falling, resting, resting]
+    budget = (0.01 * (40.0 + 0.5 + 0.5) + 0.05 + 0.02) / 3  # as it was, and a little more
+    held, spent, step = one_frame(cells, before, [fallen, resting, gaining], budget)
+    assert torch.equal(held[:2], step[:2])
+    assert spent == pytest.approx(budget, abs=1e-12)
+    # v² / 2 is what was allowed, and what the falling body lost: g² / 2.
+    assert held[2, 0].item() == pytest.approx((2 * (0.02 + 0.01**2 / 2)) ** 0.5, rel=1e-9)
+
+
+def test_all_are_slowed_where_those_that_gain_do_not_suffice():
+    cells, before = [[9.0, 5.0], [30.0, 5.0]], [[0.8, 0.0], [0.0, 0.0]]
+    budget = 0.01 * 5.0 + (0.4**2 / 2) / 2  # less than the first alone has
+    held, spent, step = one_frame(cells, before, [[0.8, 0.0], [0.3, 0.0]], budget)
+    factors = held[:, 0] / step[:, 0]
+    assert factors[0].item() == pytest.approx(factors[1].item(), rel=1e-12)
+    assert 0 < factors[0] < 1
+    assert spent == pytest.approx(budget, abs=1e-12)
+
+
+def test_a_scene_that_cannot_afford_to_stay_takes_the_steps_of_least_energy():
+    held, _, step = one_frame([[9.0, 5.0]], [[0.0, 0.0]], [[0.0, -0.5]], -1.0)
+    assert held[0, 1].item() == pytest.approx(-0.01)  # where v² / 2 - g v is lowest
+    assert step[0, 1] < held[0, 1] < 0
+
+
+def test_heavy_particles_count_by_their_mass():
+    scene = box(materials=("water", "steel"), densities=(1000.0, 8000.0))
+    material, mask = torch.tensor([[0, 1, 1]]), torch.tensor([[True, True, False]])
+    share = mass_shares(scene, material, mask, torch.float64)
+    assert share.flatten().tolist() == pytest.approx([1 / 9, 8 / 9, 0.0])
+    cells, rest = [[9.0, 5.0], [30.0, 5.0]], [[0.0, 0.0], [0.0, 0.0]]
+    allowed = 0.02
+    two = share[:, :2]
+    light, *_ = one_frame(cells, rest, [[1.0, 0.0], [0.0, 0.0]], 0.05 + allowed, two)
+    heavy, *_ = one_frame(cells, rest, [[0.0, 0.0], [1.0, 0.0]], 0.05 + allowed, two)
+    assert light[0, 0].item() == pytest.approx((2 * allowed * 9) ** 0.5, rel=1e-9)
+    assert heavy[1, 0].item() == pytest.approx((2 * allowed * 9 / 8) ** 0.5, rel=1e-9)
+
+
+def test_equal_densities_are_as_none():
+    material, mask = torch.tensor([[0, 1, 1]]), torch.tensor([[True, True, False]])
+    one, other = (
+        mass_shares(box(materials=("water", "ice"), densities=given), material, mask, torch.float32)
+        for given in ((), (917.0, 917.0))
+    )
+    assert torch.equal(one, other)
+
+
+def limited_everywhere(monkeypatch):
+    """As on a GPU: nothing is decided by reading values back."""
+    for module in ("advection", "contact"):
+        monkeypatch.setattr(f"nmpm.emulator.{module}.can_branch", lambda values: False)
+
+
+@pytest.mark.parametrize("cells", [16, (16, 8)])
+@pytest.mark.parametrize("decoder", [Absolute(), Residual(), Acceleration()])
+def test_within_the_budget_the_path_is_the_free_one_to_the_bit_on_every_device(monkeypatch, decoder, cells):
+    scene = box()
+    particles = cloud(scene, batch=2, speed=0.004)
+    free, held = (emulator_of(scene, decoder=decoder, cells=cells, energy=on) for on in (False, True))
+    assert held.budget(particles) is not None
+    solid = held.solid(particles)
+    limited_everywhere(monkeypatch)
+    expected = free(particles)
+    bundle = held(particles, RolloutContext(solid, torch.full((2,), 1e6)))
+    assert torch.equal(bundle.position, expected.position)
+    assert torch.equal(bundle.velocity, expected.velocity)
+
+
+def test_with_and_without_branches_the_energy_limit_is_the_same_to_the_bit(monkeypatch):
+    scene = box()
+    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
+    emulator.output_scale.mul_(3.0)
+    by_branching = rollout(emulator, particles, 24)
+    limited_everywhere(monkeypatch)
+    assert torch.equal(rollout(emulator, particles, 24), by_branching)
+
+
+def test_a_scene_does_not_feel_the_energy_of_others():
+    scene = box()
+    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
+    emulator.output_scale.mul_(3.0)
+    budget = torch.stack([emulator.budget(particles)[0], torch.tensor(1e6)])
+    solid = emulator.solid(particles)
+    together = emulator(particles, RolloutContext(solid, budget)).position
+    for index in range(2):
+        own = slice(index, index + 1)
+        alone = emulator(particles.scenes(own), RolloutContext(solid[own], budget[own])).position
+        torch.testing.assert_close(together[own], alone, rtol=0, atol=1e-6)
+
+
+def test_chunks_of_particles_share_one_energy(monkeypatch):
+    scene = box()
+    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
+    emulator.output_scale.mul_(3.0)
+    whole = rollout(emulator, particles, 12)
+    in_sevens = lambda count, device, values=1: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
+    monkeypatch.setattr("nmpm.emulator.advection.chunks", in_sevens)
+    torch.testing.assert_close(rollout(emulator, particles, 12), whole, rtol=0, atol=1e-6)
+
+
+def test_gradients_through_the_energy_limit_are_finite(monkeypatch):
+    scene = box()
+    limited_everywhere(monkeypatch)
+    particles = cloud(scene, batch=2)
+    emulator = emulator_of(scene, energy=True)
+    emulator.output_scale.mul_(3.0)
+    for allowed in (-1e6, emulator.budget(particles)[0].item(), 1e6, float("inf")):
+        position = particles.position.clone().requires_grad_()
+        state = particles.moved(position, particles.velocity)
+        budget = torch.full((2,), allowed)
+        emulator(state, RolloutContext(emulator.solid(state), budget)).position.square().sum().backward()
+        assert position.grad.isfinite().all()
+
+
+def test_a_particle_that_is_not_finite_disturbs_no_other_scene():
+    scene = box()
+    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
+    expected = emulator(particles).position
+    broken = particles.velocity.clone()
+    broken[1, 3] = float("nan")
+    state = particles.moved(particles.position, broken)
+    found = emulator(state).position
+    assert torch.equal(found[0], expected[0])
+    assert found[1].isnan().any()
 
 
 def test_what_moves_less_than_the_rest_speed_on_average_is_at_rest():
@@ -208,7 +351,8 @@ def test_energies_of_cells_that_are_not_square_are_counted_in_lengths():
 def test_shares_are_of_real_particles():
     mask = torch.tensor([[True, True, False], [True, True, True], [False, False, False]])
     expected = torch.tensor([[0.5, 0.5, 0.0], [1 / 3] * 3, [0.0] * 3]).unsqueeze(-1)
-    torch.testing.assert_close(equal_shares(mask, torch.float32), expected)
+    material = torch.zeros(3, 3, dtype=torch.long)
+    torch.testing.assert_close(mass_shares(box(), material, mask, torch.float32), expected)
 
 
 @pytest.mark.parametrize("bounds", [((0.1, 0.9),), ((0.1, 0.9), (-0.2, 0.4)), ((0.1, 0.9), (-0.2, 0.4), (0.0, 2.0))])

@@ -81,6 +81,73 @@ def test_scenes_of_a_batch_have_their_own_obstacles():
     torch.testing.assert_close(held[:1], floor().hold(begin, path))
 
 
+def wall(offset: float = 0.3) -> Contact:
+    """A wall of one cell across the domain."""
+    solid = torch.zeros(1, 1, 20, 20)
+    solid[..., 8], solid[..., 9] = 1 - offset, offset
+    return Contact(solid, GRID)
+
+
+def block() -> Contact:
+    """An obstacle with corners."""
+    solid = torch.zeros(1, 1, 20, 20)
+    solid[..., 7:12, 5:9] = 1.0
+    return Contact(solid, GRID)
+
+
+@pytest.mark.parametrize("obstacle", [floor, wall, block])
+@pytest.mark.parametrize("speed", [0.0, 0.05, 0.9, 7.0, 32.0])
+def test_both_forms_agree(obstacle, speed):
+    generator = torch.Generator().manual_seed(int(10 * speed))
+    one = obstacle()
+    contact = Contact(torch.cat([one.solid, torch.zeros_like(one.solid), one.solid]), GRID)
+    start = 20 * torch.rand(3, 50, 2, generator=generator)  # some of them inside
+    direction = torch.nn.functional.normalize(torch.randn(3, 1, 50, 2, generator=generator), dim=-1)
+    jitter = 0.1 * torch.randn(3, 6, 50, 2, generator=generator)
+    path = start.unsqueeze(1) + (speed * (direction + jitter)).cumsum(1)
+    path[2] = start[2] + 0.01 * (path[2] - start[2])  # a scene of its own speed
+    by_branching, dense = contact.hold_touching(start, path), contact.hold_all(start, path)
+    assert not torch.equal(dense, path)
+    torch.testing.assert_close(dense, by_branching, rtol=0, atol=2e-4)
+    assert torch.equal(dense[1], path[1])
+
+
+def test_the_dense_form_in_chunks_is_the_same(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    start = 20 * torch.rand(1, 50, 2, generator=generator)
+    path = start.unsqueeze(1) + torch.randn(1, 4, 50, 2, generator=generator).cumsum(1)
+    whole = block().hold_all(start, path)
+    in_sevens = lambda count, device, values=1: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
+    monkeypatch.setattr("nmpm.emulator.contact.chunks", in_sevens)
+    torch.testing.assert_close(block().hold_all(start, path), whole, rtol=0, atol=1e-5)
+
+
+def test_a_scene_does_not_feel_how_fast_another_is():
+    begin, slow = straight([5.0, 10.6], [0.5, -0.5])
+    fast = straight([5.0, 10.6], [0.1, -15.0])[1]
+    contact = Contact(floor().solid.repeat(2, 1, 1, 1), GRID)
+    for hold in (contact.hold_touching, contact.hold_all):
+        together = hold(begin.repeat(2, 1, 1), torch.cat([slow, fast]))
+        torch.testing.assert_close(together[:1], floor().hold(begin, slow), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
+def test_a_step_that_is_not_finite_stays_so_and_disturbs_nobody(value, hold):
+    begin, path = straight([5.0, 12.0], [0.0, -0.7])
+    broken = path.clone()
+    broken[0, 2:, 0, 1] = value
+    held = getattr(floor(), hold)(begin.repeat(1, 2, 1), torch.cat([path, broken], dim=2))
+    torch.testing.assert_close(held[:, :, :1], getattr(floor(), hold)(begin, path))
+    assert not held[:, 2:, 1].isfinite().all() or value == -float("inf")  # that leads onto the floor
+
+
+def test_nobody_to_hold():
+    begin, path = torch.zeros(2, 0, 2), torch.zeros(2, 4, 0, 2)
+    contact = Contact(floor().solid.repeat(2, 1, 1, 1), GRID)
+    assert contact.hold_touching(begin, path).shape == contact.hold_all(begin, path).shape == path.shape
+
+
 def test_in_three_dimensions():
     grid = Grid((8, 8, 8), (0.0,) * 3, (1.0,) * 3, (False,) * 3)
     solid = torch.zeros(1, 1, 8, 8, 8)

@@ -288,18 +288,18 @@ def test_over_another_kind_of_scene_is_refused(changes, message):
         small(box()).over(box(**changes))
 
 
-def in_sevens(count, device):
+def in_sevens(count, device, values=1):
     return [slice(first, first + 7) for first in range(0, count, 7)]
 
 
 @pytest.mark.parametrize("transfer", TRANSFERS)
-def test_particles_a_piece_at_a_time_move_as_all_at_once(transfer, monkeypatch):
+def test_particles_in_chunks_move_as_all_at_once(transfer, monkeypatch):
     scene = box(materials=("water", "sand"))
     emulator, particles = small(scene, transfer), cloud(scene)
     with torch.no_grad():
         whole = emulator(particles)
         for module in ("nmpm.transfer.base", "nmpm.emulator.advection"):
-            monkeypatch.setattr(f"{module}.pieces", in_sevens)
+            monkeypatch.setattr(f"{module}.chunks", in_sevens)
         cut = emulator(particles)
     torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)
     torch.testing.assert_close(cut.velocity, whole.velocity, rtol=0, atol=1e-6)

@@ -1,3 +1,4 @@
+import dataclasses
 import warnings
 
 import pytest
@@ -5,10 +6,11 @@ import torch
 from scenes import box, cloud
 
 from nmpm.data.initial_states import lattice, resting
+from nmpm.decoders import Flip
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
-from nmpm.emulator.rollouts import rollout, stream
+from nmpm.emulator.rollouts import check_inputs, rollout, stream
 from nmpm.processors import Pointwise
 
 
@@ -107,6 +109,74 @@ def test_what_is_no_number_in_the_middle_is_caught():
         next(made)
 
 
+class TestReadLate:
+    """As on a GPU: measures stay on the device for 16 bundles."""
+
+    @pytest.fixture(autouse=True)
+    def _no_branches(self, monkeypatch):
+        monkeypatch.setattr("nmpm.emulator.monitor.can_branch", lambda values: False)
+
+    def test_what_is_seen_is_the_same(self, monkeypatch):
+        scene = box()
+        emulator, particles = emulator_of(scene, 5.0), cloud(scene, batch=2)
+        late, early = Monitor(Policy.RECORD, speed=0.1), Monitor(Policy.RECORD, speed=0.1)
+        rollout(emulator, particles, 4 * 37, late)
+        monkeypatch.setattr("nmpm.emulator.monitor.can_branch", lambda values: True)
+        rollout(emulator, particles, 4 * 37, early)
+        assert late.incidents == early.incidents
+        assert late.peaks == early.peaks
+        assert late.at_walls == early.at_walls
+        assert late.report() == early.report()
+        assert late.incidents[0].frame < 4 * 16
+
+    def test_it_is_read_once_in_sixteen_bundles_and_at_the_end(self, monkeypatch):
+        read = []
+
+        class Watched(Monitor):
+            def read(self):
+                read.append(len(self._unread))
+                super().read()
+
+        scene = box()
+        rollout(emulator_of(scene, 1e-6), cloud(scene), 4 * 37, Watched(Policy.STOP))
+        assert read == [16, 16, 5]
+
+    def test_stop_comes_at_the_next_reading_and_names_the_frame(self):
+        scene = box()
+        emulator, particles = emulator_of(scene, 1e-6), cloud(scene, speed=0.0)
+        monitor, yielded = Monitor(Policy.STOP, speed=0.05), []
+        with pytest.raises(RolloutStoppedError, match=r"speed 0\.\d+ .* by frame 4"):
+            yielded.extend(stream(emulator, particles, 100, monitor))
+        assert len(yielded) == 15
+        assert monitor.incidents[0].frame < 64
+
+    def test_the_end_of_a_short_rollout_is_seen(self):
+        scene = box()
+        with pytest.raises(RolloutStoppedError, match="speed"):
+            rollout(emulator_of(scene, 5.0), cloud(scene), 8, Monitor(Policy.STOP, speed=0.1))
+
+    def test_padding_is_not_watched(self):
+        scene = box()
+        particles = cloud(scene)
+        mask = particles.mask.clone()
+        mask[:, 0] = False
+        fast = particles.velocity.clone()
+        fast[:, 0] = 1.0
+        state = dataclasses.replace(particles, velocity=fast, mask=mask)
+        monitor = Monitor(Policy.STOP)
+        rollout(emulator_of(scene, 1e-6), state, 4, monitor)
+        assert monitor.peaks["speed"] < 1
+
+
+def test_inputs_are_checked_in_one_reading(monkeypatch):
+    scene = box()
+    emulator, particles = emulator_of(scene, 1e-6), cloud(scene)
+    read, to_bool = [], torch.Tensor.__bool__
+    monkeypatch.setattr(torch.Tensor, "__bool__", lambda values: read.append(values) or to_bool(values))
+    check_inputs(emulator, particles)
+    assert len(read) == 1
+
+
 class TestBounds:
     def falling(self, rule: str) -> torch.Tensor:
         scene = box()
@@ -140,6 +210,32 @@ class TestBounds:
         fast = particles.moved(particles.position, torch.full_like(particles.position, 0.5))
         with pytest.raises(ValueError, match=r"particle 0: predicted at .* more than one beyond"):
             rollout(emulator.eval(), fast, 4)
+
+    def test_error_is_raised_once_per_bundle_for_real_particles_at_their_own_place(self, monkeypatch):
+        """Chunks of particles do not change the index that is named."""
+        monkeypatch.setattr(
+            "nmpm.emulator.advection.chunks", lambda count, *_: [slice(i, i + 7) for i in range(0, count, 7)]
+        )
+        scene = box()
+        parts = {"processor": Pointwise(hidden=(4,)), "decoder": Flip(), "constraints": Constraints(bounds="error")}
+        emulator = EmulatorRecipe(scene, 16, 4, **parts).build()
+        particles = cloud(scene, batch=2, speed=0.0)
+        velocity = particles.velocity.clone()
+        velocity[1, 23] = 0.7
+        emulator.output_scale.fill_(1e-9)
+        with pytest.raises(ValueError, match=r"Scene 1 of the batch, particle 23: .* in frame 1 of the bundle"):
+            rollout(emulator.eval(), particles.moved(particles.position, velocity), 4)
+
+    @pytest.mark.parametrize("rule", ["stop", "reflect", "error"])
+    def test_periodic_axes_have_no_bounds(self, rule):
+        scene = box(boundary=("periodic", "wall"), domain=((0.1, 0.9), (0.08, 0.92)))
+        parts = {"processor": Pointwise(hidden=(4,)), "decoder": Flip(), "constraints": Constraints(bounds=rule)}
+        emulator = EmulatorRecipe(scene, (16, 16), 4, **parts).build().eval()
+        emulator.output_scale.fill_(1e-9)
+        particles = cloud(scene, speed=0.0)
+        state = particles.moved(particles.position, torch.tensor([0.5, 0.0]).expand_as(particles.velocity))
+        moved = rollout(emulator, state, 4)[:, -1] - particles.position
+        torch.testing.assert_close(moved[..., 0], torch.full((1, 30), 2.0), rtol=1e-5, atol=0)
 
     def test_unknown(self):
         with pytest.raises(ValueError, match="bounds = 'wrap' is not one of stop, reflect, error"):

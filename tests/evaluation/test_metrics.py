@@ -50,6 +50,27 @@ def test_earth_mover_of_a_shift_is_its_length_and_ignores_order():
     assert earth_mover(cloud_, moved) == pytest.approx(0.5, rel=1e-6)
 
 
+def test_errors_are_those_of_float64_to_a_millionth():
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(2, 50, 3000, 2, generator=generator)
+    predicted = target + 1e-3 * torch.randn(target.shape, generator=generator)
+    metric = MSE(())
+    metric.update(recorded(target), predicted)
+    exact = (predicted.double() - target.double()).square().mean().item()
+    assert metric.compute()["mse"].item() == pytest.approx(exact, rel=1e-6)
+
+
+def test_states_of_metrics_need_no_float64():
+    """Not every device has it."""
+    earth, errors = EarthMover(every=1), MSE()
+    positions = torch.rand(2, 3, 4, 2)
+    for metric in (earth, errors):
+        metric.update(recorded(positions.flip(2)), positions)
+    kept = [*earth.distances, *errors.squared, *errors.lengths]
+    assert {values.dtype for values in kept} == {torch.float32, torch.int64}
+    assert EarthMover().compute() == {}
+
+
 def test_earth_mover_keeps_materials_apart():
     metric = EarthMover(every=1)
     ours = torch.tensor([[[[0.0, 0.0], [1.0, 0.0]]]])

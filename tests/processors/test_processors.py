@@ -128,3 +128,24 @@ def test_unet_refuses_a_grid_smaller_than_its_depth():
 def test_impossible_hyperparameters_are_named(recipe):
     with pytest.raises(ConfigError, match=type(recipe).__name__):
         recipe.build(GridLayout(3, 2, 1, (False, False)))
+
+
+@pytest.mark.parametrize("recipe", [FNO(modes=4, width=6, layers=2), TFNO(modes=4, width=6, layers=2, rank=0.5)])
+def test_fourier_operators_ignore_autocast(recipe):
+    torch.manual_seed(0)
+    network, grid = recipe.build(GridLayout(4, 2, 3, (False, False))).eval(), torch.randn(2, 4, 16, 16)
+    with torch.autocast("cpu", torch.bfloat16):
+        inside, half = network(grid), network(grid.bfloat16())
+    assert torch.equal(inside, network(grid))
+    assert half.dtype == torch.float32
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.bfloat16, 0.05), (torch.float64, 1e-5)])
+def test_a_factorised_fourier_operator_takes_weights_of_any_precision(dtype, tolerance):
+    torch.manual_seed(0)
+    network = FFNO(modes=4, width=6, layers=2).build(GridLayout(4, 2, 3, (False, False))).eval()
+    grid = torch.randn(2, 4, 16, 16)
+    expected = network(grid)
+    found = network.to(dtype)(grid.to(dtype))
+    assert found.dtype == dtype
+    assert (found - expected).abs().max() < tolerance * expected.abs().max()

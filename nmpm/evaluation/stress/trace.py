@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nmpm.emulator.constraints import MOST_GAIN, lowest_potential
-from nmpm.emulator.model import Emulator
+from nmpm.emulator import Emulator
+from nmpm.emulator.constraints import MOST_GAIN, lowest_potential, mass_shares
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.emulator.rollouts import beyond_walls, stream
 from nmpm.grid import Grid
@@ -105,13 +105,13 @@ def trace_rollout(emulator: Emulator, start: Particles, frames: int, every: int 
 
 
 def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
-    """Kinetic and potential energy per mass, all particles of a mass, the potential from the bounds' lowest corner.
+    """Kinetic and potential energy per mass of each scene, the potential from the bounds' lowest corner.
 
     Counted from there particle by particle: in a sum of large potentials, far from the origin, digits would be lost.
 
     Args:
         scene: Gives the bounds.
-        start: Gives gravity and which particles are real.
+        start: Gives gravity, materials and which particles are real.
         position: (B, T, N, D).
         velocity: (B, T, N, D) in length per frame.
 
@@ -121,8 +121,8 @@ def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, veloci
     gravity = start.gravity[:, None, None]
     lowest = lowest_potential(scene, start.gravity)[:, None, None]
     each = velocity.square().sum(-1) / 2 - lowest - (position * gravity).sum(-1)
-    real = start.mask.unsqueeze(1)
-    return torch.where(real, each, 0.0).sum(-1) / real.sum(-1).clamp(min=1)
+    share = mass_shares(scene, start.material, start.mask, each.dtype).squeeze(-1).unsqueeze(1)
+    return (torch.where(start.mask.unsqueeze(1), each, 0.0) * share).sum(-1)
 
 
 def is_lost(scene: Scene, position: Tensor) -> Tensor:
