@@ -28,7 +28,7 @@ from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirrored
-from nmpm.training.losses import position_error
+from nmpm.training.losses import density_error, position_error
 from nmpm.training.schedules import Schedule
 
 OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  # (jsonargparse knows this form)
@@ -51,6 +51,7 @@ class EmulatorModule(LightningModule):
         unroll_growth: Share of the training, in [0, 1], over which the calls grow from 1 to K: early steps are cheap.
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
+        density_weight: Weight of the density error at each bundle's last frame, beside the position error in cells².
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
@@ -69,6 +70,7 @@ class EmulatorModule(LightningModule):
         unroll_growth: float = 0.0,
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
+        density_weight: float = 0.0,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
         metrics: Sequence[RolloutMetric] | None = None,
@@ -86,7 +88,7 @@ class EmulatorModule(LightningModule):
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
-        self.position_noise, self.mirror = position_noise, tuple(mirror)
+        self.density_weight, self.position_noise, self.mirror = density_weight, position_noise, tuple(mirror)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
         plain = self.emulator.recipe.to_dict()
@@ -95,6 +97,7 @@ class EmulatorModule(LightningModule):
             "unroll": unroll,
             "unroll_growth": unroll_growth,
             "schedule": dataclasses.asdict(self.schedule),
+            "density_weight": density_weight,
             "position_noise": position_noise,
             "mirror": list(mirror),
             "recompute": recompute,
@@ -167,11 +170,21 @@ class EmulatorModule(LightningModule):
             chances = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
             batch = mirrored(batch, self.emulator.scene, axis, chances < 0.5)
         bundles = self._unrolled(self._perturbed(batch.initial), self.bundles(self._progress()))
-        predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
-        error = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
+        error = self._error(torch.cat([bundle.position for bundle in bundles], dim=1), batch)
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged, prog_bar=True)
         return loss
+
+    def _error(self, predicted: Tensor, batch: Window) -> Tensor:
+        """The error of predicted positions (B, K m, N, D), in float32 whatever autocast says."""
+        emulator, target = self.emulator, batch.target[:, : predicted.shape[1]]
+        error = position_error(predicted, target, batch.mask, emulator.grid)
+        if not self.density_weight:
+            return error
+        last = slice(emulator.frames - 1, None, emulator.frames)
+        with torch.autocast(predicted.device.type, enabled=False):
+            density = density_error(predicted[:, last], target[:, last], batch, emulator.scene, emulator.grid)
+        return error + self.density_weight * density
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:
         self.valid_errors.update(batch, self.predict_step(batch, batch_idx))
