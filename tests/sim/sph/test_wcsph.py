@@ -22,7 +22,7 @@ def lattice(columns, rows, low):
 def run(position, velocity, steps, gravity=(0.0, 0.0), fluid=WATER, box=BOX, dt=DT):
     state = SphParticles(position, velocity, fluid.density)
     stepper = SphStepper(fluid, SolidBoundary(box, (), H), H, np.array(gravity), dt)
-    stepper.begin(state)
+    stepper.initialise(state)
     for _ in range(steps):
         stepper.step(state)
     return state, stepper
@@ -138,7 +138,7 @@ def front(columns, until):
     nodes = np.stack(np.meshgrid(*[np.arange(columns)] * 2, indexing="ij"), -1).reshape(-1, 2)
     state = SphParticles(h * (nodes + 0.5), np.zeros((columns**2, 2)), 1.0)
     stepper = SphStepper(fluid, SolidBoundary(((0.0, 4.0), (0.0, 2.0)), (), h), h, np.array([0.0, -1.0]), dt)
-    stepper.begin(state)
+    stepper.initialise(state)
     for _ in range(round(until / dt)):
         stepper.step(state)
     return state.position[:, 0].max() + h / 2
@@ -164,7 +164,7 @@ def test_the_dam_breaks_front_is_that_of_martin_and_moyce():
     nodes = np.stack(np.meshgrid(np.arange(16), np.arange(32), indexing="ij"), -1).reshape(-1, 2)
     state = SphParticles(h * (nodes + 0.5), np.zeros((512, 2)), 1.0)
     stepper = SphStepper(fluid, SolidBoundary(((0.0, 5.0), (0.0, 3.0)), (), h), h, np.array([0.0, -1.0]), dt)
-    stepper.begin(state)
+    stepper.initialise(state)
     fronts, t = [], 0.0
     for late, _ in MARTIN_MOYCE:
         while t * np.sqrt(2) < late:
@@ -193,10 +193,10 @@ def test_the_list_of_pairs_is_renewed_in_time():
     for always in (False, True):
         state = SphParticles(position, np.zeros_like(position), fluid.density)
         stepper = SphStepper(fluid, SolidBoundary(((0.0, 30 * H), (0.0, 1.0)), (), H), H, np.array([4.0, -9.0]), DT)
-        stepper.begin(state)
+        stepper.initialise(state)
         for _ in range(400):
             if always:
-                stepper._list(state)
+                stepper._list_pairs(state)
             stepper.step(state)
         states.append(state)
     assert np.abs(states[0].position - position).max() > H, "The test should move particles past the room to spare."
