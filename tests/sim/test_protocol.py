@@ -122,8 +122,3 @@ def test_distances_from_polygons_are_negative_inside():
 def test_the_number_of_frames_is_checked(frames):
     with pytest.raises(ConfigError, match="frames"):
         load_preset("goop").with_frames(frames)
-
-
-def test_a_grid_that_does_not_divide_is_not_coarsened():
-    with pytest.raises(ConfigError, match="56 cells cannot be coarsened 3 times"):
-        load_preset("goop").coarsened(3)

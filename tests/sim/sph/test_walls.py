@@ -56,7 +56,7 @@ def test_particles_of_overlapping_obstacles_are_not_doubled():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_held_back_particles_are_outside_of_boundary_and_do_not_move_into_them(seed):
+def test_clamped_particles_are_outside_of_solids_and_do_not_move_into_them(seed):
     rng = np.random.default_rng(seed)
     boundary = SolidBoundary(BOX, (RAMP,), 0.01)
     x, y = rng.uniform(-0.1, 1.1, (2, 50))
@@ -75,7 +75,7 @@ def test_held_back_particles_are_outside_of_boundary_and_do_not_move_into_them(s
     assert np.all(along[put] >= -1e-9)
 
 
-def test_shown_particles_are_the_first_layer_and_the_obstacles():
+def test_visible_particles_are_the_first_layer_and_the_obstacles():
     boundary = SolidBoundary(BOX, (SQUARE,), 0.05)
     shown = boundary.position[boundary.visible]
     outside = np.any((shown < 0) | (shown > 1), axis=1)
