@@ -24,7 +24,7 @@ SIZES = {
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_every_preset_survives_its_own_file(name):
+def test_every_preset_round_trips_through_json(name):
     preset = load_preset(name)
     assert preset.name == name
     assert preset_from_dict(json.loads(json.dumps(preset.to_dict()))) == preset
@@ -40,7 +40,7 @@ def test_sizes_are_those_of_the_paper(name, particles, frames):
 
 @pytest.mark.parametrize("name", MPM)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_every_mpm_scene_begins_well(name, seed):
+def test_the_first_frames_of_every_mpm_scene_are_valid(name, seed):
     preset = load_preset(name).with_frames(4)
     made = preset.simulate(seed)
     moving, scene = made.particle_type != BOUNDARY, preset.scene
@@ -110,6 +110,6 @@ def test_every_material_is_in_every_scene_of_several():
         ({"box": [[0.1, 0.9]]}, "1 axes; 2 or 3"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, message):
+def test_invalid_values_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         preset_from_dict(load_preset("waterramps").to_dict() | changes)

@@ -13,13 +13,12 @@ import numpy as np
 
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.arrays import Array
 from nmpm.sim.config import check, from_section, section_entries
 from nmpm.sim.gravity import draw_gravity
 from nmpm.sim.initial_state import InitialState
 from nmpm.sim.mpm.blocks import MpmBlockRanges
 from nmpm.sim.mpm.grid import MpmGrid, Walls
-from nmpm.sim.mpm.materials import MATERIALS, Material
+from nmpm.sim.mpm.materials import MATERIALS, Material, materials_from_section
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
@@ -246,7 +245,7 @@ class MpmPreset(Preset):
     def _grid(self, gravity: tuple[float, ...], ramps: tuple[Ramp, ...]) -> MpmGrid:
         low, high = np.array(self.reach).T
         shape = tuple(round(cells) for cells in (high - low) / self.cell_size)
-        pull: Array = np.array(gravity, dtype=np.float64)
+        pull = np.array(gravity, dtype=np.float64)
         grid = MpmGrid(low, self.cell_size, shape, self.wall_friction, pull, Walls(self.walls))
         if not ramps:
             return grid
@@ -283,7 +282,7 @@ class MpmPreset(Preset):
     def from_dict(cls, plain: Mapping[str, Any]) -> MpmPreset:
         entries = section_entries(cls, plain, "the preset")
         entries["blocks"] = from_section(MpmBlockRanges, entries["blocks"], "blocks")
-        entries["materials"] = _materials_from_section(entries["materials"])
+        entries["materials"] = materials_from_section(entries["materials"])
         if entries.get("ramps") is not None:
             entries["ramps"] = from_section(RampRanges, entries["ramps"], "ramps")
         preset: MpmPreset = from_section(cls, entries, "the preset")
@@ -295,12 +294,3 @@ def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:
     if len(ramps) != len(start.obstacles):
         raise DataError("The material point method simulates ramps; other obstacles are not implemented.")
     return ramps
-
-
-def _materials_from_section(section: Any) -> tuple[Material, ...]:
-    if not isinstance(section, Mapping):
-        raise ConfigError("materials must map names to parameters.")
-    unknown = sorted(set(section) - set(MATERIALS))
-    if unknown:
-        raise ConfigError(f"Unknown material {', '.join(map(str, unknown))}; known are {', '.join(MATERIALS)}.")
-    return tuple(from_section(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())

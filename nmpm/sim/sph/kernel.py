@@ -1,4 +1,4 @@
-"""The quintic spline, by which particles weigh their neighbours (Morris, Fox & Zhu 1997), in two dimensions.
+"""The quintic spline kernel in two dimensions (Morris, Fox & Zhu 1997).
 
 With q = r / h it is w(q) = (3 − q)⁵₊ − 6 (2 − q)⁵₊ + 15 (1 − q)⁵₊, W(r) = 7 / (478 π h²) · w(q). It is zero from
 `SUPPORT` smoothing lengths on, its integral over the plane is one, and it has four continuous derivatives.

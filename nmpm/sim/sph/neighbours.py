@@ -36,7 +36,7 @@ class CellGrid:
 
     @property
     def inverse(self) -> float:
-        """Cells per length: a little fewer than size says, so that rounding never puts a pair two cells apart."""
+        """Cells per length, reduced slightly so that rounding never puts a pair two cells apart."""
         return (1.0 - 1e-9) / self.size
 
     @classmethod
@@ -45,7 +45,7 @@ class CellGrid:
         columns, rows = (int(n) + 4 for n in (high - low) / size)
         return cls(np.asarray(low, np.float64) - 1.001 * size, size, (columns, rows))
 
-    def sorting(self, x: Array, y: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def sort_by_cell(self, x: Array, y: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Order of the particles by cell, and where each cell's run of them starts (cells + 1 numbers).
 
         Particles must lie in the rectangle; within a cell they keep their order.
@@ -58,7 +58,7 @@ class CellGrid:
 
 
 class PairFinder:
-    """Finds pairs within a grid's cell size, and keeps the memory for them.
+    """Finds pairs within a grid's cell size, in memory that it reuses.
 
     Args:
         grid: Covers all particles.
@@ -68,20 +68,22 @@ class PairFinder:
         self.grid = grid
         self._memory = np.empty((2, 1024), np.uint32)
 
-    def within(self, x: Array, y: Array, starts: NDArray[np.int64]) -> Pairs:
+    def pairs_within(self, x: Array, y: Array, starts: NDArray[np.int64]) -> Pairs:
         """Every pair of sorted particles once; valid until the next call."""
-        return self._grown(lambda memory: _pairs_within(x, y, starts, *self._facts, memory))
+        return self._fill_memory(lambda memory: _pairs_within(x, y, starts, *self._grid_arguments, memory))
 
-    def between(self, x: Array, y: Array, others_x: Array, others_y: Array, starts: NDArray[np.int64]) -> Pairs:
+    def pairs_between(self, x: Array, y: Array, others_x: Array, others_y: Array, starts: NDArray[np.int64]) -> Pairs:
         """Every pair of a particle and one of the others, which are sorted; valid until the next call."""
-        return self._grown(lambda memory: _pairs_between(x, y, others_x, others_y, starts, *self._facts, memory))
+        return self._fill_memory(
+            lambda memory: _pairs_between(x, y, others_x, others_y, starts, *self._grid_arguments, memory)
+        )
 
     @property
-    def _facts(self) -> tuple[float, float, float, float, int]:
+    def _grid_arguments(self) -> tuple[float, float, float, float, int]:
         grid = self.grid
         return float(grid.low[0]), float(grid.low[1]), grid.inverse, grid.size, grid.shape[0]
 
-    def _grown(self, fill: Callable[[Indices], int]) -> Pairs:
+    def _fill_memory(self, fill: Callable[[Indices], int]) -> Pairs:
         count = fill(self._memory)
         if count >= self._memory.shape[1]:
             self._memory = np.empty((2, count + count // 4 + 1), np.uint32)

@@ -30,20 +30,22 @@ def relax(position: Array, box: tuple[tuple[float, float], tuple[float, float]],
     boundary = SolidBoundary(box, (), spacing)
     grid = CellGrid.covering(boundary.position.min(0), boundary.position.max(0), SUPPORT * spacing)
     finder, wall_finder = PairFinder(grid), PairFinder(grid)
-    order, wall_starts = grid.sorting(*np.ascontiguousarray(boundary.position.T))
+    order, wall_starts = grid.sort_by_cell(*np.ascontiguousarray(boundary.position.T))
     wall_x, wall_y = np.ascontiguousarray(boundary.position[order].T)
     x, y = np.ascontiguousarray(position.T)
     identity, still = np.arange(len(x)), np.zeros_like(x)
     for _ in range(sweeps):
-        boundary.hold_back(x, y, still, still)
-        order, starts = grid.sorting(x, y)
+        boundary.clamp(x, y, still, still)
+        order, starts = grid.sort_by_cell(x, y)
         x, y, identity = x[order], y[order], identity[order]
-        shift = _concentration_gradient(x, y, finder.within(x, y, starts), spacing)
-        shift += _wall_gradient(x, y, wall_x, wall_y, wall_finder.between(x, y, wall_x, wall_y, wall_starts), spacing)
+        shift = _concentration_gradient(x, y, finder.pairs_within(x, y, starts), spacing)
+        shift += _wall_gradient(
+            x, y, wall_x, wall_y, wall_finder.pairs_between(x, y, wall_x, wall_y, wall_starts), spacing
+        )
         shift *= -_STEP * spacing**2
         shift *= np.minimum(1.0, _LIMIT * spacing / np.maximum(np.hypot(*shift), 1e-30))
         x, y = x + shift[0], y + shift[1]
-    boundary.hold_back(x, y, still, still)
+    boundary.clamp(x, y, still, still)
     spread = np.empty((len(x), 2))
     spread[identity] = np.stack([x, y], -1)
     return spread

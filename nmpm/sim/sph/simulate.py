@@ -29,8 +29,8 @@ def record_frames(
     Raises:
         ConfigError: if the simulation becomes unstable; the message names the frame.
     """
-    stepper.begin(particles)
-    walls = stepper.boundary.position[stepper.boundary.shown]
+    stepper.initialise(particles)
+    walls = stepper.boundary.position[stepper.boundary.visible]
     moving = len(particles.identity)
     recorded = np.empty((frames + 1, moving + len(walls), 2), np.float32)
     recorded[0, :moving], recorded[:, moving:] = particles.position, walls

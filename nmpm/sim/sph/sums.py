@@ -129,7 +129,7 @@ def push(
 ) -> None:
     """Adds the accelerations of pressure (Adami et al. 2012, equations 6 and 7) and viscosity to ax and ay.
 
-    Viscosity is Monaghan's (2005, equation 4.2), for pairs that approach and that part alike; `viscosity` stands for
+    Viscosity is Monaghan's (2005, equation 4.2), whether pairs approach or part; `viscosity` stands for
     α h c plus eight times the kinematic viscosity. Both act along the line between two particles, so that momentum and
     angular momentum are kept.
     """
@@ -161,7 +161,7 @@ def wall_averages(
 ) -> None:
     """Pressure and velocity of the walls, continued from the fluid (Adami et al. 2012, equations 22, 23 and 27).
 
-    Rows of `wall` become pressure, velocity along x and y, and the sum of the weights; nought where no fluid is near.
+    Rows of `wall` become pressure, velocity along x and y, and the sum of the weights; 0 where no fluid is near.
     """
     wall[:] = 0.0
     for k in range(first.shape[0]):

@@ -1,4 +1,4 @@
-"""Solids: the box and convex obstacles in it, as dummy particles for the fluid to feel and as surfaces not to cross.
+"""The box and the obstacles in it, as dummy particles that act on the fluid and as surfaces that it cannot cross.
 
 Dummy particles continue the fluid's lattice into the solid, three layers deep, the kernel's reach (Adami, Hu & Adams,
 "A generalized wall boundary condition for smoothed particle hydrodynamics", 2012): the first layer lies half a spacing
@@ -17,7 +17,7 @@ from nmpm.sim.arrays import Array
 from nmpm.sim.jit import jit
 from nmpm.sim.sph.obstacles import LAYERS, PolygonObstacle
 
-# Distance from a surface, in spacings, at which a particle is held back. Float32 can still tell it from the surface.
+# Distance from a surface, in spacings, at which a particle is clamped. Float32 can still tell it from the surface.
 _MARGIN = 1e-3
 
 
@@ -77,8 +77,8 @@ class SolidBoundary:
         inner = _particles_of_all(obstacles, low, high, spacing)
         self.position: Array = np.concatenate([around, inner])
         """(M, 2) of all dummy particles."""
-        self.shown: NDArray[np.bool_] = np.concatenate([layer == 0, np.ones(len(inner), np.bool_)])
-        """(M,) whether a trajectory shows it: the box's first layer, and obstacles."""
+        self.visible: NDArray[np.bool_] = np.concatenate([layer == 0, np.ones(len(inner), np.bool_)])
+        """(M,) whether a trajectory contains it: the box's first layer, and obstacles."""
         self._planes = np.concatenate(
             [np.column_stack([o.normals, o.offsets]) for o in obstacles] or [np.empty((0, 3))]
         )
@@ -86,13 +86,13 @@ class SolidBoundary:
         self._box, self._obstacles = (low, high), obstacles
         self._low, self._high = low + self.margin, high - self.margin
 
-    def hold_back(self, x: Array, y: Array, vx: Array, vy: Array) -> int:
-        """Put particles that have crossed a surface back on it, without their velocity into the solid.
+    def clamp(self, x: Array, y: Array, vx: Array, vy: Array) -> int:
+        """Move particles that have crossed a surface back to it, and remove their velocity into the solid.
 
         Returns:
-            How many there were.
+            How many particles were moved.
         """
-        held: int = _hold_back(x, y, vx, vy, self._low, self._high, self._planes, self._ends, self.margin)
+        held: int = _clamp(x, y, vx, vy, self._low, self._high, self._planes, self._ends, self.margin)
         return held
 
     def count_outside(self, points: NDArray[np.floating]) -> int:
@@ -105,7 +105,7 @@ class SolidBoundary:
 
 
 def _particles_of_all(obstacles: tuple[PolygonObstacle, ...], low: Array, high: Array, spacing: float) -> Array:
-    """Dummy particles of all obstacles that lie in the box, and in no obstacle before their own."""
+    """Dummy particles of all obstacles; those outside of the box or in an earlier obstacle are left out."""
     kept = [np.empty((0, 2))]
     for index, obstacle in enumerate(obstacles):
         points = obstacle_particles(obstacle, spacing)
@@ -117,7 +117,7 @@ def _particles_of_all(obstacles: tuple[PolygonObstacle, ...], low: Array, high: 
 
 
 @jit
-def _hold_back(
+def _clamp(
     x: Array,
     y: Array,
     vx: Array,

@@ -7,12 +7,12 @@ mass at the free surface and pull it in. Walls are dummy particles with pressure
 (Adami, Hu & Adams, "A generalized wall boundary condition for smoothed particle hydrodynamics", 2012).
 
 Spray, particles with few neighbours, bears no tension, and its pressure fades within the time that sound takes past
-ten of them. Else a few particles far from the rest may hold each other in orbit while their densities drift apart until
-they burst, and a particle torn off under pressure would carry it through the air into the next wave.
+ten of them. Otherwise a few particles far from the rest can orbit each other while their densities diverge until they
+burst, and a particle torn off under pressure would carry it through the air into the next wave.
 
 A step is kick, drift, kick: half a step of acceleration, a step of position, density from the new positions and the
-velocity in between, acceleration anew, and the second half of it. Pairs are listed with some room to spare, and
-listed anew once a particle has used up half of it.
+velocity in between, acceleration anew, and the second half of it. Pairs are listed within a
+margin beyond the kernel's reach, and listed anew once a particle has moved by half of it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from nmpm.sim.sph.neighbours import CellGrid, PairFinder
 from nmpm.sim.sph.walls import SolidBoundary
 
 REVISION = 1
-"""Raised whenever the same preset and seed would give other numbers."""
+"""Increased whenever the same preset and seed give other numbers."""
 
-# Room to spare in the list of pairs, in spacings: more room lists more pairs, less room lists them more often.
+# Margin of the list of pairs, in spacings: a larger one lists more pairs, a smaller one lists them more often.
 _SKIN = 0.4
 
-# Listed neighbours below which a particle is spray: a third of what surrounds one within the fluid.
+# Listed neighbours below which a particle is spray: a third of those within the fluid.
 _SPRAY = round(np.pi * (SUPPORT + _SKIN) ** 2 / 3)
 
 # Particles that sound passes while the excess of spray's density falls to 1 / e.
@@ -41,11 +41,11 @@ _FADING = 10.0
 
 
 class SphStepper:
-    """Advances a particles by steps of one length.
+    """Advances particles by steps of one length.
 
     Args:
-        fluid: What flows.
-        boundary: What it flows around.
+        fluid: Its parameters.
+        boundary: The walls.
         spacing: Of the particles at rest; also the kernel's smoothing length.
         gravity: (2,) acceleration, in length per second squared.
         dt: Length of a step, in seconds.
@@ -55,10 +55,10 @@ class SphStepper:
         self.fluid, self.boundary, self.spacing, self.gravity, self.dt = fluid, boundary, spacing, gravity, dt
         self.mass = fluid.density * spacing**2
         self.held_back = 0
-        """Particles held back at surfaces so far."""
+        """Particles clamped at surfaces so far."""
         position = boundary.position
         grid = CellGrid.covering(position.min(0), position.max(0), (SUPPORT + _SKIN) * spacing)
-        order, self._wall_starts = grid.sorting(*position.T)
+        order, self._wall_starts = grid.sort_by_cell(*position.T)
         self._wall_x, self._wall_y = (np.ascontiguousarray(axis) for axis in position[order].T)
         self._grid, self._finder, self._wall_finder = grid, PairFinder(grid), PairFinder(grid)
         self._wall = np.zeros((4, len(position)))
@@ -67,12 +67,12 @@ class SphStepper:
         self._listed_at = np.empty((2, 0))
         self._spray = np.empty(0, np.int64)
 
-    def begin(self, particles: SphParticles) -> None:
-        """Accelerations of a particles; it must begin so."""
+    def initialise(self, particles: SphParticles) -> None:
+        """Initialise accelerations and lists of pairs; call it once before the first step."""
         particles.table[5:7] = 0.0
-        self._hold_back(particles)
-        self._list(particles)
-        self._interact(particles, 0.0)
+        self._clamp(particles)
+        self._list_pairs(particles)
+        self._update_forces(particles, 0.0)
 
     def step(self, particles: SphParticles) -> None:
         """One step, in place.
@@ -82,36 +82,36 @@ class SphStepper:
         """
         _kick(particles.table, 0.5 * self.dt)
         _drift(particles.table, self.dt)
-        self._hold_back(particles)
-        moved = _furthest(particles.table, self._listed_at)
+        self._clamp(particles)
+        moved = _max_displacement(particles.table, self._listed_at)
         if not np.isfinite(moved):
             raise FloatingPointError("The state is not finite")
         if moved > 0.5 * _SKIN * self.spacing:
-            self._list(particles)
-        self._interact(particles, self.dt)
+            self._list_pairs(particles)
+        self._update_forces(particles, self.dt)
         _kick(particles.table, 0.5 * self.dt)
 
     def pressure(self, particles: SphParticles) -> Array:
         """(N,) in the first order."""
         return _pressure(particles.density, self.fluid.density, self.fluid.speed_of_sound, self.fluid.exponent)
 
-    def _hold_back(self, particles: SphParticles) -> None:
+    def _clamp(self, particles: SphParticles) -> None:
         x, y, vx, vy = particles.table[:4]
-        self.held_back += self.boundary.hold_back(x, y, vx, vy)
+        self.held_back += self.boundary.clamp(x, y, vx, vy)
 
-    def _list(self, particles: SphParticles) -> None:
-        order, starts = self._grid.sorting(particles.table[0], particles.table[1])
+    def _list_pairs(self, particles: SphParticles) -> None:
+        order, starts = self._grid.sort_by_cell(particles.table[0], particles.table[1])
         particles.sort(order)
         x, y = particles.table[:2]
         self._listed_at = particles.table[:2].copy()
-        self._pairs = self._finder.within(x, y, starts)
-        self._wall_pairs = self._wall_finder.between(x, y, self._wall_x, self._wall_y, self._wall_starts)
+        self._pairs = self._finder.pairs_within(x, y, starts)
+        self._wall_pairs = self._wall_finder.pairs_between(x, y, self._wall_x, self._wall_y, self._wall_starts)
         neighbours = sum(np.bincount(side, minlength=len(x)) for side in (*self._pairs, self._wall_pairs[0]))
         self._spray = np.flatnonzero(neighbours < _SPRAY)
-        self._memory = _room(self._memory, len(self._pairs[0]))
-        self._wall_memory = _room(self._wall_memory, len(self._wall_pairs[0]))
+        self._memory = _with_capacity(self._memory, len(self._pairs[0]))
+        self._wall_memory = _with_capacity(self._wall_memory, len(self._wall_pairs[0]))
 
-    def _interact(self, particles: SphParticles, dt: float) -> None:
+    def _update_forces(self, particles: SphParticles, dt: float) -> None:
         """Density after dt, then accelerations."""
         fluid, h = self.fluid, self.spacing
         rest, sound = fluid.density, fluid.speed_of_sound
@@ -142,17 +142,17 @@ class SphStepper:
         )  # fmt: skip
 
 
-def _room(memory: Array, count: int) -> Array:
+def _with_capacity(memory: Array, count: int) -> Array:
     return memory if memory.shape[1] >= count else np.empty((memory.shape[0], count + count // 4))
 
 
 def _pressure(density: Array, rest: float, sound: float, exponent: float) -> Array:
-    """Tait's equation of particles."""
+    """Tait's equation of state."""
     return rest * sound**2 / exponent * ((density / rest) ** exponent - 1.0)
 
 
 def _density(pressure: Array, rest: float, sound: float, exponent: float) -> Array:
-    """Its inverse; far below any pressure that occurs, where there is none, a tenth of the density at rest."""
+    """Inverse of `_pressure`; a tenth of the density at rest where there is none, far below pressures that occur."""
     ratio = 1.0 + pressure * exponent / (rest * sound**2)
     return np.asarray(rest * np.maximum(ratio, 0.1**exponent) ** (1.0 / exponent))
 
@@ -172,8 +172,8 @@ def _drift(table: Array, dt: float) -> None:
 
 
 @jit
-def _furthest(table: Array, listed_at: Array) -> float:
-    """Largest way of a particle since the pairs were listed; infinite where one is not finite."""
+def _max_displacement(table: Array, listed_at: Array) -> float:
+    """Largest displacement of a particle since the pairs were listed; infinite if one is not finite."""
     most = 0.0
     for i in range(table.shape[1]):
         dx, dy = table[0, i] - listed_at[0, i], table[1, i] - listed_at[1, i]

@@ -45,7 +45,7 @@ def test_water_follows_deepminds(recorded):
     assert np.all(ours < 0.05e-3)
 
 
-def test_corners_that_stop_what_slides_down_would_not(recorded):
+def test_closed_corners_follow_deepminds_water_less_well(recorded):
     closed = dataclasses.replace(WATERDROP, walls="slip")
     path = recorded / "deepmind-waterdrop" / "valid.h5"
     assert errors(closed, path, 300)[0].mean() > 3 * errors(WATERDROP, path, 300)[0].mean()

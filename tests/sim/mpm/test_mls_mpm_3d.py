@@ -43,7 +43,7 @@ def test_free_fall_is_exact():
     np.testing.assert_allclose(water.position - start, np.broadcast_to(moved, start.shape), atol=1e-10)
 
 
-def test_momentum_and_angular_momentum_are_kept_by_what_flies_free():
+def test_momentum_and_angular_momentum_are_kept_in_free_flight():
     start = cloud((0.35, 0.35, 0.35), (8, 6, 7))
     spin = np.cross(np.array([3.0, -2.0, 4.0]), start - start.mean(axis=0))
     water = state(start, spin + np.array([0.2, 0.1, -0.3]))
@@ -120,7 +120,7 @@ def test_pressure_at_the_bottom_carries_the_column():
     assert slope == pytest.approx(-9.81 * 1000, rel=0.1)
 
 
-def test_friction_slows_what_slides():
+def test_friction_slows_sliding_material():
     start = cloud((0.2, 0.0, 0.3), (6, 4, 6))
     throw = np.broadcast_to([1.0, 0.0, 0.5], start.shape)
     speeds = []
@@ -136,7 +136,7 @@ def test_friction_slows_what_slides():
 
 
 @pytest.mark.parametrize("walls", [Walls.SEPARATE, Walls.SLIP])
-def test_nobody_leaves_however_hard_it_is_thrown(walls):
+def test_fast_particles_stay_in_the_box(walls):
     rng = np.random.default_rng(0)
     start = rng.uniform(0.15, 0.85, (400, 3))
     water = state(start, rng.normal(scale=20.0, size=start.shape))
@@ -146,7 +146,7 @@ def test_nobody_leaves_however_hard_it_is_thrown(walls):
         assert np.all((water.position >= 0) & (water.position <= 1))
 
 
-def test_what_is_not_finite_is_found():
+def test_non_finite_velocities_are_detected():
     start = cloud((0.4, 0.4, 0.4), (3, 3, 3))
     water = state(start, np.zeros_like(start))
     water.velocity[4, 2] = np.nan
@@ -154,7 +154,7 @@ def test_what_is_not_finite_is_found():
         Stepper3d(grid(), 1e-4).step(water)
 
 
-def test_what_is_known_in_two_dimensions_only_is_refused():
+def test_features_of_two_dimensions_only_are_refused():
     with pytest.raises(ConfigError, match="in two dimensions, not in three"):
         Stepper3d(grid(walls=Walls.OPEN_CORNERS), 1e-4)
     plain = load_preset("waterdrop3d").to_dict()

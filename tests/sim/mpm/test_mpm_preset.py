@@ -59,7 +59,7 @@ def test_scene_states_the_facts():
         ({"blocks": 3}, "blocks"),
     ],
 )
-def test_refuses_what_cannot_be_and_names_it(tmp_path, changes, message):
+def test_an_invalid_file_is_refused_naming_the_key(tmp_path, changes, message):
     path = write(tmp_path, **changes)
     with pytest.raises(ConfigError, match=message) as caught:
         load_preset(path)

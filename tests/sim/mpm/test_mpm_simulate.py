@@ -109,7 +109,7 @@ def test_starts_from_the_very_corner():
     assert made.position.max() <= 0.9
 
 
-def test_tells_of_its_progress():
+def test_progress_is_called_after_each_frame():
     seen: list[int] = []
     GOOP.simulate_from(InitialState(block(2, 2, (0.4, 0.4)), np.zeros((4, 2))), frames=3, progress=seen.append)
     assert seen == [1, 2, 3]
@@ -125,7 +125,7 @@ def test_tells_of_its_progress():
         ([[0.5, 0.5, 0.5]], [[0, 0, 0]], "shape"),
     ],
 )
-def test_refuses_states_that_cannot_be(position, velocity, message):
+def test_invalid_states_are_refused(position, velocity, message):
     with pytest.raises(DataError, match=message):
         GOOP.simulate_from(InitialState(np.array(position, float), np.array(velocity, float)), frames=1)
 

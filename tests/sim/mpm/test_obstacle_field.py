@@ -84,7 +84,7 @@ def test_obstacles_thinner_than_cells_let_no_jet_through(angle, cells):
     assert above.min() > 0
 
 
-def test_a_particle_that_comes_too_near_is_put_back_without_its_velocity_inwards():
+def test_a_particle_too_near_is_pushed_out_without_its_velocity_inwards():
     field = stepper(strip((0.3, 0.3), 0.0, 0.4, 0.1)).grid.obstacles
     before = np.array([[0.3, 0.36], [0.3, 0.3535], [0.3, 0.4]])
     position, velocity = before - [[0.0, 0.012], [0.0, 0.0], [0.0, 0.0]], np.tile([1.0, -2.0], (3, 1))
@@ -118,7 +118,7 @@ def test_material_leaves_an_obstacle_freely():
     np.testing.assert_allclose(moving.velocity, np.tile([0.0, 2.0], (len(position), 1)), atol=1e-9)
 
 
-def test_a_state_begins_outside_of_obstacles():
+def test_enclose_pushes_particles_out_of_obstacles():
     distance = strip((0.3, 0.3), 0.4, 0.2, 0.1)
     run = stepper(distance)
     position = block(20, 20, (0.25, 0.25))
@@ -128,7 +128,7 @@ def test_a_state_begins_outside_of_obstacles():
     assert distance(begun.position).min() >= 0
 
 
-def test_refuses_a_state_without_a_way_out():
+def test_a_particle_without_a_way_out_is_refused():
     run = stepper(lambda points: np.full(len(points), -1.0))
     with pytest.raises(DataError, match=r"Particle 0 at .* inside an obstacle"):
         run.enclose(state(block(1, 1, (0.3, 0.3)), np.zeros((1, 2))))

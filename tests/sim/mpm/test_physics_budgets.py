@@ -72,7 +72,7 @@ def test_nothing_leaves_the_box_whatever_its_walls(seed, speed, friction, walls)
 
 
 @pytest.mark.parametrize(("walls", "speed"), [(Walls.SEPARATE, 1.0), (Walls.SLIP, 0.0), (Walls.OPEN_CORNERS, 0.0)])
-def test_only_walls_that_hold_keep_what_would_leave(walls, speed):
+def test_only_walls_that_hold_stop_material_that_leaves(walls, speed):
     position = lattice((0.2, 0.0), (0.4, SIZE / 2), SIZE / 2)
     state = at_rest(position, ((WATER, len(position)),), SIZE)
     state.position[:, 1] = 0.001 * SIZE - (0.0 if walls is Walls.SEPARATE else 0.5 * SIZE)

@@ -67,7 +67,7 @@ def test_drawn_bars_keep_their_distance_from_everything(seed, low):
     assert sum(len(ramp.particles(0.01)) for ramp in drawn) <= RAMPS.max_particles(0.01)
 
 
-def test_the_nearest_bar_counts():
+def test_distance_is_to_the_nearest_bar():
     one, two = Ramp((0.3, 0.3), 0.2, 0.02, 0.0), Ramp((0.7, 0.7), 0.2, 0.02, 0.0)
     points = np.array([[0.3, 0.36], [0.7, 0.76], [0.7, 0.7]])
     np.testing.assert_allclose(distance_to_ramps((one, two), points), [0.05, 0.05, -0.01], atol=1e-12)
@@ -84,7 +84,7 @@ def test_the_nearest_bar_counts():
         ({"gap": -0.1}, "ramps.gap"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, message):
+def test_invalid_values_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         dataclasses.replace(RAMPS, **changes)
 

@@ -35,7 +35,7 @@ def energy(water, dt):
 
 def test_walls_are_where_the_recordings_are(preset, theirs):
     boundary = SolidBoundary(preset.box, (), preset.spacing)
-    mine = boundary.position[boundary.shown]
+    mine = boundary.position[boundary.visible]
     np.testing.assert_allclose(
         mine[np.lexsort(mine.round(3).T)], theirs[1][np.lexsort(theirs[1].round(3).T)], atol=1e-5
     )

@@ -29,7 +29,7 @@ def test_slope_is_the_derivative_and_never_points_outwards(q):
 
 
 @given(st.floats(SUPPORT, 1e6))
-def test_is_nought_beyond_its_support(q):
+def test_is_zero_beyond_its_support(q):
     assert weight(q) == 0.0
     assert slope(q) == 0.0
 

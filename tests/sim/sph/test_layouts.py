@@ -33,11 +33,11 @@ def test_a_column_fills_its_corner_evenly():
     assert all(half.sum() == pytest.approx(300, abs=10) for half in halves)
 
 
-def test_relaxation_spreads_strewn_particles():
+def test_relaxation_spreads_random_particles():
     rng = np.random.default_rng(0)
-    strewn = rng.uniform(0, 1, (400, 2))
+    scattered = rng.uniform(0, 1, (400, 2))
     box = ((0.0, 1.0), (0.0, 1.0))
-    evenness = [np.percentile(nearest(relax(strewn, box, 0.05, sweeps)), 5) for sweeps in (0, 30, 300)]
+    evenness = [np.percentile(nearest(relax(scattered, box, 0.05, sweeps)), 5) for sweeps in (0, 30, 300)]
     assert evenness[0] < evenness[1] < evenness[2]
     assert evenness[2] > 0.6 * 0.05
 

@@ -21,7 +21,7 @@ def points(most=40):
 
 
 def sorted_points(grid, position):
-    order, starts = grid.sorting(*np.ascontiguousarray(position.T))
+    order, starts = grid.sort_by_cell(*np.ascontiguousarray(position.T))
     x, y = np.ascontiguousarray(position[order].T)
     return order, starts, x, y
 
@@ -35,7 +35,7 @@ def as_set(pairs):
 def test_pairs_within_are_those_of_brute_force_each_once(position, reach):
     grid = CellGrid.covering(LOW, HIGH, reach)
     _, starts, x, y = sorted_points(grid, position)
-    first, second = PairFinder(grid).within(x, y, starts)
+    first, second = PairFinder(grid).pairs_within(x, y, starts)
     near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < reach * reach
     assert as_set((first, second)) == as_set(np.nonzero(np.triu(near, 1)))
     assert len(first) == len(as_set((first, second)))
@@ -47,7 +47,7 @@ def test_pairs_between_are_those_of_brute_force(position, others, reach):
     grid = CellGrid.covering(LOW, HIGH, reach)
     _, starts, other_x, other_y = sorted_points(grid, others)
     x, y = np.ascontiguousarray(position.T)
-    pairs = PairFinder(grid).between(x, y, other_x, other_y, starts)
+    pairs = PairFinder(grid).pairs_between(x, y, other_x, other_y, starts)
     near = (x[:, None] - other_x) ** 2 + (y[:, None] - other_y) ** 2 < reach * reach
     assert as_set(pairs) == as_set(np.nonzero(near))
 
@@ -59,7 +59,7 @@ def test_memory_grows_with_the_pairs():
     for count in (10, 2000, 100):
         position = rng.uniform(LOW, HIGH, (count, 2))
         _, starts, x, y = sorted_points(grid, position)
-        assert as_set(finder.within(x, y, starts)) == as_set(
+        assert as_set(finder.pairs_within(x, y, starts)) == as_set(
             cKDTree(np.stack([x, y], -1)).query_pairs(0.1, output_type="ndarray").T
         )
 

@@ -60,7 +60,7 @@ def test_wbcsph_has_the_papers_sizes_and_a_gravity_of_its_own():
         ({"obstacles": {"number": [3, 1], "size": [0.1, 0.2], "gap": 0.0}}, "obstacles.number"),
     ],
 )
-def test_refuses_what_cannot_be_and_names_it(tmp_path, changes, message):
+def test_an_invalid_file_is_refused_naming_the_key(tmp_path, changes, message):
     path = tmp_path / "mine.yaml"
     OmegaConf.save(OmegaConf.create(DAM.to_dict() | changes), path)
     with pytest.raises(ConfigError, match=message) as caught:
@@ -120,7 +120,7 @@ def test_a_blow_up_names_preset_seed_and_frame():
         wild.simulate(1)
 
 
-def test_tells_of_its_progress():
+def test_progress_is_called_after_each_frame():
     seen: list[int] = []
     dataclasses.replace(SMALL, frames=3).simulate(0, seen.append)
     assert seen == [1, 2, 3]
@@ -136,7 +136,7 @@ def test_tells_of_its_progress():
         ([[0.5, 0.5]], [[0, 0], [0, 0]], "shape"),
     ],
 )
-def test_refuses_states_that_cannot_be(position, velocity, message):
+def test_invalid_states_are_refused(position, velocity, message):
     obstacle = PolygonObstacle(np.array([[0.55, 0.55], [0.7, 0.55], [0.7, 0.7]]))
     with pytest.raises(DataError, match=message):
         SMALL.simulate_from(

@@ -56,14 +56,14 @@ def test_particles_of_overlapping_obstacles_are_not_doubled():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_held_back_particles_are_outside_of_boundary_and_do_not_move_into_them(seed):
+def test_clamped_particles_are_outside_of_solids_and_do_not_move_into_them(seed):
     rng = np.random.default_rng(seed)
     boundary = SolidBoundary(BOX, (RAMP,), 0.01)
     x, y = rng.uniform(-0.1, 1.1, (2, 50))
     vx, vy = rng.normal(size=(2, 50))
     before = np.stack([x, y, vx, vy], -1)
     crossed = boundary.count_outside(before[:, :2])
-    held = boundary.hold_back(x, y, vx, vy)
+    held = boundary.clamp(x, y, vx, vy)
     assert boundary.count_outside(np.stack([x, y], -1).astype(np.float32)) == 0
     assert held >= crossed
     kept = np.all(before[:, :2] == np.stack([x, y], -1), axis=1)
@@ -75,9 +75,9 @@ def test_held_back_particles_are_outside_of_boundary_and_do_not_move_into_them(s
     assert np.all(along[put] >= -1e-9)
 
 
-def test_shown_particles_are_the_first_layer_and_the_obstacles():
+def test_visible_particles_are_the_first_layer_and_the_obstacles():
     boundary = SolidBoundary(BOX, (SQUARE,), 0.05)
-    shown = boundary.position[boundary.shown]
+    shown = boundary.position[boundary.visible]
     outside = np.any((shown < 0) | (shown > 1), axis=1)
     assert outside.sum() == 4 * 20 + 4
     assert np.all(SQUARE.depth(shown[~outside]) > 0)

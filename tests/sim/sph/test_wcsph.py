@@ -22,7 +22,7 @@ def lattice(columns, rows, low):
 def run(position, velocity, steps, gravity=(0.0, 0.0), fluid=WATER, box=BOX, dt=DT):
     state = SphParticles(position, velocity, fluid.density)
     stepper = SphStepper(fluid, SolidBoundary(box, (), H), H, np.array(gravity), dt)
-    stepper.begin(state)
+    stepper.initialise(state)
     for _ in range(steps):
         stepper.step(state)
     return state, stepper
@@ -43,7 +43,7 @@ def test_free_fall_is_exact():
     np.testing.assert_allclose(state.density, 1000.0, rtol=1e-12)
 
 
-def test_momentum_and_angular_momentum_are_kept_away_from_walls():
+def test_momentum_and_angular_momentum_are_conserved_away_from_walls():
     rng = np.random.default_rng(0)
     position = lattice(15, 15, (0.35, 0.35)) + rng.uniform(-0.2 * H, 0.2 * H, (225, 2))
     velocity = rng.normal(scale=0.5, size=(225, 2))
@@ -138,7 +138,7 @@ def front(columns, until):
     nodes = np.stack(np.meshgrid(*[np.arange(columns)] * 2, indexing="ij"), -1).reshape(-1, 2)
     state = SphParticles(h * (nodes + 0.5), np.zeros((columns**2, 2)), 1.0)
     stepper = SphStepper(fluid, SolidBoundary(((0.0, 4.0), (0.0, 2.0)), (), h), h, np.array([0.0, -1.0]), dt)
-    stepper.begin(state)
+    stepper.initialise(state)
     for _ in range(round(until / dt)):
         stepper.step(state)
     return state.position[:, 0].max() + h / 2
@@ -164,7 +164,7 @@ def test_the_dam_breaks_front_is_that_of_martin_and_moyce():
     nodes = np.stack(np.meshgrid(np.arange(16), np.arange(32), indexing="ij"), -1).reshape(-1, 2)
     state = SphParticles(h * (nodes + 0.5), np.zeros((512, 2)), 1.0)
     stepper = SphStepper(fluid, SolidBoundary(((0.0, 5.0), (0.0, 3.0)), (), h), h, np.array([0.0, -1.0]), dt)
-    stepper.begin(state)
+    stepper.initialise(state)
     fronts, t = [], 0.0
     for late, _ in MARTIN_MOYCE:
         while t * np.sqrt(2) < late:
@@ -179,7 +179,7 @@ def test_the_dam_breaks_front_is_that_of_martin_and_moyce():
     assert speed * np.sqrt(2) < ritter, "Nothing outruns Ritter's front, 2 √(g H)."
 
 
-def test_the_same_to_the_bit_and_in_the_order_given():
+def test_runs_are_bit_identical_and_keep_the_order_of_particles():
     position = lattice(12, 12, (0.0, 0.0))
     a, b = (run(position, np.zeros_like(position), 60, (0.0, -9.81))[0] for _ in range(2))
     np.testing.assert_array_equal(a.position, b.position)
@@ -193,17 +193,17 @@ def test_the_list_of_pairs_is_renewed_in_time():
     for always in (False, True):
         state = SphParticles(position, np.zeros_like(position), fluid.density)
         stepper = SphStepper(fluid, SolidBoundary(((0.0, 30 * H), (0.0, 1.0)), (), H), H, np.array([4.0, -9.0]), DT)
-        stepper.begin(state)
+        stepper.initialise(state)
         for _ in range(400):
             if always:
-                stepper._list(state)
+                stepper._list_pairs(state)
             stepper.step(state)
         states.append(state)
     assert np.abs(states[0].position - position).max() > H, "The test should move particles past the room to spare."
     np.testing.assert_allclose(states[0].position, states[1].position, atol=1e-3 * H)
 
 
-def test_a_state_that_is_not_finite_is_found_at_once():
+def test_non_finite_states_are_detected():
     state, stepper = run(lattice(10, 10, (0.4, 0.4)), np.zeros((100, 2)), 1)
     state.table[4, 17] = np.nan
     stepper.step(state)
@@ -212,7 +212,7 @@ def test_a_state_that_is_not_finite_is_found_at_once():
 
 
 @pytest.mark.parametrize(("key", "value"), [("density", 0.0), ("speed_of_sound", -1.0), ("alpha", -0.1)])
-def test_refuses_fluids_that_cannot_be(key, value):
+def test_invalid_fluids_are_refused(key, value):
     entries = {"density": 1.0, "speed_of_sound": 1.0, "exponent": 1.0, "alpha": 0.0, "viscosity": 0.0, "diffusion": 0.0}
     with pytest.raises(ConfigError, match=key):
         Fluid(**(entries | {key: value}))

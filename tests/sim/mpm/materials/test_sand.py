@@ -72,6 +72,6 @@ def test_refuses_parameters_out_of_range(key, value):
         Sand(**{**SAND.to_dict(), key: value})
 
 
-def test_is_known_in_two_dimensions_only():
+def test_is_implemented_in_two_dimensions_only():
     with pytest.raises(ConfigError, match="in 3"):
         SAND.rest(3)

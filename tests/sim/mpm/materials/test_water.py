@@ -25,7 +25,7 @@ def matrices(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_is_at_ease_at_rest(dim):
+def test_is_stress_free_at_rest(dim):
     volume, stress = respond(WATER, np.zeros((dim, dim)))
     assert volume == 1
     np.testing.assert_array_equal(stress, 0)
@@ -66,7 +66,7 @@ def test_viscosity_resists_shear_and_not_rotation(dim):
     np.testing.assert_allclose(stress, 0.0, atol=1e-12)
 
 
-def test_a_volume_that_is_not_a_number_stays_one():
+def test_a_nan_volume_stays_nan():
     volume, stress = respond(WATER, np.full((2, 2), np.nan))
     assert math.isnan(volume)
     assert math.isnan(stress[0])
