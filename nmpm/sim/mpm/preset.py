@@ -263,6 +263,7 @@ class MpmPreset(Preset):
             gravity=None if self.gravity_turn else self.gravity,
             gravity_varies=self.gravity_turn > 0,
             obstacles=self.ramps is not None,
+            densities=tuple(material.density for material in self.materials) if len(self.materials) > 1 else (),
         )
 
     @property
