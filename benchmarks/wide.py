@@ -20,10 +20,10 @@ import torch
 
 from nmpm.comparison import Comparison
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derived_seed, metadata_of
-from nmpm.data.progress import shown
-from nmpm.data.recording import Reader
-from nmpm.data.shelf import collate
+from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.progress import progress_bar
 from nmpm.emulator import Emulator
 from nmpm.rollouts import rollout
 from nmpm.sim import MpmPreset, load_preset
@@ -37,9 +37,9 @@ def error(emulator: Emulator, preset: MpmPreset, seeds: list[int], workers: int)
     """Errors of the emulator on scenes of a preset, in the box of that preset."""
     scene = preset.scene
     emulator = emulator.over(scene).eval()
-    reader = Reader(metadata_of(preset), scene)
+    reader = RecordingReader(preset_metadata(preset), scene)
     comparison = Comparison(scene, HORIZONS)
-    with ThreadPoolExecutor(workers) as pool, shown(f"{preset.name} box", len(seeds)) as advance:
+    with ThreadPoolExecutor(workers) as pool, progress_bar(f"{preset.name} box", len(seeds)) as advance:
         for made in pool.map(preset.simulate, seeds):
             window = collate([reader.recording(Trajectory(made.position, made.particle_type), preset.name)], scene)
             comparison.update(window, rollout(emulator, window.initial, window.target.shape[1]))
@@ -66,7 +66,7 @@ def main() -> None:
     preset = load_preset(chosen.preset)
     if not isinstance(preset, MpmPreset):
         parser.error(f"{chosen.preset} is not simulated by the material point method")
-    seeds = [derived_seed(chosen.seed, index) for index in range(chosen.scenes)]
+    seeds = [derive_seed(chosen.seed, index) for index in range(chosen.scenes)]
     models = {run.name: trained(run) for run in chosen.runs} | {name: Zoo.load(name).emulator for name in chosen.zoo}
     for name, emulator in models.items():
         for kind in (preset, dataclasses.replace(preset.widened(2), name="wide")):

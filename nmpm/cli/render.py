@@ -61,7 +61,7 @@ def _draw(split: Split, index: int, family: str | None, stem: Path) -> None:
 def _facts(split: Split, trajectory: Trajectory, family: str | None) -> tuple[Scene, dict[int, str], frozenset[int]]:
     """Scene, names of the type ids and static ids: from the trajectory itself if a rollout wrote it, else metadata."""
     from nmpm.data.format import read_metadata
-    from nmpm.data.scenes import infer_scene
+    from nmpm.data.scene_inference import infer_scene
     from nmpm.scene import Scene
 
     if "scene" in trajectory.attributes:

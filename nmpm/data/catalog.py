@@ -14,14 +14,14 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from nmpm.data.generate import Request, generate
+from nmpm.data.generate import SimulationRequest, generate
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.sim import load_preset, preset_names
 
 
 @dataclass(frozen=True)
-class Entry:
+class CatalogEntry:
     """An embedded dataset.
 
     Args:
@@ -54,9 +54,9 @@ _COUNTS = {
 
 
 @cache
-def _entries() -> Mapping[str, Entry]:
+def _entries() -> Mapping[str, CatalogEntry]:
     """Every shipped preset is a dataset."""
-    return MappingProxyType({name: Entry(name, name, *_COUNTS.get(name, _USUAL)) for name in preset_names()})
+    return MappingProxyType({name: CatalogEntry(name, name, *_COUNTS.get(name, _USUAL)) for name in preset_names()})
 
 
 def dataset_home() -> Path:
@@ -69,7 +69,7 @@ def catalog() -> tuple[str, ...]:
     return tuple(_entries())
 
 
-def describe(name: str) -> Entry:
+def describe(name: str) -> CatalogEntry:
     """What an embedded dataset is made of.
 
     Raises:
@@ -92,9 +92,9 @@ def scene(name: str) -> Scene:
     return load_preset(describe(name).preset).scene
 
 
-def request_of(
+def simulation_request(
     name: str, counts: Mapping[str, int] | None = None, frames: int | None = None, seed: int | None = None
-) -> Request:
+) -> SimulationRequest:
     """What `ensure` simulates for the same arguments.
 
     Raises:
@@ -104,10 +104,10 @@ def request_of(
     entry = describe(name)
     preset = load_preset(entry.preset)
     preset = preset if frames is None else preset.lasting(frames)
-    return Request(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
+    return SimulationRequest(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
 
 
-def folder_of(name: str, request: Request) -> Path:
+def dataset_folder(name: str, request: SimulationRequest) -> Path:
     """Where a request is kept: the name and a fingerprint of all that determines the data."""
     fingerprint = hashlib.sha256(json.dumps(request.to_dict(), sort_keys=True).encode()).hexdigest()[:10]
     return dataset_home() / "datasets" / f"{name}-{fingerprint}"
@@ -133,7 +133,7 @@ def ensure(
         DataError: if there is no dataset of that name, or its folder cannot be written.
         ConfigError: if the counts or frames cannot be.
     """
-    request = request_of(name, counts, frames, seed)
-    folder = folder_of(name, request)
+    request = simulation_request(name, counts, frames, seed)
+    folder = dataset_folder(name, request)
     generate(request.preset, folder, request.counts, request.seed, workers)
     return folder

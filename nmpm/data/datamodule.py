@@ -10,10 +10,10 @@ from typing import Any, Literal, get_args
 import torch
 from lightning.pytorch import LightningDataModule
 
-from nmpm.data.buffer import Source, TrajectoryBuffer
-from nmpm.data.evaluation import EvaluationLoader
-from nmpm.data.origins import Embedded, Folder, Hub, Live, Origin, Stated
-from nmpm.data.plan import Start, WindowPlan
+from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
+from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.loading.sources import DataSource, EmbeddedSource, FolderSource, HubSource, SimulatedSource, StatedFacts
+from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
@@ -24,10 +24,10 @@ _GPU_SHARE = 0.25  # of the free memory; the rest is for the model
 
 
 @dataclass(frozen=True)
-class _Course:
+class _BatchHistory:
     """How training batches are cut from the plan: from where on, and of what size. Kept in checkpoints."""
 
-    start: Start
+    start: PlanStart
     batch_size: int
     world: int
 
@@ -41,7 +41,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     Args:
         path: A dataset: a folder in the native layout, or anything that `nmpm convert` reads, converted on first use.
-        name: Embedded dataset, simulated on first use; either this or `path`.
+        name: EmbeddedSource dataset, simulated on first use; either this or `path`.
         source: "disk"; or "simulate" to train on trajectories of `name` fresh from the simulator, never written and
             never seen twice; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
         horizon: Frames to predict in a training window: frames per bundle times bundles unrolled.
@@ -89,15 +89,15 @@ class TrajectoryDataModule(LightningDataModule):
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
-        self.origin = _origin(path, name, source, Stated(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
+        self.data_source = _make_source(path, name, source, StatedFacts(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
-        self._course: _Course | None = None
+        self._course: _BatchHistory | None = None
 
     def __str__(self) -> str:
         # Lightning's own would go through the endless training batches.
-        return f"{type(self).__name__}({self.origin}, horizon={self.horizon}, batch_size={self.batch_size})"
+        return f"{type(self).__name__}({self.data_source}, horizon={self.horizon}, batch_size={self.batch_size})"
 
     @property
     def scene(self) -> Scene:
@@ -107,16 +107,16 @@ class TrajectoryDataModule(LightningDataModule):
             DataError: if recorded files are missing or wrong.
             ConfigError: if there is no such embedded dataset.
         """
-        return self.origin.scene
+        return self.data_source.scene
 
     @property
     def description(self) -> str:
         """What the data are, in words: simulated data are named so."""
-        return self.origin.description
+        return self.data_source.description
 
     def prepare_data(self) -> None:
         """Simulates, fetches or converts the dataset on first use, in one process."""
-        _ = self.origin.folder
+        _ = self.data_source.folder
 
     def setup(self, stage: str) -> None:
         """Forgets an earlier training, unless this one goes on with it."""
@@ -129,13 +129,13 @@ class TrajectoryDataModule(LightningDataModule):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Takes up the training of a checkpoint."""
-        self._course = _Course(Start(**state["start"]), state["batch_size"], state["world"])
+        self._course = _BatchHistory(PlanStart(**state["start"]), state["batch_size"], state["world"])
 
     def train_dataloader(self) -> TrainingLoader:
         """Endless batches of training windows, from the first one on that was not seen before a resumed checkpoint."""
         _, world = self.ranks
-        course = self._course or _Course(Start(), self.batch_size, world)
-        source, plan = self.origin.training(
+        course = self._course or _BatchHistory(PlanStart(), self.batch_size, world)
+        source, plan = self.data_source.training(
             self.horizon + 2,
             batch_size=self.batch_size,
             buffer_size=self.buffer_size,
@@ -144,17 +144,17 @@ class TrajectoryDataModule(LightningDataModule):
             emphasis=self.emphasis,
             start=course.start,
         )
-        plan = plan.after(self.batches_seen, course.batch_size, course.world, world)
-        self._course = _Course(plan.start, self.batch_size, world)
+        plan = plan.resume_after(self.batches_seen, course.batch_size, course.world, world)
+        self._course = _BatchHistory(plan.start, self.batch_size, world)
         return TrainingLoader(TrajectoryBuffer(source, plan, self.buffer_device(source, plan)), self)
 
-    def buffer_device(self, source: Source, plan: WindowPlan) -> torch.device:
+    def buffer_device(self, source: RecordingProvider, plan: WindowPlan) -> torch.device:
         """Where the buffer is held: on the trainer's GPU if that has room, else in the processor's memory."""
         device = self.trainer.strategy.root_device if self.trainer is not None else torch.device("cpu")
         if device.type != "cuda":
             return torch.device("cpu")
         free, _ = torch.cuda.mem_get_info(device)
-        needed = 2 * min(plan.buffer_size, len(plan.frames)) * source.most_bytes
+        needed = 2 * min(plan.buffer_size, len(plan.frames)) * source.max_bytes
         return device if needed <= _GPU_SHARE * free else torch.device("cpu")
 
     def val_dataloader(self) -> EvaluationLoader:
@@ -171,7 +171,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     def _evaluation(self, name: str, limit: int | None = None) -> EvaluationLoader:
         rank, world = self.ranks
-        return EvaluationLoader(self.origin.recordings(name), self.eval_batch_size, limit, rank, world)
+        return EvaluationLoader(self.data_source.recordings(name), self.eval_batch_size, limit, rank, world)
 
     @property
     def ranks(self) -> tuple[int, int]:
@@ -211,13 +211,15 @@ class TrainingLoader:
         """Has nothing to restore."""
 
 
-def _origin(path: str | None, name: str | None, source: str, stated: Stated, generate: dict[str, Any]) -> Origin:
+def _make_source(
+    path: str | None, name: str | None, source: str, stated: StatedFacts, generate: dict[str, Any]
+) -> DataSource:
     if path is not None:
-        return Folder(Path(path), stated)
-    named: dict[str, Callable[[str], Origin]] = {
-        "disk": lambda known: Embedded(known, generate),
-        "simulate": lambda known: Live(known, generate),
-        "hub": lambda known: Hub(Path(known), stated),
+        return FolderSource(Path(path), stated)
+    named: dict[str, Callable[[str], DataSource]] = {
+        "disk": lambda known: EmbeddedSource(known, generate),
+        "simulate": lambda known: SimulatedSource(known, generate),
+        "hub": lambda known: HubSource(Path(known), stated),
     }
     return named[source](str(name))
 

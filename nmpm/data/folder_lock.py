@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder, made if need be, against other processes; wait until they have let go of it.
 
     The lock is the system's and ends with the process, however it ends.

@@ -147,12 +147,12 @@ class Split:
 
     def particle_type(self, index: int) -> np.ndarray:
         """The (N,) int64 type ids of a trajectory."""
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             return np.asarray(file[self._entries[index].name]["particle_type"][()], dtype=np.int64)
 
     def attributes(self, index: int) -> dict[str, Any]:
         """The attributes of a trajectory."""
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             return dict(file[self._entries[index].name].attrs)
 
     def fields(self, index: int) -> dict[str, np.ndarray]:
@@ -162,7 +162,7 @@ class Split:
             DataError: if one does not hold numbers.
         """
         found: dict[str, np.ndarray] = {}
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
             names: list[str] = []
             group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
@@ -172,7 +172,7 @@ class Split:
                     _check_field(name, found[name], self.where(index))
         return found
 
-    def whole(self, index: int) -> Trajectory:
+    def read_with_fields(self, index: int) -> Trajectory:
         """A trajectory with all that its group holds.
 
         Raises:
@@ -186,7 +186,7 @@ class Split:
         Raises:
             DataError: if they cannot be read or hold a position that is not a finite number.
         """
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
             position = np.asarray(group["position"][start:stop], dtype=np.float32)
             particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
@@ -196,7 +196,7 @@ class Split:
 
     @cached_property
     def _entries(self) -> tuple[_Entry, ...]:
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             entries = tuple(_entry(group, name, self.path) for name, group in file.items())
         for entry in entries:
             if entry.dim != entries[0].dim:
@@ -207,7 +207,7 @@ class Split:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def open_hdf5(path: Path) -> Iterator[Any]:
     """An open HDF5 file; whatever HDF5 stumbles over becomes a DataError that names the file."""
     try:
         with h5py.File(path, "r") as file:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from nmpm.atomic import replacing
-from nmpm.data.archives import DAMAGED_NPZ
-from nmpm.data.folder_lock import locked
+from nmpm.data.archive_errors import NPZ_ERRORS
+from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,
@@ -33,8 +33,8 @@ from nmpm.data.format import (
     write_metadata,
     write_split,
 )
-from nmpm.data.progress import shown
-from nmpm.data.statistics import Statistics
+from nmpm.data.progress import progress_bar
+from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
@@ -47,7 +47,7 @@ _KEY = "simulation"
 _log = logging.getLogger(__name__)
 
 
-def _are_counts(counts: object) -> bool:
+def _is_valid_counts(counts: object) -> bool:
     """Whether these are numbers of trajectories, one for each split."""
     if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):
         return False
@@ -55,7 +55,7 @@ def _are_counts(counts: object) -> bool:
 
 
 @dataclass(frozen=True)
-class Request:
+class SimulationRequest:
     """A dataset to simulate.
 
     Args:
@@ -72,7 +72,7 @@ class Request:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not _are_counts(self.counts) or not self.splits or self.seed < 0:
+        if not _is_valid_counts(self.counts) or not self.splits or self.seed < 0:
             raise ConfigError(
                 f"counts = {self.counts}, seed = {self.seed}: give the number of trajectories in each of "
                 f"{', '.join(SPLITS)}, as in {{train: 3, valid: 1, test: 1}}, at least 1 in all; neither they nor the "
@@ -91,10 +91,10 @@ class Request:
 
     def trajectory_seed(self, split: str, index: int) -> int:
         """Seed of one trajectory, whatever the number of others."""
-        return derived_seed(self.seed, SPLITS.index(split), index)
+        return derive_seed(self.seed, SPLITS.index(split), index)
 
 
-def derived_seed(*entropy: int) -> int:
+def derive_seed(*entropy: int) -> int:
     """A seed that depends on all of the numbers."""
     return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
@@ -117,11 +117,11 @@ def generate(
         ConfigError: if the preset or the counts cannot be.
         DataError: if the folder holds other data than asked for, or cannot be written.
     """
-    request, folder = Request(preset, counts, seed), Path(folder)
+    request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):  # Without the lock, which needs a folder that can be written.
         return
     try:
-        with locked(folder):
+        with lock_folder(folder):
             _complete(request, folder, workers or os.cpu_count() or 1)
     except OSError as error:
         raise DataError(
@@ -130,16 +130,16 @@ def generate(
         ) from error
 
 
-def _complete(request: Request, folder: Path, workers: int) -> None:
+def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
     if _is_complete(request, folder):
         return
     _open_parts(request, folder)
-    _sweep(folder)
+    _remove_stale_files(folder)
     _simulate_parts(request, folder, workers)
     for split in request.splits:
         _assemble(request, folder, split)
-    metadata = metadata_of(request.preset)
-    first, statistics = Split(folder / f"{request.splits[0]}.h5"), Statistics(metadata)
+    metadata = preset_metadata(request.preset)
+    first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
     for index in range(len(first)):
         statistics.add(first.read(index))
     extra = metadata.extra | statistics.result() | {_KEY: request.to_dict()}
@@ -147,14 +147,14 @@ def _complete(request: Request, folder: Path, workers: int) -> None:
     shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
 
-def _is_complete(request: Request, folder: Path) -> bool:
+def _is_complete(request: SimulationRequest, folder: Path) -> bool:
     if not (folder / METADATA_FILE).is_file():
         return False
     _check_same(request, read_metadata(folder).extra.get(_KEY), folder)
     return True
 
 
-def _open_parts(request: Request, folder: Path) -> None:
+def _open_parts(request: SimulationRequest, folder: Path) -> None:
     """Note what the parts are for, or make sure that those which are there are for the same."""
     note = folder / _PARTS / _REQUEST
     if note.is_file():
@@ -167,7 +167,7 @@ def _open_parts(request: Request, folder: Path) -> None:
         temporary.write_text(json.dumps(request.to_dict(), indent=1), encoding="utf-8")
 
 
-def _check_same(request: Request, found: Any, folder: Path) -> None:
+def _check_same(request: SimulationRequest, found: Any, folder: Path) -> None:
     asked = json.loads(json.dumps(request.to_dict()))
     found = found if isinstance(found, dict) else {}
     differing = [key for key in asked if found.get(key) != asked[key]]
@@ -185,13 +185,13 @@ def _difference(key: str, found: Any, asked: Any) -> str:
     return f"{key} is {found}, asked {asked}"
 
 
-def _sweep(folder: Path) -> None:
+def _remove_stale_files(folder: Path) -> None:
     """Remove what killed processes left half-written; the lock says that no other is writing."""
     for stale in [*folder.glob(".*.part*"), *(folder / _PARTS).glob(".*.part*")]:
         stale.unlink(missing_ok=True)
 
 
-def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
+def _simulate_parts(request: SimulationRequest, folder: Path, workers: int) -> None:
     wanted = [(s, i) for s in request.splits if not (folder / f"{s}.h5").is_file() for i in range(request.counts[s])]
     missing = [(s, i) for s, i in wanted if not _part(folder, s, i).is_file()]
     if not missing:
@@ -201,7 +201,7 @@ def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
     # Threads suffice, as the kernels hold no lock; they need no second start of the interpreter, and die with it.
     pool = ThreadPoolExecutor(min(workers, len(missing)))
     try:
-        with shown(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
+        with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
             for future in as_completed([pool.submit(_simulate_part, request, folder, s, i) for s, i in missing]):
                 future.result()
                 advance()
@@ -209,7 +209,7 @@ def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
         pool.shutdown(cancel_futures=True)
 
 
-def _simulate_part(request: Request, folder: Path, split: str, index: int) -> None:
+def _simulate_part(request: SimulationRequest, folder: Path, split: str, index: int) -> None:
     made = request.preset.simulate(request.trajectory_seed(split, index))
     with replacing(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
         np.savez(file, position=made.position, particle_type=made.particle_type, **made.attributes)
@@ -219,11 +219,11 @@ def _part(folder: Path, split: str, index: int) -> Path:
     return folder / _PARTS / f"{split}-{index:05d}.npz"
 
 
-def _assemble(request: Request, folder: Path, split: str) -> None:
+def _assemble(request: SimulationRequest, folder: Path, split: str) -> None:
     path = folder / f"{split}.h5"
     parts = [_part(folder, split, index) for index in range(request.counts[split])]
     if not path.is_file():
-        with shown(f"Writing {path.name}", len(parts)) as advance:
+        with progress_bar(f"Writing {path.name}", len(parts)) as advance:
             write_split(path, _read_parts(parts, advance))
     for part in parts:
         part.unlink(missing_ok=True)
@@ -235,12 +235,12 @@ def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Traj
             with np.load(part, allow_pickle=False) as arrays:
                 attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
                 yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
-        except DAMAGED_NPZ as error:
+        except NPZ_ERRORS as error:
             raise DataError(f"{part}: damaged ({error}); delete it, and the same call makes it again.") from error
         advance()
 
 
-def metadata_of(preset: Preset) -> Metadata:
+def preset_metadata(preset: Preset) -> Metadata:
     """What holds for every trajectory that a preset simulates."""
     scene = preset.scene
     return Metadata(

@@ -94,7 +94,7 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
         ConfigError: if there is no such family.
     """
     path = Path(folder) / METADATA_FILE
-    return metadata_from_dict(_loaded(path), path, family)
+    return metadata_from_dict(_load_json(path), path, family)
 
 
 def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None = None) -> Metadata:
@@ -149,7 +149,7 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         part.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _load_json(path: Path) -> dict[str, Any]:
     if not path.parent.is_dir():
         raise DataError(f"{path.parent}: no such folder. Give the folder that holds {METADATA_FILE}.")
     if not path.is_file():

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 @contextmanager
-def shown(what: str, total: int | None, done: int = 0) -> Iterator[Callable[[], None]]:
+def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Callable[[], None]]:
     """A progress bar on standard error; gives the function that moves it on by one.
 
     Args:

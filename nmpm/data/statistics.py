@@ -14,7 +14,7 @@ KEYS = ("vel_mean", "vel_std", "acc_mean", "acc_std")
 _STILL = 1e-3
 
 
-class Statistics:
+class MotionStatistics:
     """Gathers, trajectory by trajectory, the moments of what the moving particles do.
 
     Velocities are differences of successive frames, in length per frame, and accelerations theirs, in length per
@@ -52,11 +52,11 @@ class Statistics:
         return found
 
 
-def disagreements(measured: Mapping[str, list[float]], stated: Mapping[str, Any], share: float = 0.1) -> list[str]:
+def find_disagreements(measured: Mapping[str, list[float]], stated: Mapping[str, Any], share: float = 0.1) -> list[str]:
     """Standard deviations that a file states otherwise than they are, as sentences.
 
     Args:
-        measured: From `Statistics.result`.
+        measured: From `MotionStatistics.result`.
         stated: The metadata's own, as far as there are any.
         share: From which difference, as a share of the measured value.
     """
@@ -76,7 +76,7 @@ def _short(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in np.atleast_1d(values)) + ")"
 
 
-def first_that_moves(position: np.ndarray, chosen: np.ndarray, extent: Sequence[Interval]) -> int | None:
+def first_moving_particle(position: np.ndarray, chosen: np.ndarray, extent: Sequence[Interval]) -> int | None:
     """The first of the chosen particles that leaves its first place, by more than a thousandth of the extent.
 
     Args:

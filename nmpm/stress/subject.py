@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derived_seed, metadata_of
-from nmpm.data.recording import Reader
-from nmpm.data.shelf import collate
+from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles, Window
 from nmpm.sim import MpmPreset, Preset
@@ -54,7 +54,7 @@ class Subject:
 
     def seeds(self, count: int) -> list[int]:
         """Seeds of scenes that no dataset holds."""
-        return [derived_seed(self.seed, _STREAM, index) for index in range(count)]
+        return [derive_seed(self.seed, _STREAM, index) for index in range(count)]
 
     def over(self, emulator: Emulator) -> Subject:
         """The same with another emulator."""
@@ -63,7 +63,7 @@ class Subject:
 
 def simulated(preset: Preset, seeds: Sequence[int], frames: int) -> Window:
     """Scenes of a preset with `frames` frames after the two that an emulator starts from."""
-    lasting, reader = preset.lasting(frames + 1), Reader(metadata_of(preset), preset.scene)
+    lasting, reader = preset.lasting(frames + 1), RecordingReader(preset_metadata(preset), preset.scene)
     made = [lasting.simulate(seed) for seed in seeds]
     recordings = [
         reader.recording(Trajectory(each.position, each.particle_type, each.attributes), f"{preset.name}, seed {seed}")

@@ -46,7 +46,7 @@ def test_ensure_makes_a_dataset_once(home):
 
 def test_the_folder_depends_on_all_that_determines_the_data(home):
     variants = [{}, {"seed": 1}, {"frames": 2}, {"counts": COUNTS}]
-    folders = {catalog.folder_of("goop", catalog.request_of("goop", **variant)) for variant in variants}
+    folders = {catalog.dataset_folder("goop", catalog.simulation_request("goop", **variant)) for variant in variants}
     assert len(folders) == len(variants)
 
 

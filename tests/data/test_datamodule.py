@@ -178,7 +178,7 @@ class TestEvaluation:
                 assert len(batch) == len(window.frames) <= batch_size
                 seen.update(batch)
                 for row, index in enumerate(batch):
-                    truth = torch.from_numpy(module.origin.recordings("test").split.read(index).position)
+                    truth = torch.from_numpy(module.data_source.recordings("test").split.read(index).position)
                     assert torch.equal(window.frames[row, :, window.mask[row]], truth)
         assert seen == Counter(range(7))
 
@@ -223,7 +223,7 @@ class TestEmbedded:
         model = Recorder()
         trainer_of(tmp_path, max_steps=2).fit(model, datamodule=module)
         assert len(model.seen) == 2
-        assert len(module.origin.recordings("train")) == 2
+        assert len(module.data_source.recordings("train")) == 2
 
     def test_unknown_option(self):
         with pytest.raises(ConfigError, match="'count'"):
@@ -240,7 +240,7 @@ class TestModule:
     def test_holds_the_buffer_on_a_gpu_where_it_fits(self, make_dataset, monkeypatch, free, held_on):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
         module = as_rank(module_of(make_dataset()), 0, 1, device="cuda")
-        source, plan = module.origin.training(5, batch_size=2, buffer_size=2, passes=1, seed=0)
+        source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
         assert module.buffer_device(source, plan).type == held_on
 
     def test_works_without_a_trainer(self, make_dataset):

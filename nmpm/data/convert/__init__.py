@@ -8,22 +8,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from nmpm.data.convert.base import Format as Format
+from nmpm.data.convert.base import DatasetFormat as DatasetFormat
+from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
-from nmpm.data.convert.base import Source as Source
+from nmpm.data.convert.conversion import detect_format, find_format, write_native
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
-from nmpm.data.convert.pickles import RolloutPickle
-from nmpm.data.convert.renumber import renumbered
-from nmpm.data.convert.run import detect, named, write_source
+from nmpm.data.convert.renumbering import renumber_types
+from nmpm.data.convert.rollout_pickle import RolloutPickle
 
-FORMATS: tuple[Format, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
+FORMATS: tuple[DatasetFormat, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
 
 
-def open_source(path: Path, format_name: str | None = None, options: Options | None = None) -> Source:
+def open_dataset(path: Path, format_name: str | None = None, options: Options | None = None) -> ForeignDataset:
     """Opens a dataset of any format.
 
     Args:
@@ -35,7 +35,7 @@ def open_source(path: Path, format_name: str | None = None, options: Options | N
         DataError: if there is nothing, of no known format, or damaged.
         ConfigError: if there is no such format, or an option cannot be.
     """
-    kind = named(format_name, FORMATS) if format_name else detect(Path(path), FORMATS)
+    kind = find_format(format_name, FORMATS) if format_name else detect_format(Path(path), FORMATS)
     return kind.open(Path(path), options or Options())
 
 
@@ -62,5 +62,5 @@ def convert(
         DataError: if the source is missing, damaged or of no known format, or the destination is taken.
         ConfigError: if there is no such format, or an option cannot be.
     """
-    opened = open_source(source, format_name, options)
-    return write_source(renumbered(opened, ids) if ids else opened, destination)
+    opened = open_dataset(source, format_name, options)
+    return write_native(renumber_types(opened, ids) if ids else opened, destination)

@@ -42,19 +42,19 @@ def write_trajectories(path: str | Path, trajectories: Iterable[Trajectory | np.
             raise DataError(f"{path.parent / METADATA_FILE}: states another scene. Choose another folder for this one.")
         metadata = found
     lengths: list[int] = []
-    write_split(path, _checked(trajectories, scene, path, lengths))
+    write_split(path, _check_options(trajectories, scene, path, lengths))
     longest = max(metadata.sequence_length, *lengths)
     write_metadata(path.parent, replace(metadata, sequence_length=longest))
 
 
-def _checked(
+def _check_options(
     trajectories: Iterable[Trajectory | np.ndarray], scene: Scene, path: Path, lengths: list[int]
 ) -> Iterator[Trajectory]:
     kinds = len(scene.materials) + scene.obstacles
     low, high = np.asarray(scene.domain).T
     for index, item in enumerate(trajectories):
         where = f"{path}: trajectory {index}"
-        trajectory = item if isinstance(item, Trajectory) else _bare(item, kinds, where)
+        trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
         if trajectory.position.shape[2] != scene.dim:
             raise DataError(f"{where} has {trajectory.position.shape[2]} axes, the scene {scene.dim}.")
         types = np.unique(trajectory.particle_type)
@@ -72,7 +72,7 @@ def _checked(
         yield trajectory
 
 
-def _bare(position: np.ndarray, kinds: int, where: str) -> Trajectory:
+def _from_bare_array(position: np.ndarray, kinds: int, where: str) -> Trajectory:
     position = np.asarray(position)
     if kinds > 1:
         raise DataError(f"{where} is a bare array, but the scene has {kinds} kinds of particles: give a Trajectory.")

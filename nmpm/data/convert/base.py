@@ -13,7 +13,7 @@ from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
 
-UNSTATED = 0
+UNKNOWN_LENGTH = 0
 """For `Metadata.sequence_length`, where the files leave it open: conversion puts in what it finds."""
 
 
@@ -39,7 +39,7 @@ class Options:
     gravity: tuple[float, ...] | None = None
     periodic: tuple[bool, ...] | None = None
 
-    def applied(self, metadata: Metadata) -> Metadata:
+    def apply_to(self, metadata: Metadata) -> Metadata:
         """The metadata as the user corrects them; the family is left to whoever reads the type ids.
 
         Raises:
@@ -63,7 +63,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Reread(Iterable[Trajectory]):
+class Rereadable(Iterable[Trajectory]):
     """Trajectories read anew each time they are iterated over.
 
     Args:
@@ -76,13 +76,13 @@ class Reread(Iterable[Trajectory]):
         return self.start()
 
 
-def split_of(stem: str) -> str | None:
+def split_name(stem: str) -> str | None:
     """The split that a file's name begins with: "test_sub" means test."""
     return next((split for split in SPLITS if stem.lower().startswith(split)), None)
 
 
 @dataclass(frozen=True)
-class Source:
+class ForeignDataset:
     """A foreign dataset, opened.
 
     Args:
@@ -98,7 +98,7 @@ class Source:
     counts: Mapping[str, int | None] = field(default_factory=dict)
 
 
-class Format(abc.ABC):
+class DatasetFormat(abc.ABC):
     """A foreign format; below it, one class per format."""
 
     name: ClassVar[str]
@@ -112,7 +112,7 @@ class Format(abc.ABC):
         """Whether a file or folder looks like this format; cheap, and never raises."""
 
     @abc.abstractmethod
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         """A dataset of this format.
 
         Raises:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import Format, Options, Reread, Source, split_of
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
 from nmpm.errors import DataError
@@ -22,7 +22,7 @@ from nmpm.errors import DataError
 _SUFFIX = ".tfrecord"
 
 
-class DeepMind(Format):
+class DeepMind(DatasetFormat):
     """A folder of TFRecord files with a `metadata.json`, or one such file beside it."""
 
     name: ClassVar[str] = "deepmind"
@@ -31,20 +31,20 @@ class DeepMind(Format):
     def recognises(self, path: Path) -> bool:
         return any(path.glob(f"*{_SUFFIX}")) if path.is_dir() else path.suffix == _SUFFIX and path.is_file()
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
         family = options.family or "deepmind"
         folder = next(iter(files.values())).parent
-        metadata = options.applied(read_metadata(folder, family))
+        metadata = options.apply_to(read_metadata(folder, family))
         offsets = {split: record_offsets(file) for split, file in files.items()}
         for split, file in files.items():
             if not offsets[split]:
                 raise DataError(f"{file}: the file holds no record.")
-        return Source(
+        return ForeignDataset(
             metadata=metadata,
-            splits={s: Reread(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
+            splits={s: Rereadable(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
             notes=(f"Particle types are read after the {family} family.", *_naming(files)),
             counts={split: len(found) for split, found in offsets.items()},
         )
@@ -53,7 +53,7 @@ class DeepMind(Format):
 def _files(path: Path) -> dict[str, Path]:
     """The TFRecord of each split."""
     found = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path] * (path.suffix == _SUFFIX and path.is_file())
-    named = {split: [file for file in found if split_of(file.stem) == split] for split in SPLITS}
+    named = {split: [file for file in found if split_name(file.stem) == split] for split in SPLITS}
     for split, files in named.items():
         if len(files) > 1:
             raise DataError(f"{path}: {', '.join(f.name for f in files)} all mean {split}; give one of the files.")

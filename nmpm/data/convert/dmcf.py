@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import UNSTATED, Format, Options, Reread, Source, split_of
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import ConfigError, DataError
@@ -26,7 +26,7 @@ _DT, _GRAVITY = 0.02, -9.81
 _MOST_BYTES = 2**31  # of one frame
 
 
-class Dmcf(Format):
+class Dmcf(DatasetFormat):
     """A file, a folder of files, or folders train, valid and test of them."""
 
     name: ClassVar[str] = "dmcf"
@@ -35,16 +35,16 @@ class Dmcf(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_files(path))
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no *{_SUFFIX} file there.")
         family = options.family or "lagrangebench"
         sample = next(iter(files.values()))[0]
         first = next(_frames(sample), {})
-        return Source(
-            metadata=options.applied(_metadata(first, find_family(family).types, options, sample)),
-            splits={split: Reread(partial(_trajectories, found)) for split, found in files.items()},
+        return ForeignDataset(
+            metadata=options.apply_to(_metadata(first, find_family(family).types, options, sample)),
+            splits={split: Rereadable(partial(_trajectories, found)) for split, found in files.items()},
             notes=(
                 f"The fluid becomes particle type {_FLUID}, the solid around it type {_WALL} ({family} family).",
                 *(() if options.dt else (f"The files do not state dt; {_DT:g} s was taken (--dt).",)),
@@ -56,7 +56,7 @@ class Dmcf(Format):
 
 def _files(path: Path) -> dict[str, tuple[Path, ...]]:
     if path.is_file():
-        return {split_of(path.name) or "test": (path,)} if path.name.endswith(_SUFFIX) else {}
+        return {split_name(path.name) or "test": (path,)} if path.name.endswith(_SUFFIX) else {}
     folders = {split: sorted((path / split).glob(f"*{_SUFFIX}")) for split in SPLITS}
     if not any(folders.values()):
         folders = {"test": sorted(path.glob(f"*{_SUFFIX}"))}
@@ -74,13 +74,13 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
         with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
             reader = msgpack.Unpacker(stream, raw=True, max_buffer_size=_MOST_BYTES)
             for index in range(reader.read_array_header()):
-                yield _decoded(reader.unpack(), f"{path}, frame {index}")
+                yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
     except (zstandard.ZstdError, msgpack.UnpackException, ValueError, OSError, RecursionError, MemoryError) as error:
         reason = str(error)[:200] or type(error).__name__
         raise DataError(f"{path}: cannot be read ({reason}). Is it complete? Copy or download it again.") from error
 
 
-def _decoded(frame: Any, where: str) -> dict[str, Any]:
+def _decode_frame(frame: Any, where: str) -> dict[str, Any]:
     if not isinstance(frame, dict) or not all(isinstance(key, bytes) for key in frame):
         raise DataError(f"{where}: a map with names is due, found {type(frame).__name__}.")
     return {key.decode("utf-8", "replace"): _value(value, f"{where}, {key!r}") for key, value in frame.items()}
@@ -109,7 +109,7 @@ def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -
         bounds=bounds,
         dt=options.dt or _DT,
         dim=dim,
-        sequence_length=UNSTATED,
+        sequence_length=UNKNOWN_LENGTH,
         particle_types=dict(types),
         static_types=frozenset({_WALL}),
         gravity=tuple(_GRAVITY if axis == 1 else 0.0 for axis in range(dim)),

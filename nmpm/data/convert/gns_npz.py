@@ -16,9 +16,9 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.archives import DAMAGED_NPZ
-from nmpm.data.convert.base import Format, Options, Reread, Source, split_of
-from nmpm.data.convert.pickles import load_pickled, numbers
+from nmpm.data.archive_errors import NPZ_ERRORS
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
+from nmpm.data.convert.rollout_pickle import load_pickled, numbers
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
 from nmpm.errors import DataError
 
@@ -26,7 +26,7 @@ _SUFFIX = ".npz"
 _ALL = "gns_data"
 
 
-class GnsNpz(Format):
+class GnsNpz(DatasetFormat):
     """A folder of train.npz, valid.npz, test.npz with a `metadata.json`, or one such file beside it."""
 
     name: ClassVar[str] = "gns-npz"
@@ -35,16 +35,16 @@ class GnsNpz(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_found(path)) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
 
-    def open(self, path: Path, options: Options) -> Source:
-        files = {split_of(file.stem) or "test": file for file in reversed(_found(path))}
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        files = {split_name(file.stem) or "test": file for file in reversed(_found(path))}
         if not files:
             raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
         family = options.family or "deepmind"
-        metadata = options.applied(read_metadata(next(iter(files.values())).parent, family))
+        metadata = options.apply_to(read_metadata(next(iter(files.values())).parent, family))
         members = {split: _members(files[split]) for split in SPLITS if split in files}
-        return Source(
+        return ForeignDataset(
             metadata=metadata,
-            splits={split: Reread(partial(_trajectories, files[split], names)) for split, names in members.items()},
+            splits={split: Rereadable(partial(_trajectories, files[split], names)) for split, names in members.items()},
             notes=(f"Particle types are read after the {family} family.",),
             counts={split: None if names == (_ALL,) else len(names) for split, names in members.items()},
         )
@@ -61,7 +61,7 @@ def _members(path: Path) -> tuple[str, ...]:
     try:
         with zipfile.ZipFile(path) as file:
             names = [name.removesuffix(".npy") for name in file.namelist() if name.endswith(".npy")]
-    except DAMAGED_NPZ as error:
+    except NPZ_ERRORS as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
     if not names:
         raise DataError(f"{path}: the file holds no array.")
@@ -84,7 +84,7 @@ def _array(path: Path, name: str) -> Any:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
             shape, fortran, kind = _header(file)
             data = file.read()
-    except DAMAGED_NPZ as error:
+    except NPZ_ERRORS as error:
         raise DataError(f"{where}: cannot be read ({str(error)[:200]}). Copy or download the file again.") from error
     if kind.hasobject:
         return load_pickled(data, where)

@@ -17,10 +17,10 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
-from nmpm.data.convert.base import UNSTATED, Format, Options, Reread, Source
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.families import find_family
-from nmpm.data.format import SPLITS, Metadata, Trajectory, opened
-from nmpm.data.statistics import first_that_moves
+from nmpm.data.format import SPLITS, Metadata, Trajectory, open_hdf5
+from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
@@ -52,7 +52,7 @@ _PUBLISHED = {
 }
 
 
-class NeuralMpm(Format):
+class NeuralMpm(DatasetFormat):
     """A folder of train, valid and test folders with `sim_*.h5` files, or one of these."""
 
     name: ClassVar[str] = "neuralmpm"
@@ -61,18 +61,18 @@ class NeuralMpm(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_files(path))
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no train, valid or test folder with sim_*.h5 files there.")
         known = _PUBLISHED.get(path.resolve().name.lower())
         first = next(_trajectories(next(iter(files.values()))[:1], known.material if known else None))
-        metadata = options.applied(_metadata(path, known, first, options))
+        metadata = options.apply_to(_metadata(path, known, first, options))
         material = known.material if known else _only_material(options, path, files)
         family = options.family or "deepmind"
-        return Source(
+        return ForeignDataset(
             metadata=metadata,
-            splits={split: Reread(partial(_trajectories, found, material)) for split, found in files.items()},
+            splits={split: Rereadable(partial(_trajectories, found, material)) for split, found in files.items()},
             notes=(*_notes(path, known, first, metadata), f"Particle types are numbered after the {family} family."),
             counts={split: len(found) for split, found in files.items()},
         )
@@ -107,7 +107,7 @@ def _metadata(path: Path, known: _Published | None, first: Trajectory, options: 
         bounds=known.domain if known and len(known.domain) == dim else observed,
         dt=known.dt if known else options.dt or 1.0,
         dim=dim,
-        sequence_length=UNSTATED,
+        sequence_length=UNKNOWN_LENGTH,
         particle_types=dict(family.types),
         static_types=frozenset({_BOUNDARY}),
         gravity=known.gravity if known and known.gravity and len(known.gravity) == dim else None,
@@ -124,7 +124,7 @@ def _notes(path: Path, known: _Published | None, first: Trajectory, metadata: Me
     else:
         notes.append("Bounds are the extent of the first trajectory; give --bounds if you know them.")
     wall = first.particle_type == _BOUNDARY
-    if first_that_moves(first.position, wall, metadata.bounds) is not None:
+    if first_moving_particle(first.position, wall, metadata.bounds) is not None:
         notes.append("The boundary moves in the first trajectory.")
     if _GRAVITY in first.fields:
         notes.append("`grav` is kept as a field as it is, and taken as gravity in length/s² where it has D numbers.")
@@ -133,7 +133,7 @@ def _notes(path: Path, known: _Published | None, first: Trajectory, metadata: Me
 
 def _only_material(options: Options, path: Path, files: dict[str, tuple[Path, ...]]) -> int | None:
     """The type of all particles where the files have none: the only one that the user names."""
-    with opened(next(iter(files.values()))[0]) as file:
+    with open_hdf5(next(iter(files.values()))[0]) as file:
         if "types" in file:
             return None
     named = [i for i in options.types or {} if i != _BOUNDARY]
@@ -144,7 +144,7 @@ def _only_material(options: Options, path: Path, files: dict[str, tuple[Path, ..
 
 def _trajectories(files: tuple[Path, ...], material: int | None) -> Iterator[Trajectory]:
     for path in files:
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             content = {name: _values(file, name, path) for name in file}
         yield _trajectory(content, material, path)
 

@@ -52,7 +52,7 @@ def record_offsets(path: Path) -> list[int]:
             offset = file.tell()
             length = _length(file, path, len(offsets), offset)
             if offset + 12 + length + 4 > size:
-                raise _damaged(path, len(offsets), offset, "the file ends within it")
+                raise _damage_error(path, len(offsets), offset, "the file ends within it")
             offsets.append(offset)
             file.seek(length + 4, 1)
     return offsets
@@ -75,13 +75,13 @@ def read_record(path: Path, offset: int, index: int) -> SequenceExample:
         payload = file.read(length)
         checksum = file.read(4)
     if len(payload) < length or len(checksum) < 4:
-        raise _damaged(path, index, offset, "the file ends within it")
+        raise _damage_error(path, index, offset, "the file ends within it")
     if masked_crc(payload) != struct.unpack("<I", checksum)[0]:
-        raise _damaged(path, index, offset, "its checksum does not fit its content")
+        raise _damage_error(path, index, offset, "its checksum does not fit its content")
     try:
         return _sequence_example(payload)
     except (ValueError, IndexError, struct.error) as error:
-        raise _damaged(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
+        raise _damage_error(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
 
 
 def masked_crc(data: bytes) -> int:
@@ -118,14 +118,14 @@ _crc32c = numba.njit(cache=True, nogil=True)(_crc_loop)
 def _length(file: BinaryIO, path: Path, index: int, offset: int) -> int:
     header = file.read(12)
     if len(header) < 12:
-        raise _damaged(path, index, offset, "the file ends within its header")
+        raise _damage_error(path, index, offset, "the file ends within its header")
     length, checksum = struct.unpack("<QI", header)
     if masked_crc(header[:8]) != checksum or length > _LARGEST:
-        raise _damaged(path, index, offset, "the checksum of its length does not fit")
+        raise _damage_error(path, index, offset, "the checksum of its length does not fit")
     return int(length)
 
 
-def _damaged(path: Path, index: int, offset: int, why: str) -> DataError:
+def _damage_error(path: Path, index: int, offset: int, why: str) -> DataError:
     return DataError(
         f"{path}: record {index}, at byte {offset}, cannot be read: {why}. Is it a complete TFRecord? Copy or"
         " download it again."

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nmpm.data.format import Metadata, Split, split_paths
+from nmpm.data.inspection.anomalies import find_anomalies
 from nmpm.data.inspection.facts import Inspection, Range, SplitFacts
-from nmpm.data.inspection.oddities import oddities
 from nmpm.data.inspection.survey import Survey
-from nmpm.data.origins import Folder
-from nmpm.data.progress import shown
-from nmpm.data.statistics import disagreements
+from nmpm.data.loading.sources import FolderSource
+from nmpm.data.progress import progress_bar
+from nmpm.data.statistics import find_disagreements
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -33,7 +33,7 @@ class _Tally:
     gravities: set[tuple[float, ...] | None] = field(default_factory=set)
 
 
-def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
+def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection:
     """Looks at a dataset, with a progress bar.
 
     Args:
@@ -56,22 +56,22 @@ def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
     tally = _tally(splits, metadata)
     domain = scene.domain if scene else metadata.domain or metadata.bounds
     survey = Survey(metadata, domain)
-    chosen = {name: _chosen(split, trajectories) for name, split in splits.items()}
+    chosen = {name: _spread_evenly(split, trajectories) for name, split in splits.items()}
     spacing = _spacing(splits, chosen, metadata)
     fields: dict[str, tuple[int, ...]] = {}
-    with shown("Inspecting", sum(map(len, chosen.values()))) as advance:
+    with progress_bar("Inspecting", sum(map(len, chosen.values()))) as advance:
         for where, split, index in _each(splits, chosen):
             try:
                 trajectory = split.read(index)
                 fields = fields or {key: values.shape for key, values in split.fields(index).items()}
-                findings += oddities(trajectory, metadata, spacing, where)
+                findings += find_anomalies(trajectory, metadata, spacing, where)
                 survey.add(trajectory)
             except DataError as error:
                 findings.append(str(error))
             advance()
     if not np.isfinite(survey.observed).all():
         raise DataError(f"{origin.folder}: none of its trajectories could be looked at. {findings[0]}")
-    findings += disagreements(survey.statistics.result(), metadata.extra)
+    findings += find_disagreements(survey.statistics.result(), metadata.extra)
     findings += _lengths(tally, metadata)
     occupied, each = survey.occupied()
     fall = np.median(survey.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
@@ -97,8 +97,8 @@ def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
         occupied_each=each,
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
         restless=len(survey.rests) - len(rests),
-        notes=(*_beyond(survey, metadata), *metadata.extra.get("conversion", ())),
-        findings=_shortened(findings),
+        notes=(*_out_of_bounds_notes(survey, metadata), *metadata.extra.get("conversion", ())),
+        findings=_truncate(findings),
     )
 
 
@@ -108,7 +108,7 @@ def _each(splits: Mapping[str, Split], chosen: Mapping[str, range]) -> Iterator[
             yield f"{name}, trajectory {split.names[index]}", split, index
 
 
-def _chosen(split: Split, trajectories: int | None) -> range:
+def _spread_evenly(split: Split, trajectories: int | None) -> range:
     """Evenly spread trajectories."""
     if trajectories is None:
         size = sum(4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split)))
@@ -184,7 +184,7 @@ def _lengths(tally: _Tally, metadata: Metadata) -> list[str]:
     return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {held} frames."]
 
 
-def _beyond(survey: Survey, metadata: Metadata) -> list[str]:
+def _out_of_bounds_notes(survey: Survey, metadata: Metadata) -> list[str]:
     notes = []
     for axis, (low, high) in enumerate(metadata.bounds):
         seen_low, seen_high = survey.observed[:, axis].tolist()
@@ -196,7 +196,7 @@ def _beyond(survey: Survey, metadata: Metadata) -> list[str]:
     return notes
 
 
-def _shortened(findings: list[str]) -> tuple[str, ...]:
+def _truncate(findings: list[str]) -> tuple[str, ...]:
     if len(findings) <= _MOST_FINDINGS:
         return tuple(findings)
     return (*findings[:_MOST_FINDINGS], f"… and {len(findings) - _MOST_FINDINGS} more.")

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.inspection.anomalies import steps
 from nmpm.data.inspection.facts import GridFacts
-from nmpm.data.inspection.oddities import steps
-from nmpm.data.statistics import Statistics
+from nmpm.data.statistics import MotionStatistics
 from nmpm.scene import Interval
 
 CANDIDATES = (16, 32, 64, 128, 256, 512)
@@ -36,7 +36,7 @@ class Survey:
 
     def __init__(self, metadata: Metadata, domain: Sequence[Interval]) -> None:
         self.metadata = metadata
-        self.statistics = Statistics(metadata)
+        self.statistics = MotionStatistics(metadata)
         self.low, high = np.asarray(domain).T
         self.extent = high - self.low
         self.longest = float(self.extent.max())

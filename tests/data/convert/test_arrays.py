@@ -3,7 +3,7 @@ import pytest
 
 import nmpm
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.origins import Folder
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 
 SCENE = nmpm.Scene(
@@ -33,13 +33,13 @@ def runs(number: int = 2, frames: int = 7) -> list[nmpm.Trajectory]:
 def test_what_is_written_is_a_dataset_to_train_on(tmp_path):
     nmpm.write_trajectories(tmp_path / "mine" / "train.h5", iter(runs()), SCENE)
     nmpm.write_trajectories(tmp_path / "mine" / "test.h5", runs(1, 9), SCENE)
-    origin = Folder(tmp_path / "mine")
+    origin = FolderSource(tmp_path / "mine")
     assert origin.scene == SCENE
     recording = origin.recordings("train")[1]
     np.testing.assert_array_equal(recording.frames.numpy(), runs()[1].position[:, :4])
     assert recording.material.tolist() == [0, 0, 1, 1]
     assert recording.obstacle.shape == (1, 2)
-    whole = Split(tmp_path / "mine" / "train.h5").whole(0)
+    whole = Split(tmp_path / "mine" / "train.h5").read_with_fields(0)
     np.testing.assert_array_equal(whole.fields["heat"], runs()[0].fields["heat"])
     assert whole.attributes == {"seed": 0}
     assert read_metadata(tmp_path / "mine").sequence_length == 9

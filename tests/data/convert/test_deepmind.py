@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from nmpm.data.convert import DeepMind, Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert import records
 
@@ -38,7 +38,7 @@ def test_every_number_arrives(folder, tmp_path):
     assert len(split) == 2
     for index in range(2):
         position, particle_type = made(seed=index)
-        trajectory = split.whole(index)
+        trajectory = split.read_with_fields(index)
         np.testing.assert_array_equal(trajectory.position, position)
         np.testing.assert_array_equal(trajectory.particle_type, particle_type)
         np.testing.assert_array_equal(trajectory.fields["step_context"], np.full((5, 6), index))
@@ -115,7 +115,7 @@ class TestRecorded:
 
     def test_forces_and_a_moving_tool_are_kept(self, recorded, tmp_path):
         notes = convert(recorded / "mpm-excavation-3d", tmp_path / "sand")
-        trajectory = Split(tmp_path / "sand" / "train.h5").whole(0)
+        trajectory = Split(tmp_path / "sand" / "train.h5").read_with_fields(0)
         assert trajectory.position.shape == (11, 26945, 3)
         assert trajectory.fields["force"].shape == (11, 3)
         tool = trajectory.position[:, trajectory.particle_type == 3]

@@ -36,7 +36,7 @@ def write(path: Path, content: object) -> Path:
 def test_every_number_arrives(tmp_path):
     made = frames()
     notes = convert(write(tmp_path / "a.msgpack.zst", made), tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     assert trajectory.position.shape == (4, 12, 3)
     for index, frame in enumerate(made):
         fluid = np.frombuffer(frame[b"pos"][b"data"], "<f4").reshape(5, 3)
@@ -90,7 +90,7 @@ def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, place, 
 
 def test_recorded_canyon(recorded, tmp_path):
     convert(recorded / "dmcf-canyon-3d", tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     assert trajectory.position.shape == (13, 1280 + 185447, 3)
     assert trajectory.fields["vel"].shape == (13, 1280, 3)
     fluid = trajectory.position[:, trajectory.particle_type == 0]

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.data.convert.test_pickles import Runs
 
 from nmpm.data.convert import GnsNpz, Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
-from tests.data.convert.test_pickles import Runs
 
 METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 7, "dim": 2, "dt": 0.0025}
 
@@ -44,7 +44,7 @@ def test_trajectories_come_in_the_order_of_their_numbers(tmp_path):
 def test_types_per_particle_and_material_properties_are_kept(tmp_path):
     types, angle = np.array([6, 6, 3, 3], dtype=object), np.array([20.0, 20.0, 0.0, 0.0])
     convert(write(tmp_path / "a", simulation_0=pair(positions(0), types, angle)), tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "train.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
     assert trajectory.particle_type.tolist() == [6, 6, 3, 3]
     np.testing.assert_array_equal(trajectory.fields["material_property"], angle)
 

@@ -10,19 +10,19 @@ from hypothesis import strategies as st
 
 from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.data.inspection import Inspection, inspect
-from nmpm.data.origins import Folder, Stated
+from nmpm.data.loading.sources import FolderSource, StatedFacts
 from nmpm.errors import DataError
 from tests.conftest import made_up_metadata, made_up_trajectory
 
 UNIT = {"bounds": ((0.0, 1.0),) * 2, "domain": ((0.0, 1.0),) * 2, "particle_volume": 1e-4}
 
 
-def look(folder: Path, *trajectories: Trajectory, stated: Stated | None = None, **changes: object) -> Inspection:
+def look(folder: Path, *trajectories: Trajectory, stated: StatedFacts | None = None, **changes: object) -> Inspection:
     """Written and inspected; without the metadata's remarks about their number of frames."""
     write_split(folder / "train.h5", trajectories)
     length = len(trajectories[0].position)
     write_metadata(folder, made_up_metadata(**({"sequence_length": length} | changes)))
-    return inspect(Folder(folder, stated or Stated()))
+    return inspect(FolderSource(folder, stated or StatedFacts()))
 
 
 def lattice(side: int, frames: int = 5, shift: tuple[float, float] = (0.0, 0.0)) -> Trajectory:
@@ -110,7 +110,7 @@ class TestFindings:
         write_metadata(tmp_path, made_up_metadata())
         with h5py.File(tmp_path / "train.h5", "a") as file:
             file["00001"]["position"][3, 2, 1] = np.nan
-        found = inspect(Folder(tmp_path))
+        found = inspect(FolderSource(tmp_path))
         assert any("trajectory 00001: position of particle 2 in frame 3" in finding for finding in found.findings)
         assert found.splits["train"].trajectories == 2
         assert found.grids[0].per_cell > 0  # the other trajectory was looked at
@@ -121,7 +121,7 @@ class TestFindings:
         with h5py.File(tmp_path / "train.h5", "a") as file:
             file["00000"]["position"][0] = np.nan
         with pytest.raises(DataError, match="none of its trajectories could be looked at"):
-            inspect(Folder(tmp_path))
+            inspect(FolderSource(tmp_path))
 
     def test_outside_of_the_stated_domain(self, tmp_path, run):
         found = look(tmp_path, run, domain=((0.45, 0.92), (0.08, 0.92)), bounds=((0.5, 0.9), (0.1, 0.9)))
@@ -141,7 +141,7 @@ class TestFindings:
 def test_few_trajectories_will_do_and_it_says_so(tmp_path):
     write_split(tmp_path / "train.h5", [made_up_trajectory(12, 5, seed=i) for i in range(10)])
     write_metadata(tmp_path, made_up_metadata())
-    split = inspect(Folder(tmp_path), trajectories=3).splits["train"]
+    split = inspect(FolderSource(tmp_path), trajectories=3).splits["train"]
     assert (split.trajectories, split.inspected) == (10, 3)
 
 
@@ -151,7 +151,9 @@ def test_everything_is_json(tmp_path):
 
 
 def test_recorded_waterdrop(recorded):
-    found = inspect(Folder(recorded / "deepmind-waterdrop", Stated("deepmind", (0.0, -9.81))), trajectories=2)
+    found = inspect(
+        FolderSource(recorded / "deepmind-waterdrop", StatedFacts("deepmind", (0.0, -9.81))), trajectories=2
+    )
     assert found.observed[1][0] == pytest.approx(0.0914, abs=0.002)
     assert any("Along y positions reach from 0.09" in note for note in found.notes)
     assert found.recommended == 64
@@ -159,8 +161,8 @@ def test_recorded_waterdrop(recorded):
 
 
 def test_recorded_channel_wraps(recorded):
-    stated = Stated("jax-sph", None, ("periodic", "wall"))
-    found = inspect(Folder(recorded / "jaxsph-heated-channel-2d", stated), trajectories=1)
+    stated = StatedFacts("jax-sph", None, ("periodic", "wall"))
+    found = inspect(FolderSource(recorded / "jaxsph-heated-channel-2d", stated), trajectories=1)
     assert found.fields == {"temperature": (130, 950)}
     assert not any("jumps" in finding for finding in found.findings)
     assert found.grids[0].most_speed < 1  # and not the box's length, as across the period

@@ -6,21 +6,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nmpm.data.background import in_background, spread
+from nmpm.data.loading.background import map_in_threads, run_in_thread
 
 
 def test_gives_the_result_of_another_thread():
-    assert in_background(threading.get_ident).result() != threading.get_ident()
+    assert run_in_thread(threading.get_ident).result() != threading.get_ident()
 
 
 def test_gives_the_error_to_whoever_asks():
     with pytest.raises(ZeroDivisionError):
-        in_background(lambda: 1 // 0).result()
+        run_in_thread(lambda: 1 // 0).result()
 
 
 @given(items=st.lists(st.integers(), max_size=20), workers=st.integers(1, 5))
 def test_spread_keeps_the_order(items, workers):
-    assert spread(lambda item: 2 * item, items, workers) == [2 * item for item in items]
+    assert map_in_threads(lambda item: 2 * item, items, workers) == [2 * item for item in items]
 
 
 def test_spread_stops_at_an_error():
@@ -32,19 +32,19 @@ def test_spread_stops_at_an_error():
             raise ValueError("two")
 
     with pytest.raises(ValueError, match="two"):
-        spread(work, range(100), workers=1)
+        map_in_threads(work, range(100), workers=1)
     assert begun == [0, 1, 2]
 
 
 def test_the_program_ends_although_work_is_left():
     script = """
-from nmpm.data.background import carry_on, in_background
+from nmpm.data.loading.background import raise_if_abandoned, run_in_thread
 
 def work():
     while True:
-        carry_on()
+        raise_if_abandoned()
 
-in_background(work)
+run_in_thread(work)
 """
     assert subprocess.run([sys.executable, "-c", script], timeout=60, check=False).returncode == 0
 

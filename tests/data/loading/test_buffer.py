@@ -9,12 +9,12 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.buffer import Motion, TrajectoryBuffer
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.plan import WindowPlan
-from nmpm.data.recording import Recording, Recordings
-from nmpm.data.scenes import infer_scene
+from nmpm.data.loading.buffer import MotionSampler, TrajectoryBuffer
+from nmpm.data.loading.recording import Recording, SplitRecordings
+from nmpm.data.loading.window_plan import WindowPlan
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 
 PLANS = st.builds(
@@ -28,8 +28,8 @@ PLANS = st.builds(
 )
 
 
-def recordings_of(folder) -> Recordings:
-    return Recordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
+def recordings_of(folder) -> SplitRecordings:
+    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
 
 
 def buffer_of(folder, length: int = 5, **options) -> TrajectoryBuffer:
@@ -83,9 +83,9 @@ class TestPlan:
         index, before, expected = 0, None, (0, 0)
         for batches, batch_size, world in legs:
             plan = dataclasses.replace(plan, batch_size=batch_size)
-            plan = plan.after(index, *before, world) if before else plan
+            plan = plan.resume_after(index, *before, world) if before else plan
             for number in range(index, index + batches):
-                buffer, drawn = plan.place(number, world)
+                buffer, drawn = plan.locate(number, world)
                 assert (buffer, drawn) in (expected, (expected[0] + 1, 0))
                 if buffer > expected[0]:
                     assert expected[1] > (plan.batches_per_buffer(world) - 1) * batch_size * world
@@ -98,7 +98,7 @@ class TestPlan:
         whole = dataclasses.replace(plan, batch_size=3 * plan.batch_size)
         parts = [plan.batch(index, rank, 3) for rank in range(3)]
         assert parts[0] + parts[1] + parts[2] == whole.batch(index, 0, 1)
-        assert plan.after(index, whole.batch_size, 1, 3) == plan
+        assert plan.resume_after(index, whole.batch_size, 1, 3) == plan
 
     def test_every_window_is_as_likely(self):
         plan = WindowPlan(frames=(8,) * 6, length=3, batch_size=4, buffer_size=2, passes=1, seed=3)
@@ -171,7 +171,7 @@ def test_waterdrop(recorded):
     folder = recorded / "deepmind-waterdrop"
     scene = infer_scene(folder, family="deepmind", gravity=(0, -9.81))
     split = Split(folder / "train.h5")
-    recordings = Recordings(split, read_metadata(folder, "deepmind"), scene)
+    recordings = SplitRecordings(split, read_metadata(folder, "deepmind"), scene)
     plan = WindowPlan(tuple(map(split.frames, range(9))), length=18, batch_size=16, buffer_size=4, passes=4, seed=0)
     window = next(TrajectoryBuffer(recordings, plan).batches(7))
     for row, (trajectory, start) in enumerate(plan.batch(7, 0, 1)):
@@ -185,9 +185,9 @@ def test_emphasis_draws_windows_in_proportion_to_their_motion():
     frames[:10] = torch.arange(10).view(-1, 1, 1) * 0.01  # moves for 10 frames, then rests
     frames[10:] = frames[9]
     recording = Recording(frames, torch.zeros(3, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
-    motion = Motion({7: recording}, length=4)
+    motion = MotionSampler({7: recording}, length=4)
     rng = np.random.default_rng(0)
-    drawn = [motion.at(share) for share in rng.random(4000)]
+    drawn = [motion.window_at(share) for share in rng.random(4000)]
     assert {trajectory for trajectory, _ in drawn} == {7}
     starts = np.bincount([start for _, start in drawn], minlength=37) / 4000
     expected = np.array([min(3, max(0, 9 - start)) for start in range(37)]) / 24
@@ -201,7 +201,7 @@ def test_emphasis_keeps_batches_a_function_of_their_number(make_dataset):
     resumed = list(islice(buffer.batches(start=3), 3))
     for one, other in zip(run[3:], resumed, strict=True):
         assert torch.equal(one.frames, other.frames)
-    plain = TrajectoryDataModule(path=str(data.origin.path), horizon=4, batch_size=4).train_dataloader().buffer
+    plain = TrajectoryDataModule(path=str(data.data_source.path), horizon=4, batch_size=4).train_dataloader().buffer
     assert any(not torch.equal(a.frames, b.frames) for a, b in zip(run, plain.batches(), strict=False))
 
 

@@ -1,4 +1,4 @@
-"""Recordings side by side in one padded tensor, from which windows are gathered in one go."""
+"""SplitRecordings side by side in one padded tensor, from which windows are gathered in one go."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.data.recording import Recording
+from nmpm.data.loading.recording import Recording
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
 
 @dataclass(frozen=True)
-class Shelf:
+class PaddedRecordings:
     """S recordings of a scene, padded to the longest and largest; padding particles lie at the domain's centre.
 
     Args:
@@ -33,12 +33,12 @@ class Shelf:
     scene: Scene
 
     @classmethod
-    def of(cls, recordings: Sequence[Recording], scene: Scene) -> Shelf:
-        """Puts recordings on a shelf, copying them."""
+    def of(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
+        """Puts recordings on a padded, copying them."""
         centre = [(low + high) / 2 for low, high in scene.domain]
-        frames, mask = _padded([recording.frames for recording in recordings], centre)
-        obstacle, obstacle_mask = _padded([recording.obstacle[None] for recording in recordings], centre)
-        material, _ = _padded([recording.material[None, :, None] for recording in recordings], [0])
+        frames, mask = _pad_and_stack([recording.frames for recording in recordings], centre)
+        obstacle, obstacle_mask = _pad_and_stack([recording.obstacle[None] for recording in recordings], centre)
+        material, _ = _pad_and_stack([recording.material[None, :, None] for recording in recordings], [0])
         gravity = torch.stack([recording.gravity for recording in recordings])
         return cls(frames, material[:, 0, :, 0], mask, obstacle[:, 0], obstacle_mask, gravity, scene)
 
@@ -52,9 +52,9 @@ class Shelf:
             gravity=self.gravity[row],
         )
 
-    def to(self, device: torch.device) -> Shelf:
+    def to(self, device: torch.device) -> PaddedRecordings:
         """The same on another device."""
-        return Shelf(
+        return PaddedRecordings(
             frames=self.frames.to(device),
             material=self.material.to(device),
             mask=self.mask.to(device),
@@ -95,7 +95,7 @@ def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = 
         Window: padded to the largest recording.
     """
     frames = len(recordings[0].frames) if length is None else length
-    return Shelf.of(recordings, scene).window(range(len(recordings)), [0] * len(recordings), frames)
+    return PaddedRecordings.stack(recordings, scene).window(range(len(recordings)), [0] * len(recordings), frames)
 
 
 def unwrap(frames: Tensor, scene: Scene) -> None:
@@ -111,7 +111,7 @@ def unwrap(frames: Tensor, scene: Scene) -> None:
             along[:, 1:] -= turns * period
 
 
-def _padded(parts: Sequence[Tensor], filler: Sequence[float]) -> tuple[Tensor, Tensor]:
+def _pad_and_stack(parts: Sequence[Tensor], filler: Sequence[float]) -> tuple[Tensor, Tensor]:
     """Stacks (T_i, N_i, C) tensors to (S, T, N, C), with (S, N) telling which of the N are not filler."""
     counts = [part.shape[1] for part in parts]
     longest = max(part.shape[0] for part in parts)

@@ -4,21 +4,21 @@ from itertools import islice
 import pytest
 import torch
 
-from nmpm.data.buffer import TrajectoryBuffer
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split
-from nmpm.data.live import LiveRecordings
-from nmpm.data.plan import EndlessPlan
+from nmpm.data.loading.buffer import TrajectoryBuffer
+from nmpm.data.loading.simulated import SimulatedRecordings
+from nmpm.data.loading.window_plan import EndlessWindowPlan
 from nmpm.errors import ConfigError
 from nmpm.sim import MpmPreset, load_preset
 
 GOOP = load_preset("goop")
 TINY = dataclasses.replace(GOOP, frames=8, blocks=dataclasses.replace(GOOP.blocks, particles=(40, 60)))
-PLAN = EndlessPlan(frames=(9, 9), length=5, batch_size=3, buffer_size=2, passes=1, seed=0)
+PLAN = EndlessWindowPlan(frames=(9, 9), length=5, batch_size=3, buffer_size=2, passes=1, seed=0)
 
 
-def live(**changes) -> LiveRecordings:
-    return LiveRecordings(TINY, **({"workers": 2} | changes))
+def live(**changes) -> SimulatedRecordings:
+    return SimulatedRecordings(TINY, **({"workers": 2} | changes))
 
 
 def test_a_number_is_always_the_same_trajectory():
@@ -60,7 +60,7 @@ def test_a_buffers_windows_are_all_seen():
 @pytest.mark.parametrize(("earlier", "world"), [(1, 2), (2, 1), (3, 2), (2, 3)])
 def test_no_trajectory_is_seen_again_by_another_number_of_ranks(earlier, world):
     seen = {index for rank in range(earlier) for batch in range(7) for index, _ in PLAN.batch(batch, rank, earlier)}
-    after = PLAN.after(7, PLAN.batch_size, earlier, world)
+    after = PLAN.resume_after(7, PLAN.batch_size, earlier, world)
     more = {index for rank in range(world) for batch in range(7, 14) for index, _ in after.batch(batch, rank, world)}
     assert max(seen) < min(more) <= max(seen) + 2 * world
 
@@ -68,7 +68,7 @@ def test_no_trajectory_is_seen_again_by_another_number_of_ranks(earlier, world):
 def test_a_failed_simulation_is_reported():
     fast = dataclasses.replace(TINY, blocks=dataclasses.replace(TINY.blocks, speed=1e200))
     with pytest.raises(ConfigError, match=r"Preset goop, seed .*finite"):
-        LiveRecordings(fast).load([0, 1])
+        SimulatedRecordings(fast).load([0, 1])
 
 
 def test_too_long_a_horizon():
@@ -89,7 +89,7 @@ class TestDataModule:
         window = next(iter(module.train_dataloader()))
         assert window.frames.shape[:2] == (2, 5)
         assert len(next(iter(module.val_dataloader())).frames) == 1
-        assert sorted(path.name for path in module.origin.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
+        assert sorted(path.name for path in module.data_source.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
         assert "simulated by nmpm while training" in module.description
 
     def test_evaluates_on_the_trajectories_of_the_dataset(self, module):
@@ -97,7 +97,7 @@ class TestDataModule:
             name="goop", generate={"counts": {"train": 1, "valid": 1, "test": 1}, "frames": 6}
         )
         for split in ("valid", "test"):
-            live_file, stored_file = (Split(data.origin.folder / f"{split}.h5") for data in (module, stored))
+            live_file, stored_file = (Split(data.data_source.folder / f"{split}.h5") for data in (module, stored))
             assert (live_file.read(0).position == stored_file.read(0).position).all()
 
     def test_needs_the_name_of_a_preset(self):

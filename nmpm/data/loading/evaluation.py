@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 
-from nmpm.data.recording import Recordings
-from nmpm.data.shelf import collate
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import SplitRecordings
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 
@@ -27,7 +27,7 @@ class EvaluationLoader:
     """
 
     def __init__(
-        self, recordings: Recordings, batch_size: int, limit: int | None = None, rank: int = 0, world: int = 1
+        self, recordings: SplitRecordings, batch_size: int, limit: int | None = None, rank: int = 0, world: int = 1
     ) -> None:
         self.recordings = recordings
         recordings.require_frames(3, "an evaluation")

@@ -7,9 +7,9 @@ import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from nmpm.data.archives import DAMAGED_ZIP
+from nmpm.data.archive_errors import ZIP_ERRORS
 from nmpm.data.catalog import dataset_home
-from nmpm.data.folder_lock import locked
+from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import SPLITS
 from nmpm.errors import ConfigError, DataError
 
@@ -32,19 +32,19 @@ def hub_folder(name: str) -> Path:
         ConfigError: if the name cannot be one.
         DataError: if it cannot be fetched, for lack of a connection or because there is none of that name.
     """
-    repository, folder = _parsed(name)
-    fetched = _fetched(repository, folder)
+    repository, folder = _parse_name(name)
+    fetched = _fetch(repository, folder)
     archives = sorted(fetched.rglob("*.zip"))
     if not archives:
         return fetched
     unpacked = dataset_home() / "hub" / repository.replace("/", "--") / (folder or "all")
-    with locked(unpacked.parent):
+    with lock_folder(unpacked.parent):
         if not unpacked.is_dir():
             _unpack(fetched, archives, unpacked)
     return _root(unpacked)
 
 
-def _parsed(name: str) -> tuple[str, str]:
+def _parse_name(name: str) -> tuple[str, str]:
     parts = name.strip("/").split("/")
     if len(parts) > 3 or not all(_NAME.fullmatch(part) for part in parts):
         raise ConfigError(
@@ -56,7 +56,7 @@ def _parsed(name: str) -> tuple[str, str]:
     return "/".join(parts[:2]), parts[2] if len(parts) == 3 else ""
 
 
-def _fetched(repository: str, folder: str) -> Path:
+def _fetch(repository: str, folder: str) -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
@@ -96,7 +96,7 @@ def _unpack(fetched: Path, archives: list[Path], target: Path) -> None:
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, place)
         part.rename(target)
-    except DAMAGED_ZIP as error:
+    except ZIP_ERRORS as error:
         raise DataError(f"{target}: cannot be unpacked ({_first_line(error)}).") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from nmpm.data.convert.base import Reread, Source
+from nmpm.data.convert.base import ForeignDataset, Rereadable
 from nmpm.data.format import Trajectory
 from nmpm.errors import ConfigError
 
 
-def renumbered(source: Source, ids: Mapping[int, int]) -> Source:
+def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDataset:
     """The same dataset with other particle type ids; names and what is static go along.
 
     Args:
@@ -37,7 +37,7 @@ def renumbered(source: Source, ids: Mapping[int, int]) -> Source:
     return replace(
         source,
         metadata=replace(metadata, particle_types=types, static_types=static),
-        splits={name: Reread(partial(_each, split, ids, kept)) for name, split in source.splits.items()},
+        splits={name: Rereadable(partial(_each, split, ids, kept)) for name, split in source.splits.items()},
     )
 
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import first_that_moves
+from nmpm.data.statistics import first_moving_particle
 
 _JUMP = 5.0  # spacings by which a particle's step may differ from the one before
 
 
-def oddities(trajectory: Trajectory, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
+def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
     """What is suspicious about one trajectory.
 
     Args:
@@ -35,7 +35,7 @@ def oddities(trajectory: Trajectory, metadata: Metadata, spacing: float, where: 
         twins = int((number - 1).sum())
         yield f"{where}, frame 0: {twins} particles are where another is, e.g. where particle {twin} is."
     static = np.isin(types, list(metadata.static_types))
-    particle = first_that_moves(position, static, metadata.bounds)
+    particle = first_moving_particle(position, static, metadata.bounds)
     if particle is not None:
         yield f"{where}: particle {particle}, of the static type {types[particle]}, moves."
 

@@ -9,24 +9,24 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.data.convert import Options, Source, convert
-from nmpm.data.convert.base import Reread
-from nmpm.data.convert.run import write_source
+from nmpm.data.convert import ForeignDataset, Options, convert
+from nmpm.data.convert.base import Rereadable
+from nmpm.data.convert.conversion import write_native
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.conftest import made_up_metadata, made_up_trajectory
 
 
-def source_of(*trajectories: Trajectory, **changes) -> Source:
-    return Source(made_up_metadata(**changes), {"train": Reread(lambda: iter(trajectories))})
+def source_of(*trajectories: Trajectory, **changes) -> ForeignDataset:
+    return ForeignDataset(made_up_metadata(**changes), {"train": Rereadable(lambda: iter(trajectories))})
 
 
 def test_a_taken_destination_is_left_alone(tmp_path):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "precious.txt").write_text("mine")
     with pytest.raises(DataError, match="taken: is there already"):
-        write_source(source_of(made_up_trajectory(5, 3)), tmp_path / "taken")
+        write_native(source_of(made_up_trajectory(5, 3)), tmp_path / "taken")
     assert (tmp_path / "taken" / "precious.txt").read_text() == "mine"
 
 
@@ -36,7 +36,7 @@ def test_an_error_half_way_leaves_nothing(tmp_path):
         raise DataError("the second is damaged")
 
     with pytest.raises(DataError, match="second is damaged"):
-        write_source(Source(made_up_metadata(), {"train": Reread(broken)}), tmp_path / "out")
+        write_native(ForeignDataset(made_up_metadata(), {"train": Rereadable(broken)}), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
@@ -45,15 +45,15 @@ def test_killed_half_way_it_leaves_no_dataset_and_the_next_call_sweeps(tmp_path)
 import sys, time
 sys.path.insert(0, {str(Path.cwd())!r})
 from pathlib import Path
-from nmpm.data.convert import Source
-from nmpm.data.convert.base import Reread
-from nmpm.data.convert.run import write_source
+from nmpm.data.convert import ForeignDataset
+from nmpm.data.convert.base import Rereadable
+from nmpm.data.convert.conversion import write_native
 from tests.conftest import made_up_metadata, made_up_trajectory
 def slow():
     yield made_up_trajectory(5, 3)
     print("begun", flush=True)
     time.sleep(60)
-write_source(Source(made_up_metadata(), {{"train": Reread(slow)}}), Path({str(tmp_path / "out")!r}))
+write_native(ForeignDataset(made_up_metadata(), {{"train": Rereadable(slow)}}), Path({str(tmp_path / "out")!r}))
 """
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
@@ -62,7 +62,7 @@ write_source(Source(made_up_metadata(), {{"train": Reread(slow)}}), Path({str(tm
     process.wait()
     time.sleep(0.1)
     assert not (tmp_path / "out").exists()
-    write_source(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
+    write_native(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
     assert [item.name for item in tmp_path.iterdir()] == ["out"]
 
 
@@ -70,7 +70,7 @@ def test_says_what_is_odd(tmp_path):
     still, moving = made_up_trajectory(5, 3, statics=2), made_up_trajectory(5, 3, seed=1, statics=2)
     moving.position[:, -1, 0] += np.linspace(0, 0.1, 5, dtype=np.float32)
     moving.position[2, 0, 1] = 0.95
-    notes = write_source(source_of(still, moving, extra={"vel_std": [1.0, 1.0]}), tmp_path / "out")
+    notes = write_native(source_of(still, moving, extra={"vel_std": [1.0, 1.0]}), tmp_path / "out")
     said = " ".join(notes)
     assert "static type move in 1 of 2 trajectories" in said
     assert "state vel_std = (1, 1)" in said
@@ -84,7 +84,7 @@ def test_says_what_is_odd(tmp_path):
 
 
 def test_says_nothing_of_clean_data(tmp_path):
-    notes = write_source(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "out")
+    notes = write_native(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "out")
     assert notes == ()
 
 
@@ -92,7 +92,7 @@ def test_unknown_types_are_refused_with_the_remedy(tmp_path):
     trajectory = made_up_trajectory(5, 3)
     strange = Trajectory(trajectory.position, np.full(3, 42))
     with pytest.raises(DataError, match=r"train split, trajectory 0: unknown particle type 42"):
-        write_source(source_of(strange), tmp_path / "out")
+        write_native(source_of(strange), tmp_path / "out")
 
 
 def test_what_is_of_no_format_is_refused(tmp_path):
@@ -142,7 +142,7 @@ class TestNative:
         for index in range(len(old)):
             with h5py.File(old.path) as file:
                 temperature = file[old.names[index]]["temperature"][()]
-            np.testing.assert_array_equal(new.whole(index).fields["temperature"], temperature)
+            np.testing.assert_array_equal(new.read_with_fields(index).fields["temperature"], temperature)
             np.testing.assert_array_equal(new.read(index).position, old.read(index).position)
         metadata = read_metadata(tmp_path / "channel")
         assert metadata.periodic == (True, False)

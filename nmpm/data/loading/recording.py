@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.data.background import carry_on
 from nmpm.data.format import Metadata, Split, Trajectory
-from nmpm.data.statistics import first_that_moves
+from nmpm.data.loading.background import raise_if_abandoned
+from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -38,7 +38,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Reader:
+class RecordingReader:
     """Makes recordings of trajectories, and checks what a file may hold wrongly.
 
     Args:
@@ -102,7 +102,7 @@ class Reader:
             )
 
     def _check_still(self, trajectory: Trajectory, static: np.ndarray, where: str) -> None:
-        particle = first_that_moves(trajectory.position, static, self.scene.domain)
+        particle = first_moving_particle(trajectory.position, static, self.scene.domain)
         if particle is not None:
             type_id = int(trajectory.particle_type[particle])
             raise DataError(
@@ -121,7 +121,7 @@ class Reader:
         return (gravity * self.scene.dt**2).float()
 
 
-class Recordings(Sequence[Recording]):
+class SplitRecordings(Sequence[Recording]):
     """The trajectories of a split as recordings, read and checked when asked for.
 
     Args:
@@ -134,7 +134,7 @@ class Recordings(Sequence[Recording]):
         if split.dim != scene.dim:
             raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
         self.split, self.scene = split, scene
-        self.reader = Reader(metadata, scene)
+        self.reader = RecordingReader(metadata, scene)
 
     def __len__(self) -> int:
         return len(self.split)
@@ -148,7 +148,7 @@ class Recordings(Sequence[Recording]):
         return self.reader.recording(self.split.read(index), self.split.where(index))
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         """Size of the positions of the largest trajectory."""
         split = self.split
         return max(4 * split.frames(index) * split.particles(index) * split.dim for index in range(len(self)))
@@ -158,7 +158,7 @@ class Recordings(Sequence[Recording]):
         return list(map(self._next, indices))
 
     def _next(self, index: int) -> Recording:
-        carry_on()
+        raise_if_abandoned()
         return self[index]
 
     def require_frames(self, frames: int, purpose: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nmpm.data.catalog import dataset_home
 from nmpm.data.convert import Options, convert
-from nmpm.data.folder_lock import locked
+from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import METADATA_FILE
 
 _log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
     path, options = Path(path).resolve(), options or Options()
     cache = dataset_home() / "converted"
     folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
-    with locked(cache):
+    with lock_folder(cache):
         if not (folder / METADATA_FILE).is_file():
             for note in convert(path, folder, options=options):
                 _log.info("%s: %s", path.name, note)
@@ -38,7 +38,7 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
 
 
 def _fingerprint(path: Path, options: Options) -> str:
-    told = repr((str(path), _plain(options), list(_stamps(path))))
+    told = repr((str(path), _plain(options), list(_file_stamps(path))))
     return hashlib.sha256(told.encode()).hexdigest()[:10]
 
 
@@ -49,7 +49,7 @@ def _plain(options: Options) -> list[tuple[str, object]]:
     return sorted(entries.items())
 
 
-def _stamps(path: Path) -> Iterator[tuple[str, int, int]]:
+def _file_stamps(path: Path) -> Iterator[tuple[str, int, int]]:
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
             status = file.stat()

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from threading import Lock
 
-from nmpm.data.background import carry_on, in_background, spread
 from nmpm.data.format import SPLITS, Trajectory
-from nmpm.data.generate import derived_seed, metadata_of
-from nmpm.data.progress import shown
-from nmpm.data.recording import Reader, Recording
+from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.loading.background import map_in_threads, raise_if_abandoned, run_in_thread
+from nmpm.data.loading.recording import Recording, RecordingReader
+from nmpm.data.progress import progress_bar
 from nmpm.errors import ConfigError
 from nmpm.sim import Preset
 
@@ -20,7 +20,7 @@ _STREAM = len(SPLITS)  # no split's number, so that no seed is that of a written
 _REMEMBERED = 2  # requests: the buffer in use and the next
 
 
-class LiveRecordings:
+class SimulatedRecordings:
     """The trajectories that a preset gives for a seed, simulated when asked for.
 
     Number i is always the same one, so that training that stopped goes on with the trajectories it would have seen.
@@ -34,7 +34,7 @@ class LiveRecordings:
     def __init__(self, preset: Preset, seed: int = 0, workers: int | None = None) -> None:
         self.preset, self.seed, self.scene = preset, seed, preset.scene
         self.workers = workers or os.cpu_count() or 1
-        self.reader = Reader(metadata_of(preset), self.scene)
+        self.reader = RecordingReader(preset_metadata(preset), self.scene)
         self._lock = Lock()
         self._requests: OrderedDict[tuple[int, ...], Future[list[Recording]]] = OrderedDict()
 
@@ -44,12 +44,12 @@ class LiveRecordings:
         Raises:
             ConfigError: if the simulation fails; names preset and seed.
         """
-        made = self.preset.simulate(derived_seed(self.seed, _STREAM, index), progress=lambda _: carry_on())
+        made = self.preset.simulate(derive_seed(self.seed, _STREAM, index), progress=lambda _: raise_if_abandoned())
         trajectory = Trajectory(made.position, made.particle_type, made.attributes)
         return self.reader.recording(trajectory, f"{self.preset.name}, simulated trajectory {index}")
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         """Size of the positions of the largest trajectory that may come."""
         return 4 * (self.preset.frames + 1) * self.preset.most_particles * self.scene.dim
 
@@ -59,7 +59,7 @@ class LiveRecordings:
         with self._lock:
             first = not self._requests
             if key not in self._requests:
-                self._requests[key] = in_background(self._simulate_shown if first else self._simulate, key)
+                self._requests[key] = run_in_thread(self._simulate_shown if first else self._simulate, key)
             while len(self._requests) > _REMEMBERED:
                 self._requests.popitem(last=False)
             request = self._requests[key]
@@ -78,15 +78,17 @@ class LiveRecordings:
             )
 
     def _simulate(self, indices: Sequence[int]) -> list[Recording]:
-        return spread(self.__getitem__, indices, self.workers)
+        return map_in_threads(self.__getitem__, indices, self.workers)
 
     def _simulate_shown(self, indices: Sequence[int]) -> list[Recording]:
         """With a progress bar: training waits for the first ones."""
-        with shown(f"Simulating the first {len(indices)} trajectories of {self.preset.name}", len(indices)) as advance:
+        with progress_bar(
+            f"Simulating the first {len(indices)} trajectories of {self.preset.name}", len(indices)
+        ) as advance:
 
             def simulate(index: int) -> Recording:
                 made = self[index]
                 advance()
                 return made
 
-            return spread(simulate, indices, self.workers)
+            return map_in_threads(simulate, indices, self.workers)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 
 

@@ -47,7 +47,7 @@ def infer_scene(
         ConfigError: if an argument does not fit the data.
     """
     folder = Path(folder)
-    metadata = _overridden(read_metadata(folder, family), gravity, boundary, bounds)
+    metadata = _override(read_metadata(folder, family), gravity, boundary, bounds)
     split = _reference_split(folder)
     if split.dim != metadata.dim:
         raise DataError(f"{split.path}: positions have {split.dim} dimensions, {METADATA_FILE} says {metadata.dim}.")
@@ -68,7 +68,7 @@ def infer_scene(
     )
 
 
-def _overridden(
+def _override(
     metadata: Metadata,
     gravity: Sequence[float] | None,
     boundary: Sequence[Boundary] | None,
@@ -120,7 +120,7 @@ def _gravities(split: Split, metadata: Metadata) -> tuple[tuple[float, ...], ...
 
 
 @dataclass(frozen=True)
-class _Survey:
+class _ObservedExtents:
     """What a look at the positions showed: extents (2, D) of moving and of all particles, and spacings."""
 
     moving: np.ndarray
@@ -128,7 +128,7 @@ class _Survey:
     spacing: np.ndarray
 
 
-def _survey(split: Split, metadata: Metadata) -> _Survey:
+def _survey(split: Split, metadata: Metadata) -> _ObservedExtents:
     sizes = [4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split))]
     sample = range(0, len(split), max(1, -(-sum(sizes) // _SURVEY_BYTES)))
     measured = set(sample[:: -(-len(sample) // _SPACING_TRAJECTORIES)])
@@ -145,7 +145,7 @@ def _survey(split: Split, metadata: Metadata) -> _Survey:
                 extents.append([position.min(axis=(0, 1)), position.max(axis=(0, 1))])
         if index in measured:
             spacing.append(_spacing(trajectory.position[0, kind], metadata))
-    return _Survey(_union(moving, metadata), _union(everything, metadata), np.concatenate(spacing))
+    return _ObservedExtents(_union(moving, metadata), _union(everything, metadata), np.concatenate(spacing))
 
 
 def _union(extents: list[list[np.ndarray]], metadata: Metadata) -> np.ndarray:
@@ -168,7 +168,7 @@ def _spacing(position: np.ndarray, metadata: Metadata) -> np.ndarray:
     return distance
 
 
-def _volume(survey: _Survey, metadata: Metadata, folder: Path) -> float:
+def _volume(survey: _ObservedExtents, metadata: Metadata, folder: Path) -> float:
     distance = float(np.median(survey.spacing)) if len(survey.spacing) else 0.0
     if distance <= 0:
         raise DataError(
@@ -178,7 +178,9 @@ def _volume(survey: _Survey, metadata: Metadata, folder: Path) -> float:
     return float(distance**metadata.dim)
 
 
-def _extents(metadata: Metadata, survey: _Survey, folder: Path) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
+def _extents(
+    metadata: Metadata, survey: _ObservedExtents, folder: Path
+) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Bounds and domain per axis."""
     stated = metadata.domain or (None,) * metadata.dim
     pairs = [
@@ -195,7 +197,7 @@ def _periodic_extent(bounds: Interval, stated: Interval | None) -> tuple[Interva
 
 
 def _walled_extent(
-    bounds: Interval, stated: Interval | None, survey: _Survey, axis: int, folder: Path
+    bounds: Interval, stated: Interval | None, survey: _ObservedExtents, axis: int, folder: Path
 ) -> tuple[Interval, Interval]:
     low, high = bounds
     seen_low, seen_high = map(float, survey.everything[:, axis])

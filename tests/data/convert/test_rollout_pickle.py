@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from nmpm.data.convert import Options, RolloutPickle, convert
-from nmpm.data.convert.pickles import load_pickled, numbers
+from nmpm.data.convert.rollout_pickle import load_pickled, numbers
 from nmpm.data.format import Split, Trajectory
 from nmpm.errors import DataError
 
@@ -113,7 +113,7 @@ def test_a_rollout_becomes_a_trajectory_with_its_prediction(tmp_path):
     content = rollout()
     path = write(tmp_path / "rollout_test_0.pkl", content, 2)
     notes = convert(path, tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     truth = np.concatenate([content["initial_positions"], content["ground_truth_rollout"]])
     predicted = np.concatenate([content["initial_positions"], content["predicted_rollout"]])
     np.testing.assert_array_equal(trajectory.position, truth)
@@ -141,8 +141,8 @@ def test_recorded_rollout_equals_the_record_beside_it(recorded, tmp_path):
     folder = recorded / "deepmind-sand-subset"
     convert(folder / "rollout_test_s0.pkl", tmp_path / "rollout")
     convert(folder / "test_sub.tfrecord", tmp_path / "record")
-    rolled = Split(tmp_path / "rollout" / "test.h5").whole(0)
-    record = Split(tmp_path / "record" / "test.h5").whole(0)
+    rolled = Split(tmp_path / "rollout" / "test.h5").read_with_fields(0)
+    record = Split(tmp_path / "record" / "test.h5").read_with_fields(0)
     assert rolled.position.shape == (320, 256, 2)
     np.testing.assert_array_equal(rolled.position, record.position[:320])
     assert rolled.fields["predicted_rollout"].shape == (320, 256, 2)

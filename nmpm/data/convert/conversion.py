@@ -9,17 +9,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from nmpm.data.convert.base import Format, Source
-from nmpm.data.convert.seen import Seen
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset
+from nmpm.data.convert.conversion_log import ConversionLog
 from nmpm.data.format import SPLITS, Trajectory, write_metadata, write_split
-from nmpm.data.progress import shown
-from nmpm.data.statistics import Statistics
+from nmpm.data.progress import progress_bar
+from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import ConfigError, DataError
 
 NOTES = "conversion"
 
 
-def detect(path: Path, formats: Sequence[Format]) -> Format:
+def detect_format(path: Path, formats: Sequence[DatasetFormat]) -> DatasetFormat:
     """The format of a file or folder.
 
     Raises:
@@ -37,7 +37,7 @@ def detect(path: Path, formats: Sequence[Format]) -> Format:
     return found
 
 
-def named(name: str, formats: Sequence[Format]) -> Format:
+def find_format(name: str, formats: Sequence[DatasetFormat]) -> DatasetFormat:
     """The format of that name.
 
     Raises:
@@ -49,7 +49,7 @@ def named(name: str, formats: Sequence[Format]) -> Format:
     raise ConfigError(f"No format is called {name!r}; known: {', '.join(kind.name for kind in formats)}.")
 
 
-def write_source(source: Source, destination: Path) -> tuple[str, ...]:
+def write_native(source: ForeignDataset, destination: Path) -> tuple[str, ...]:
     """Writes an opened dataset in the native layout.
 
     Args:
@@ -66,18 +66,18 @@ def write_source(source: Source, destination: Path) -> tuple[str, ...]:
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination}: is there already; choose another folder, or delete this one.")
     try:
-        with _appearing(destination) as part:
+        with _replacing_folder(destination) as part:
             return _write(source, part)
     except OSError as error:
         raise DataError(f"{destination}: cannot be written ({error}).") from error
 
 
 @contextmanager
-def _appearing(folder: Path) -> Iterator[Path]:
+def _replacing_folder(folder: Path) -> Iterator[Path]:
     """A folder beside the given one, which becomes it once all went well and is gone otherwise."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     for stale in folder.parent.glob(f".{folder.name}.*.part"):
-        if not _alive(stale.name.split(".")[-2]):
+        if not _is_running(stale.name.split(".")[-2]):
             shutil.rmtree(stale, ignore_errors=True)
     part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     shutil.rmtree(part, ignore_errors=True)
@@ -89,7 +89,7 @@ def _appearing(folder: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _alive(process: str) -> bool:
+def _is_running(process: str) -> bool:
     with suppress(ProcessLookupError, ValueError):
         try:
             os.kill(int(process), 0)
@@ -99,23 +99,23 @@ def _alive(process: str) -> bool:
     return False
 
 
-def _write(source: Source, folder: Path) -> tuple[str, ...]:
+def _write(source: ForeignDataset, folder: Path) -> tuple[str, ...]:
     names = [name for name in SPLITS if name in source.splits]
     known = [source.counts.get(name) for name in names]
     total = None if None in known else sum(count or 0 for count in known)
-    seen = Seen(source.metadata, Statistics(source.metadata))
-    with shown("Converting", total) as advance:
+    seen = ConversionLog(source.metadata, MotionStatistics(source.metadata))
+    with progress_bar("Converting", total) as advance:
         for name in names:
-            write_split(folder / f"{name}.h5", _watched(source.splits[name], seen, f"{name} split", advance))
-            # Statistics are those of the first split, train where there is one.
+            write_split(folder / f"{name}.h5", _log_and_yield(source.splits[name], seen, f"{name} split", advance))
+            # MotionStatistics are those of the first split, train where there is one.
             seen.statistics_done = True
-    metadata, odd = seen.concluded()
+    metadata, odd = seen.final_metadata()
     write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *odd]}))
-    return (*source.notes, *odd, *seen.outside())
+    return (*source.notes, *odd, *log.out_of_bounds_notes())
 
 
-def _watched(
-    trajectories: Iterable[Trajectory], seen: Seen, where: str, advance: Callable[[], None]
+def _log_and_yield(
+    trajectories: Iterable[Trajectory], seen: ConversionLog, where: str, advance: Callable[[], None]
 ) -> Iterator[Trajectory]:
     for index, trajectory in enumerate(trajectories):
         seen.add(trajectory, f"{where}, trajectory {index}")

@@ -14,21 +14,21 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from nmpm.data.background import in_background
-from nmpm.data.plan import MOTION, WindowPlan
-from nmpm.data.recording import Recording
-from nmpm.data.shelf import Shelf
+from nmpm.data.loading.background import run_in_thread
+from nmpm.data.loading.padded_batch import PaddedRecordings
+from nmpm.data.loading.recording import Recording
+from nmpm.data.loading.window_plan import MOTION, WindowPlan
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
 
-class Source(Protocol):
+class RecordingProvider(Protocol):
     """Where a buffer takes its trajectories from."""
 
     scene: Scene
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         """Size of the positions of the largest trajectory."""
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
@@ -38,26 +38,26 @@ class Source(Protocol):
         """Makes sure that every trajectory is long enough."""
 
 
-class Motion:
+class MotionSampler:
     """Draws windows in proportion to the distance that their particles travel, on average.
 
     Args:
-        held: Recordings by trajectory.
+        held: SplitRecordings by trajectory.
         length: Frames of a window.
     """
 
     def __init__(self, held: Mapping[int, Recording], length: int) -> None:
-        travelled = {index: _travelled(recording, length) for index, recording in held.items()}
+        travelled = {index: _distances_travelled(recording, length) for index, recording in held.items()}
         self.windows = [(index, start) for index, distance in travelled.items() for start in range(len(distance))]
         self.cumulative = np.cumsum(np.concatenate(list(travelled.values())))
 
-    def at(self, share: float) -> tuple[int, int]:
+    def window_at(self, share: float) -> tuple[int, int]:
         """The window, as (trajectory, first frame), at a share in [0, 1) of all motion; any if nothing moves."""
         place = share * self.cumulative[-1]
         return self.windows[min(int(np.searchsorted(self.cumulative, place, side="right")), len(self.windows) - 1)]
 
 
-def _travelled(recording: Recording, length: int) -> np.ndarray:
+def _distances_travelled(recording: Recording, length: int) -> np.ndarray:
     """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
     frames = recording.frames.numpy()
     speed = np.linalg.norm(np.diff(frames, axis=0), axis=-1).mean(axis=-1, dtype=np.float64)
@@ -66,17 +66,17 @@ def _travelled(recording: Recording, length: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Held:
-    """The trajectories of one buffer: where each stands on the shelf, and how their windows move."""
+class _BufferContents:
+    """The trajectories of one buffer: where each stands on the padded, and how their windows move."""
 
-    shelf: Shelf
+    padded: PaddedRecordings
     recordings: Mapping[int, Recording]
-    motion: Motion | None
+    motion: MotionSampler | None
 
     def window(self, drawn: Sequence[tuple[int, int]], length: int) -> Window:
         place = {trajectory: row for row, trajectory in enumerate(self.recordings)}
         trajectories, starts = zip(*drawn, strict=True)
-        return self.shelf.window([place[trajectory] for trajectory in trajectories], starts, length)
+        return self.padded.window([place[trajectory] for trajectory in trajectories], starts, length)
 
 
 class TrajectoryBuffer:
@@ -94,7 +94,7 @@ class TrajectoryBuffer:
         DataError: if a trajectory is shorter than a window.
     """
 
-    def __init__(self, source: Source, plan: WindowPlan, device: torch.device | None = None) -> None:
+    def __init__(self, source: RecordingProvider, plan: WindowPlan, device: torch.device | None = None) -> None:
         source.require_frames(plan.length, f"a training window of {plan.length - 2} frames to predict")
         self.source, self.plan, self.device = source, plan, device or torch.device("cpu")
 
@@ -105,29 +105,29 @@ class TrajectoryBuffer:
             DataError: if a trajectory cannot be read or does not fit the scene.
         """
         plan = self.plan
-        held = self._hold(plan.members(plan.place(start, world)[0], rank, world), None)
-        for buffer, indices in groupby(count(start), key=lambda index: plan.place(index, world)[0]):
-            upcoming = in_background(self._hold, plan.members(buffer + 1, rank, world), held)
+        held = self._load_contents(plan.members(plan.locate(start, world)[0], rank, world), None)
+        for buffer, indices in groupby(count(start), key=lambda index: plan.locate(index, world)[0]):
+            upcoming = run_in_thread(self._load_contents, plan.members(buffer + 1, rank, world), held)
             for index in indices:
-                drawn = self._emphasised(plan.batch(index, rank, world), held.motion, index, rank, world)
+                drawn = self._apply_emphasis(plan.batch(index, rank, world), held.motion, index, rank, world)
                 yield held.window(drawn, plan.length)
             held = upcoming.result()
 
-    def _hold(self, members: Sequence[int], held: _Held | None) -> _Held:
+    def _load_contents(self, members: Sequence[int], held: _BufferContents | None) -> _BufferContents:
         known = held.recordings if held is not None else {}
         if held is not None and list(members) == list(known):
             return held
         missing = [index for index in members if index not in known]
         found = dict(zip(missing, self.source.load(missing), strict=True))
         loaded = [known[index] if index in known else found[index] for index in members]
-        shelf = Shelf.of(loaded, self.source.scene)
+        padded = PaddedRecordings.stack(loaded, self.source.scene)
         # Views: what was loaded itself is let go.
-        recordings = {index: shelf.recording(row, loaded[row]) for row, index in enumerate(members)}
-        motion = Motion(recordings, self.plan.length) if self.plan.emphasis else None
-        return _Held(shelf.to(self.device), recordings, motion)
+        recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}
+        motion = MotionSampler(recordings, self.plan.length) if self.plan.emphasis else None
+        return _BufferContents(padded.to(self.device), recordings, motion)
 
-    def _emphasised(
-        self, drawn: list[tuple[int, int]], motion: Motion | None, index: int, rank: int, world: int
+    def _apply_emphasis(
+        self, drawn: list[tuple[int, int]], motion: MotionSampler | None, index: int, rank: int, world: int
     ) -> list[tuple[int, int]]:
         """The windows drawn, some of them replaced by others that were drawn in proportion to motion.
 
@@ -142,4 +142,4 @@ class TrajectoryBuffer:
         mine = replaced[first : first + len(drawn)]
         before = int(replaced[:first].sum())
         shares = iter(rng.random(before + int(mine.sum()))[before:])
-        return [motion.at(next(shares)) if swap else window for swap, window in zip(mine, drawn, strict=True)]
+        return [motion.window_at(next(shares)) if swap else window for swap, window in zip(mine, drawn, strict=True)]

@@ -7,7 +7,7 @@ import tokenize
 import zipfile
 import zlib
 
-DAMAGED_ZIP: tuple[type[Exception], ...] = (
+ZIP_ERRORS: tuple[type[Exception], ...] = (
     OSError,
     EOFError,
     RuntimeError,  # it says that it is encrypted, or packed in a way that Python does not know
@@ -16,8 +16,8 @@ DAMAGED_ZIP: tuple[type[Exception], ...] = (
     zipfile.BadZipFile,
 )
 
-DAMAGED_NPZ: tuple[type[Exception], ...] = (
-    *DAMAGED_ZIP,
+NPZ_ERRORS: tuple[type[Exception], ...] = (
+    *ZIP_ERRORS,
     KeyError,  # the archive lists other arrays than it has
     ValueError,
     tokenize.TokenError,  # of an array's header, which is Python's notation

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.convert import Options
-from nmpm.data.convert.inplace import native_folder
+from nmpm.data.convert.cache import native_folder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import read_metadata
 from tests.data.convert import records

@@ -23,7 +23,7 @@ _TRAJECTORIES, _WINDOWS, MOTION = 0, 1, 2  # separate the streams of random numb
 
 
 @dataclass(frozen=True)
-class Start:
+class PlanStart:
     """Where batches of a size begin.
 
     Args:
@@ -62,7 +62,7 @@ class WindowPlan:
     passes: float
     seed: int
     emphasis: float = 0.0
-    start: Start = Start()
+    start: PlanStart = PlanStart()
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "buffer_size", "passes"):
@@ -92,7 +92,7 @@ class WindowPlan:
         chosen = {int(_shuffle(total, self.seed, _TRAJECTORIES, p // total)[p % total]) for p in places}
         return tuple(sorted(chosen))
 
-    def place(self, index: int, world: int) -> tuple[int, int]:
+    def locate(self, index: int, world: int) -> tuple[int, int]:
         """The buffer that a batch is drawn from, and how many of its windows are drawn before."""
         stride, per_buffer = self._stride(world), self.batches_per_buffer(world)
         since = index - self.start.batch
@@ -104,7 +104,7 @@ class WindowPlan:
 
     def batch(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
         """The windows of a batch, each as (trajectory, first frame)."""
-        buffer, drawn = self.place(index, world)
+        buffer, drawn = self.locate(index, world)
         members = self.members(buffer, rank, world)
         ends = np.cumsum([self.windows(trajectory) for trajectory in members])
         total = int(ends[-1])
@@ -117,7 +117,7 @@ class WindowPlan:
             for owner, window in zip(owners, chosen, strict=True)
         ]
 
-    def after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
+    def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
         """This plan, to be gone on with after batches of another size: with the first window that none of them had.
 
         Args:
@@ -131,8 +131,8 @@ class WindowPlan:
         if batches == self.start.batch:
             return self
         had = replace(self, batch_size=batch_size)
-        buffer, drawn = had.place(batches - 1, earlier)  # a buffer's rest, too small for those, may do for these
-        return replace(self, start=Start(batches, buffer, drawn + had._stride(earlier)))
+        buffer, drawn = had.locate(batches - 1, earlier)  # a buffer's rest, too small for those, may do for these
+        return replace(self, start=PlanStart(batches, buffer, drawn + had._stride(earlier)))
 
     def _stride(self, world: int) -> int:
         """Windows of a buffer that one batch of every rank takes."""
@@ -144,7 +144,7 @@ class WindowPlan:
 
 
 @dataclass(frozen=True)
-class EndlessPlan(WindowPlan):
+class EndlessWindowPlan(WindowPlan):
     """Windows of trajectories without end, such as a simulator makes: every buffer of every rank has its own.
 
     Args:
@@ -161,13 +161,13 @@ class EndlessPlan(WindowPlan):
         first = (buffer * world + rank) * self.buffer_size
         return tuple(range(first, first + self.buffer_size))
 
-    def after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
+    def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
         """As for a plan with an end, but with the first buffer that no rank has begun."""
         if (batch_size, earlier) == (self.batch_size, world):
             return self
-        buffer, drawn = replace(self, batch_size=batch_size).place(batches, earlier)
+        buffer, drawn = replace(self, batch_size=batch_size).locate(batches, earlier)
         begun = (buffer + (drawn > 0)) * earlier
-        return replace(self, start=Start(batches, -(-begun // world)))
+        return replace(self, start=PlanStart(batches, -(-begun // world)))
 
     def _stride(self, world: int) -> int:  # noqa: ARG002
         return self.batch_size

@@ -8,8 +8,8 @@ import huggingface_hub
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
-from nmpm.data.convert.hub import REPOSITORY, hub_folder
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.hub import REPOSITORY, hub_folder
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert.test_neuralmpm import write
 

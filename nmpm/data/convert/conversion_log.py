@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nmpm.data.convert.base import UNSTATED
+from nmpm.data.convert.base import UNKNOWN_LENGTH
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import KEYS, Statistics, disagreements, first_that_moves
+from nmpm.data.statistics import KEYS, MotionStatistics, find_disagreements, first_moving_particle
 from nmpm.errors import DataError
 
 STATED = "stated_statistics"
@@ -16,7 +16,7 @@ MOVING_BOUNDARIES = "moving_boundaries"
 
 
 @dataclass
-class Seen:
+class ConversionLog:
     """What the trajectories that pass by show.
 
     Args:
@@ -25,7 +25,7 @@ class Seen:
     """
 
     metadata: Metadata
-    statistics: Statistics
+    statistics: MotionStatistics
     statistics_done: bool = False
     moving_boundaries: int = 0
     number: int = 0
@@ -48,7 +48,7 @@ class Seen:
             self.statistics.add(trajectory)
         self.number += 1
         static = np.isin(types, list(self.metadata.static_types))
-        self.moving_boundaries += first_that_moves(position, static, self.metadata.bounds) is not None
+        self.moving_boundaries += first_moving_particle(position, static, self.metadata.bounds) is not None
         present = np.isin(types, [*self.metadata.moving_types, *self.metadata.static_types])
         if present.any():
             low, high = position[:, present].min(axis=(0, 1)), position[:, present].max(axis=(0, 1))
@@ -57,11 +57,11 @@ class Seen:
         self.frames |= {len(position)}
         self.particles = max(self.particles, position.shape[1])
 
-    def concluded(self) -> tuple[Metadata, list[str]]:
+    def final_metadata(self) -> tuple[Metadata, list[str]]:
         """The metadata with what was measured, and notes on what is odd."""
         extra, measured = dict(self.metadata.extra), self.statistics.result()
         stated = {key: extra[key] for key in KEYS if key in extra}
-        notes = disagreements(measured, stated)
+        notes = find_disagreements(measured, stated)
         if notes:
             notes.append(f"Those stated are kept as {STATED!r}.")
         if stated:
@@ -91,7 +91,7 @@ class Seen:
 
     def _lengths(self) -> list[str]:
         stated = self.metadata.sequence_length
-        if stated == UNSTATED or self.frames <= {stated, stated + 1}:
+        if stated == UNKNOWN_LENGTH or self.frames <= {stated, stated + 1}:
             return []
         few, many = min(self.frames), max(self.frames)
         held = f"{few}" if few == many else f"{few} to {many}"

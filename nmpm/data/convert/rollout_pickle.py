@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from nmpm.data.convert.base import Format, Options, Reread, Source
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import metadata_from_dict
 from nmpm.errors import DataError
@@ -77,7 +77,7 @@ def _from_buffer(data: bytes | bytearray, kind: _Kind, shape: Sequence[int], ord
     return kind.read(data, shape, order)
 
 
-def _encoded(text: str, encoding: str) -> bytes:
+def _encode(text: str, encoding: str) -> bytes:
     """How bytes are written below pickle protocol 3."""
     if encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError(f"text in {encoding}")
@@ -92,7 +92,7 @@ def _no_bytes() -> bytes:
 _BASICS: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NDARRAY,
     ("numpy", "dtype"): _Kind,
-    ("_codecs", "encode"): _encoded,
+    ("_codecs", "encode"): _encode,
     ("__builtin__", "bytes"): _no_bytes,
 }
 _ALLOWED: Mapping[tuple[str, str], Any] = _BASICS | {
@@ -123,24 +123,24 @@ def load_pickled(data: bytes, where: str) -> Any:
         DataError: if it is damaged, or would run anything but the constructors of arrays.
     """
     try:
-        return _built(_ArraysOnly(io.BytesIO(data)).load(), {})
+        return _resolve(_ArraysOnly(io.BytesIO(data)).load(), {})
     except Exception as error:
         reason = str(error)[:200] or type(error).__name__
         raise DataError(f"{where}: cannot be read as pickled arrays: {reason}.") from error
 
 
-def _built(value: Any, done: dict[int, Any]) -> Any:
+def _resolve(value: Any, done: dict[int, Any]) -> Any:
     """The content with arrays in the place of what stands for them; each thing once, however often it occurs."""
     if id(value) not in done:
-        done[id(value)] = _made(value, done)
+        done[id(value)] = _resolve_one(value, done)
     return done[id(value)]
 
 
-def _made(value: Any, done: dict[int, Any]) -> Any:
+def _resolve_one(value: Any, done: dict[int, Any]) -> Any:
     if isinstance(value, dict):
-        return {_built(key, done): _built(item, done) for key, item in value.items()}
+        return {_resolve(key, done): _resolve(item, done) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(_built(item, done) for item in value)
+        return type(value)(_resolve(item, done) for item in value)
     if not isinstance(value, _Array):
         return value
     if isinstance(value.value, np.ndarray):
@@ -148,7 +148,7 @@ def _made(value: Any, done: dict[int, Any]) -> Any:
     items, shape, fortran = value.value
     array = np.empty(len(items), object)
     for place, item in enumerate(items):
-        array[place] = _built(item, done)
+        array[place] = _resolve(item, done)
     return array.reshape(shape, order="F" if fortran else "C")
 
 
@@ -169,7 +169,7 @@ def numbers(value: Any, where: str) -> np.ndarray:
     return array
 
 
-class RolloutPickle(Format):
+class RolloutPickle(DatasetFormat):
     """A `rollout_*.pkl` of DeepMind's code or its PyTorch successors, or a folder of them."""
 
     name: ClassVar[str] = "rollout-pickle"
@@ -178,14 +178,14 @@ class RolloutPickle(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_files(path))
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no .pkl file there.")
         family = options.family or "deepmind"
-        return Source(
-            metadata=options.applied(_metadata(files[0], family)),
-            splits={"test": Reread(partial(_trajectories, files))},
+        return ForeignDataset(
+            metadata=options.apply_to(_metadata(files[0], family)),
+            splits={"test": Rereadable(partial(_trajectories, files))},
             notes=(
                 f"Particle types are read after the {family} family.",
                 "The true trajectories are taken as positions; the predictions are kept as the field"
@@ -214,13 +214,13 @@ def _metadata(path: Path, family: str) -> Metadata:
     plain = _content(path)["metadata"]
     if not isinstance(plain, dict):
         raise DataError(f"{path}: metadata should map keys to values; it is {type(plain).__name__}.")
-    return metadata_from_dict(_unboxed(plain), path, family)
+    return metadata_from_dict(_to_plain(plain), path, family)
 
 
-def _unboxed(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """NumPy's arrays and numbers as Python's."""
     if isinstance(value, dict):
-        return {str(key): _unboxed(item) for key, item in value.items()}
+        return {str(key): _to_plain(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 

@@ -1,7 +1,7 @@
 """Work beside the main thread that soon ends when the program does.
 
 The threads are waited for at the program's end, as one that dies while it reads a file would leave the file's lock held
-for ever. So whatever takes long asks `carry_on` from time to time.
+for ever. So whatever takes long asks `raise_if_abandoned` from time to time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class AbandonedError(Exception):
     """The program ends, and nobody will ask for the result."""
 
 
-def carry_on() -> None:
+def raise_if_abandoned() -> None:
     """Lets work in the background go on.
 
     Raises:
@@ -31,7 +31,7 @@ def carry_on() -> None:
         raise AbandonedError
 
 
-def in_background(function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> Future[T]:
+def run_in_thread(function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> Future[T]:
     """Calls a function in a thread of its own."""
     future: Future[T] = Future()
 
@@ -45,7 +45,7 @@ def in_background(function: Callable[P, T], *arguments: P.args, **options: P.kwa
     return future
 
 
-def spread(function: Callable[[S], T], items: Sequence[S], workers: int) -> list[T]:
+def map_in_threads(function: Callable[[S], T], items: Sequence[S], workers: int) -> list[T]:
     """The function's values for all items, in their order, by several threads.
 
     Raises:
@@ -60,7 +60,7 @@ def spread(function: Callable[[S], T], items: Sequence[S], workers: int) -> list
         try:
             while True:
                 index, item = waiting.get_nowait()
-                carry_on()
+                raise_if_abandoned()
                 done[index] = function(item)
         except Empty:
             return
@@ -68,7 +68,7 @@ def spread(function: Callable[[S], T], items: Sequence[S], workers: int) -> list
             _drain(waiting)
             raise
 
-    for future in [in_background(work) for _ in range(min(workers, len(items)))]:
+    for future in [run_in_thread(work) for _ in range(min(workers, len(items)))]:
         future.result()
     return [done[index] for index in range(len(items))]
 

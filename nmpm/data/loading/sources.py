@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmpm.data import catalog
-from nmpm.data.buffer import Source
 from nmpm.data.format import Metadata, Split, read_metadata, split_paths
-from nmpm.data.live import LiveRecordings
-from nmpm.data.plan import EndlessPlan, WindowPlan
-from nmpm.data.recording import Recordings
-from nmpm.data.scenes import infer_scene
+from nmpm.data.loading.buffer import RecordingProvider
+from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.loading.simulated import SimulatedRecordings
+from nmpm.data.loading.window_plan import EndlessWindowPlan, WindowPlan
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Stated:
+class StatedFacts:
     """What a user says of recorded data where its files do not, or are wrong; as `infer_scene` takes it."""
 
     family: str | None = None
@@ -46,7 +46,7 @@ class Stated:
         )
 
 
-class Origin(abc.ABC):
+class DataSource(abc.ABC):
     """A source of trajectories; below it, one class per kind. Nothing is read or simulated before it is asked for."""
 
     @property
@@ -69,7 +69,7 @@ class Origin(abc.ABC):
         """The metadata of the folder."""
         return read_metadata(self.folder)
 
-    def recordings(self, name: str) -> Recordings:
+    def recordings(self, name: str) -> SplitRecordings:
         """The trajectories of a split: "train", "valid" or "test".
 
         Raises:
@@ -78,9 +78,9 @@ class Origin(abc.ABC):
         paths = split_paths(self.folder)
         if name not in paths:
             raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split at all'}).")
-        return Recordings(Split(paths[name]), self.metadata, self.scene)
+        return SplitRecordings(Split(paths[name]), self.metadata, self.scene)
 
-    def training(self, length: int, **plan: Any) -> tuple[Source, WindowPlan]:
+    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
         """What to train on.
 
         Args:
@@ -93,7 +93,7 @@ class Origin(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Folder(Origin):
+class FolderSource(DataSource):
     """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads.
 
     Args:
@@ -102,7 +102,7 @@ class Folder(Origin):
     """
 
     path: Path
-    stated: Stated = field(default_factory=Stated)
+    stated: StatedFacts = field(default_factory=StatedFacts)
 
     @property
     def description(self) -> str:
@@ -112,7 +112,7 @@ class Folder(Origin):
     def folder(self) -> Path:
         if not self.path.exists() or split_paths(self.path):
             return self.path
-        from nmpm.data.convert.inplace import native_folder
+        from nmpm.data.convert.cache import native_folder
 
         return native_folder(self.path, self.stated.options)
 
@@ -127,7 +127,7 @@ class Folder(Origin):
 
 
 @dataclass(frozen=True)
-class Hub(Folder):
+class HubSource(FolderSource):
     """A dataset published on the Hugging Face hub, fetched on first use.
 
     Args:
@@ -140,14 +140,14 @@ class Hub(Folder):
 
     @cached_property
     def folder(self) -> Path:
-        from nmpm.data.convert.hub import hub_folder
-        from nmpm.data.convert.inplace import native_folder
+        from nmpm.data.convert.cache import native_folder
+        from nmpm.data.hub import hub_folder
 
         return native_folder(hub_folder(str(self.path)), self.stated.options)
 
 
 @dataclass(frozen=True)
-class Embedded(Origin):
+class EmbeddedSource(DataSource):
     """An embedded dataset, simulated on first use.
 
     Args:
@@ -164,13 +164,13 @@ class Embedded(Origin):
 
     @cached_property
     def folder(self) -> Path:
-        return catalog.ensure(self.name, **self._checked())
+        return catalog.ensure(self.name, **self._check_options())
 
     @property
     def scene(self) -> Scene:
         return catalog.scene(self.name)
 
-    def _checked(self) -> dict[str, Any]:
+    def _check_options(self) -> dict[str, Any]:
         try:
             inspect.signature(catalog.ensure).bind(self.name, **self.generate)
         except TypeError as error:
@@ -179,7 +179,7 @@ class Embedded(Origin):
 
 
 @dataclass(frozen=True)
-class Live(Embedded):
+class SimulatedSource(EmbeddedSource):
     """Training on trajectories fresh from the simulator, none seen twice; evaluation on those of the dataset."""
 
     @property
@@ -188,13 +188,13 @@ class Live(Embedded):
 
     @cached_property
     def folder(self) -> Path:
-        options = self._checked()
+        options = self._check_options()
         counts = dict(options.get("counts") or catalog.describe(self.name).counts)
         return catalog.ensure(self.name, **(options | {"counts": counts | {"train": 0}}))
 
-    def training(self, length: int, **plan: Any) -> tuple[Source, WindowPlan]:
-        options = {key: value for key, value in self._checked().items() if key not in ("counts", "workers")}
-        request = catalog.request_of(self.name, **options)
-        recordings = LiveRecordings(request.preset, request.seed, self.generate.get("workers"))
+    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        options = {key: value for key, value in self._check_options().items() if key not in ("counts", "workers")}
+        request = catalog.simulation_request(self.name, **options)
+        recordings = SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
         frames = (request.preset.frames + 1,) * plan["buffer_size"]
-        return recordings, EndlessPlan(frames=frames, length=length, **plan)
+        return recordings, EndlessWindowPlan(frames=frames, length=length, **plan)
