@@ -18,6 +18,7 @@ import numpy as np
 
 from nmpm.atomic import replacing
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
@@ -152,8 +153,9 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
 def _load_json(path: Path) -> dict[str, Any]:
     if not path.parent.is_dir():
         raise DataError(f"{path.parent}: no such folder. Give the folder that holds {METADATA_FILE}.")
-    if not path.is_file():
+    if not path.exists():
         raise DataError(f"{path}: no such file. A dataset needs one with bounds, dt, dim and sequence_length.")
+    check_regular(path)
     try:
         plain = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:

@@ -103,21 +103,21 @@ def _write(source: ForeignDataset, folder: Path) -> tuple[str, ...]:
     names = [name for name in SPLITS if name in source.splits]
     known = [source.counts.get(name) for name in names]
     total = None if None in known else sum(count or 0 for count in known)
-    seen = ConversionLog(source.metadata, MotionStatistics(source.metadata))
+    log = ConversionLog(source.metadata, MotionStatistics(source.metadata))
     with progress_bar("Converting", total) as advance:
         for name in names:
-            write_split(folder / f"{name}.h5", _log_and_yield(source.splits[name], seen, f"{name} split", advance))
-            # MotionStatistics are those of the first split, train where there is one.
-            seen.statistics_done = True
-    metadata, odd = seen.final_metadata()
+            write_split(folder / f"{name}.h5", _log_and_yield(source.splits[name], log, f"{name} split", advance))
+            # The statistics are those of the first split, train where there is one.
+            log.statistics_done = True
+    metadata, odd = log.final_metadata()
     write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *odd]}))
     return (*source.notes, *odd, *log.out_of_bounds_notes())
 
 
 def _log_and_yield(
-    trajectories: Iterable[Trajectory], seen: ConversionLog, where: str, advance: Callable[[], None]
+    trajectories: Iterable[Trajectory], log: ConversionLog, where: str, advance: Callable[[], None]
 ) -> Iterator[Trajectory]:
     for index, trajectory in enumerate(trajectories):
-        seen.add(trajectory, f"{where}, trajectory {index}")
+        log.add(trajectory, f"{where}, trajectory {index}")
         yield trajectory
         advance()

@@ -76,7 +76,7 @@ class ConversionLog:
         length = self.metadata.sequence_length or max(self.frames, default=2) - 1
         return replace(self.metadata, extra=extra, sequence_length=length), notes + self._lengths()
 
-    def outside(self) -> list[str]:
+    def out_of_bounds_notes(self) -> list[str]:
         """Where positions leave the stated bounds."""
         if self.lower is None or self.upper is None:
             return []

@@ -18,6 +18,7 @@ import numpy as np
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import ConfigError, DataError
 
 _SUFFIX = ".msgpack.zst"
@@ -70,6 +71,7 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
         import zstandard
     except ImportError as error:
         raise ConfigError(f"{path}: reading it needs more packages: pip install 'nmpm[convert]'.") from error
+    check_regular(path)
     try:
         with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
             reader = msgpack.Unpacker(stream, raw=True, max_buffer_size=_MOST_BYTES)

@@ -18,8 +18,9 @@ import numpy as np
 
 from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
-from nmpm.data.convert.rollout_pickle import load_pickled, numbers
+from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
 _SUFFIX = ".npz"
@@ -52,12 +53,13 @@ class GnsNpz(DatasetFormat):
 
 def _found(path: Path) -> list[Path]:
     if path.is_dir():
-        return [file for split in SPLITS if (file := path / f"{split}{_SUFFIX}").is_file()]
+        return [file for split in SPLITS if (file := path / f"{split}{_SUFFIX}").exists()]
     return [path] if path.suffix == _SUFFIX and path.is_file() else []
 
 
 def _members(path: Path) -> tuple[str, ...]:
     """Names of the trajectories, those with numbers in order of the numbers."""
+    check_regular(path)
     try:
         with zipfile.ZipFile(path) as file:
             names = [name.removesuffix(".npy") for name in file.namelist() if name.endswith(".npy")]
@@ -104,7 +106,7 @@ def _trajectory(row: Any, where: str) -> Trajectory:
     parts: list[Any] = [*row] if isinstance(row, np.ndarray | list | tuple) else []
     if len(parts) not in (2, 3):
         raise DataError(f"{where}: (positions, types) are due, perhaps with a property; found {len(parts)} parts.")
-    position = numbers(parts[0], f"{where}: positions")
+    position = number_array(parts[0], f"{where}: positions")
     if position.ndim != 3:
         raise DataError(f"{where}: positions should have the shape (T, N, D); they have {position.shape}.")
     types = _per_particle(parts[1], position.shape[1], f"{where}: types").astype(np.int64)
@@ -119,7 +121,7 @@ def _trajectory(row: Any, where: str) -> Trajectory:
 
 def _per_particle(value: Any, particles: int, where: str) -> np.ndarray:
     """(N,) numbers: one each, or one for all."""
-    found = numbers(value, where)
+    found = number_array(value, where)
     if found.size not in (1, particles) or found.ndim > 1:
         raise DataError(f"{where}: one number, or one for each of {particles} particles is due; shape {found.shape}.")
     return np.broadcast_to(found.reshape(-1), particles).copy()

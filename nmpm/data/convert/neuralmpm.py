@@ -19,7 +19,8 @@ import numpy as np
 
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.families import find_family
-from nmpm.data.format import SPLITS, Metadata, Trajectory, open_hdf5
+from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.hdf5 import check_self_contained, open_hdf5
 from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
@@ -145,6 +146,7 @@ def _only_material(options: Options, path: Path, files: dict[str, tuple[Path, ..
 def _trajectories(files: tuple[Path, ...], material: int | None) -> Iterator[Trajectory]:
     for path in files:
         with open_hdf5(path) as file:
+            check_self_contained(file, path)
             content = {name: _values(file, name, path) for name in file}
         yield _trajectory(content, material, path)
 

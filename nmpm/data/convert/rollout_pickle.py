@@ -1,172 +1,20 @@
-"""Pickled arrays, read without trusting them; and the rollouts that DeepMind's code pickles.
-
-A pickle is a program. The reader below runs it with stand-ins for the few constructors that NumPy arrays need, which
-check what they are given, and with no others: whatever else a file asks for is an error that names it.
-"""
+"""The rollouts that DeepMind's code and its PyTorch successors pickle."""
 
 from __future__ import annotations
 
-import io
-import math
-import pickle
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable
+from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import metadata_from_dict
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
-
-_NDARRAY = "numpy.ndarray"
-"""Stands for the class, so that a pickle cannot call it and claim memory."""
-
-_KINDS = re.compile(r"[biuf][1248]|c8|c16|O8|O4|[SU]\d{1,4}")
-
-
-class _Kind:
-    """Stands for a dtype: NumPy's own takes a state that it does not check."""
-
-    def __init__(self, code: str, *_: object) -> None:
-        self.code, self.order = code, "="
-        if not isinstance(code, str) or not _KINDS.fullmatch(code):
-            raise pickle.UnpicklingError(f"an array of the kind {str(code)[:40]!r}")
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, self.order, *structure = state[:5]
-        if self.order not in ("<", ">", "=", "|") or any(part is not None for part in structure):
-            raise pickle.UnpicklingError("a structured array")
-
-    def read(self, data: bytes | bytearray, shape: Sequence[int], order: Literal["C", "F"] = "C") -> np.ndarray:
-        """The array that these bytes are."""
-        kind = np.dtype(object if self.code.startswith("O") else self.order.replace("|", "=") + self.code)
-        if kind.hasobject or len(data) != math.prod(shape) * kind.itemsize:
-            raise pickle.UnpicklingError(f"{len(data)} bytes for an array of {kind} and shape {tuple(shape)}")
-        return np.frombuffer(data, kind).reshape(shape, order=order)
-
-
-class _Array:
-    """Stands for an array while its pickle is read."""
-
-    value: np.ndarray | tuple[list[Any], tuple[int, ...], bool]
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        shape, kind, fortran, data = state[-4:]
-        if isinstance(data, str):
-            data = data.encode("latin1")
-        self.value = (
-            (data, shape, fortran) if isinstance(data, list) else kind.read(data, shape, "F" if fortran else "C")
-        )
-
-
-def _array(kind: object, *_: object) -> _Array:
-    if kind is not _NDARRAY:
-        raise pickle.UnpicklingError("an array of a class of its own")
-    return _Array()
-
-
-def _scalar(kind: _Kind, data: bytes | str) -> Any:
-    return kind.read(data.encode("latin1") if isinstance(data, str) else data, (1,))[0]
-
-
-def _from_buffer(data: bytes | bytearray, kind: _Kind, shape: Sequence[int], order: Literal["C", "F"]) -> np.ndarray:
-    return kind.read(data, shape, order)
-
-
-def _encode(text: str, encoding: str) -> bytes:
-    """How bytes are written below pickle protocol 3."""
-    if encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"text in {encoding}")
-    return text.encode("latin1")
-
-
-def _no_bytes() -> bytes:
-    """How b"" is written there."""
-    return b""
-
-
-_BASICS: dict[tuple[str, str], Any] = {
-    ("numpy", "ndarray"): _NDARRAY,
-    ("numpy", "dtype"): _Kind,
-    ("_codecs", "encode"): _encode,
-    ("__builtin__", "bytes"): _no_bytes,
-}
-_ALLOWED: Mapping[tuple[str, str], Any] = _BASICS | {
-    (module, name): made
-    for core in ("numpy.core", "numpy._core")
-    for (module, name), made in {
-        (f"{core}.multiarray", "_reconstruct"): _array,
-        (f"{core}.multiarray", "scalar"): _scalar,
-        (f"{core}.numeric", "_frombuffer"): _from_buffer,
-    }.items()
-}
-
-
-class _ArraysOnly(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is not needed for arrays and not run")
-        return _ALLOWED[module, name]
-
-    def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError(f"it refers to something outside of itself ({pid!r})")
-
-
-def load_pickled(data: bytes, where: str) -> Any:
-    """What a pickle of arrays, numbers, strings and containers of them holds.
-
-    Raises:
-        DataError: if it is damaged, or would run anything but the constructors of arrays.
-    """
-    try:
-        return _resolve(_ArraysOnly(io.BytesIO(data)).load(), {})
-    except Exception as error:
-        reason = str(error)[:200] or type(error).__name__
-        raise DataError(f"{where}: cannot be read as pickled arrays: {reason}.") from error
-
-
-def _resolve(value: Any, done: dict[int, Any]) -> Any:
-    """The content with arrays in the place of what stands for them; each thing once, however often it occurs."""
-    if id(value) not in done:
-        done[id(value)] = _resolve_one(value, done)
-    return done[id(value)]
-
-
-def _resolve_one(value: Any, done: dict[int, Any]) -> Any:
-    if isinstance(value, dict):
-        return {_resolve(key, done): _resolve(item, done) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(_resolve(item, done) for item in value)
-    if not isinstance(value, _Array):
-        return value
-    if isinstance(value.value, np.ndarray):
-        return value.value
-    items, shape, fortran = value.value
-    array = np.empty(len(items), object)
-    for place, item in enumerate(items):
-        array[place] = _resolve(item, done)
-    return array.reshape(shape, order="F" if fortran else "C")
-
-
-def numbers(value: Any, where: str) -> np.ndarray:
-    """An array of numbers, also where each number is an object of its own.
-
-    Raises:
-        DataError: if it is something else.
-    """
-    array = np.asarray(value) if not isinstance(value, np.ndarray) else value
-    if array.dtype == object:
-        items = array.ravel().tolist()
-        if not all(isinstance(item, int | float | np.number | np.bool_) for item in items):
-            raise DataError(f"{where}: numbers are due, found objects such as {type(items[0]).__name__}.")
-        array = np.array(items).reshape(array.shape)
-    if array.dtype.kind not in "biuf":
-        raise DataError(f"{where}: numbers are due, found {array.dtype}.")
-    return array
 
 
 class RolloutPickle(DatasetFormat):
@@ -202,6 +50,7 @@ def _files(path: Path) -> tuple[Path, ...]:
 
 
 def _content(path: Path) -> dict[str, Any]:
+    check_regular(path)
     content = load_pickled(path.read_bytes(), str(path))
     needed = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
     if not isinstance(content, dict) or not all(key in content for key in needed):
@@ -227,15 +76,15 @@ def _to_plain(value: Any) -> Any:
 def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
     for path in files:
         content = _content(path)
-        initial = numbers(content["initial_positions"], f"{path}: initial_positions").astype(np.float32)
+        initial = number_array(content["initial_positions"], f"{path}: initial_positions").astype(np.float32)
         parts = {
-            key: numbers(content[key], f"{path}: {key}").astype(np.float32)
+            key: number_array(content[key], f"{path}: {key}").astype(np.float32)
             for key in ("ground_truth_rollout", "predicted_rollout")
             if key in content
         }
         try:
             whole: dict[str, np.ndarray] = {key: np.concatenate([initial, part]) for key, part in parts.items()}
-            types = numbers(content["particle_types"], f"{path}: particle_types")
+            types = number_array(content["particle_types"], f"{path}: particle_types")
             yield Trajectory(whole.pop("ground_truth_rollout"), types, {}, whole)
         except (DataError, ValueError) as error:
             raise DataError(f"{path}: {error}") from error

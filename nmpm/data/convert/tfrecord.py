@@ -17,6 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
 _MASK_DELTA = 0xA282EAD8
@@ -45,6 +46,7 @@ def record_offsets(path: Path) -> list[int]:
     Raises:
         DataError: if the file is cut off or a length is damaged.
     """
+    check_regular(path)
     size = path.stat().st_size
     offsets: list[int] = []
     with path.open("rb") as file:

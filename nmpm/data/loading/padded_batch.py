@@ -1,4 +1,4 @@
-"""SplitRecordings side by side in one padded tensor, from which windows are gathered in one go."""
+"""Recordings stacked into one padded tensor, from which windows are gathered in one indexing operation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from nmpm.scene import Scene
 
 @dataclass(frozen=True)
 class PaddedRecordings:
-    """S recordings of a scene, padded to the longest and largest; padding particles lie at the domain's centre.
+    """S recordings of a scene, padded to the longest and largest; padding particles are at the domain's centre.
 
     Args:
         frames: (S, T, N, D) positions, in domain length.
         material, mask, obstacle, obstacle_mask, gravity: as in `Window`, with S in place of B.
-        scene: What they are recordings of.
+        scene: The recordings' scene.
     """
 
     frames: Tensor
@@ -33,8 +33,8 @@ class PaddedRecordings:
     scene: Scene
 
     @classmethod
-    def of(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
-        """Puts recordings on a padded, copying them."""
+    def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
+        """Copies recordings into padded tensors."""
         centre = [(low + high) / 2 for low, high in scene.domain]
         frames, mask = _pad_and_stack([recording.frames for recording in recordings], centre)
         obstacle, obstacle_mask = _pad_and_stack([recording.obstacle[None] for recording in recordings], centre)
@@ -42,18 +42,18 @@ class PaddedRecordings:
         gravity = torch.stack([recording.gravity for recording in recordings])
         return cls(frames, material[:, 0, :, 0], mask, obstacle[:, 0], obstacle_mask, gravity, scene)
 
-    def recording(self, row: int, like: Recording) -> Recording:
-        """A view of the recording in a row, without the padding that `like`, a recording of the same sizes, lacks."""
-        frames, count, _ = like.frames.shape
+    def recording(self, row: int, original: Recording) -> Recording:
+        """A view of one row without its padding; `original` is the recording that was stacked there."""
+        frames, count, _ = original.frames.shape
         return Recording(
             frames=self.frames[row, :frames, :count],
             material=self.material[row, :count],
-            obstacle=self.obstacle[row, : len(like.obstacle)],
+            obstacle=self.obstacle[row, : len(original.obstacle)],
             gravity=self.gravity[row],
         )
 
     def to(self, device: torch.device) -> PaddedRecordings:
-        """The same on another device."""
+        """Copies the tensors to a device; tensors that are there already are shared."""
         return PaddedRecordings(
             frames=self.frames.to(device),
             material=self.material.to(device),
@@ -64,18 +64,18 @@ class PaddedRecordings:
             scene=self.scene,
         )
 
-    def window(self, rows: Sequence[int], starts: Sequence[int], length: int) -> Window:
-        """Consecutive frames of B recordings.
+    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int) -> Window:
+        """Gathers consecutive frames of B recordings.
 
         Args:
-            rows: Which recordings.
-            starts: First frame of each; on the scene's periodic axes positions follow the particle across the border
-                from there, so that differences between frames are displacements.
-            length: Frames, at most what the shortest of them has from its start on.
+            rows: Rows of the recordings.
+            starts: First frame of each. On the scene's periodic axes positions are unwrapped from there on, so that
+                differences between frames are displacements.
+            length: Frames of the window; each recording must have as many from its start on.
         """
-        device = self.frames.device
-        row = torch.as_tensor(rows, device=device)
-        frame = torch.as_tensor(starts, device=device)[:, None] + torch.arange(length, device=device)
+        row = _index_tensor(rows, self.frames.device)
+        first = _index_tensor(starts, self.frames.device)
+        frame = first[:, None] + torch.arange(length, device=self.frames.device)
         frames = self.frames[row[:, None], frame]
         unwrap(frames, self.scene)
         return Window(
@@ -89,19 +89,19 @@ class PaddedRecordings:
 
 
 def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = None) -> Window:
-    """The first `length` frames of B recordings as one batch; all frames, of which they have equally many, when None.
+    """Makes one batch of the first `length` frames of B recordings; of all frames, equally many, when None.
 
     Returns:
         Window: padded to the largest recording.
     """
     frames = len(recordings[0].frames) if length is None else length
-    return PaddedRecordings.stack(recordings, scene).window(range(len(recordings)), [0] * len(recordings), frames)
+    return PaddedRecordings.stack(recordings, scene).gather(range(len(recordings)), [0] * len(recordings), frames)
 
 
 def unwrap(frames: Tensor, scene: Scene) -> None:
-    """Undoes, in place, the jumps of (B, T, N, D) positions across periodic borders, by minimum image.
+    """Removes the jumps of (B, T, N, D) positions across periodic borders, in place, by minimum image.
 
-    The first frame stays where it is; a later one may lie outside the domain, by whole periods.
+    The first frame stays as it is; later ones may be outside of the domain, by whole periods.
     """
     for axis, (low, high) in enumerate(scene.domain):
         if scene.periodic[axis]:
@@ -111,11 +111,17 @@ def unwrap(frames: Tensor, scene: Scene) -> None:
             along[:, 1:] -= turns * period
 
 
+def _index_tensor(values: Sequence[int], device: torch.device) -> Tensor:
+    """Indices on a device; the copy to a GPU does not wait for the kernels that are queued there."""
+    index = torch.as_tensor(values)
+    return index.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else index.to(device)
+
+
 def _pad_and_stack(parts: Sequence[Tensor], filler: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Stacks (T_i, N_i, C) tensors to (S, T, N, C), with (S, N) telling which of the N are not filler."""
+    """Stacks (T_i, N_i, C) tensors to (S, T, N, C), and a mask (S, N) that is False for padding."""
     counts = [part.shape[1] for part in parts]
     longest = max(part.shape[0] for part in parts)
-    # NumPy copies in this thread alone; PyTorch would wait for its thread pool, which training needs.
+    # NumPy copies in this thread; PyTorch would occupy its thread pool, which training needs.
     padded = np.empty((len(parts), longest, max(counts), len(filler)), dtype=parts[0].numpy().dtype)
     padded[:] = filler
     for row, (part, count) in enumerate(zip(parts, counts, strict=True)):

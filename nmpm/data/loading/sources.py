@@ -1,4 +1,4 @@
-"""Where a datamodule's trajectories come from: a folder, an embedded dataset, the simulator itself, or a hub."""
+"""Where a datamodule's trajectories come from: a folder, the Hugging Face hub, an embedded dataset or a simulator."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nmpm.data import catalog
+from nmpm.data.convert import Options
+from nmpm.data.convert.cache import native_folder
 from nmpm.data.format import Metadata, Split, read_metadata, split_paths
+from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.simulated import SimulatedRecordings
@@ -20,13 +23,10 @@ from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene
 
-if TYPE_CHECKING:
-    from nmpm.data.convert import Options
-
 
 @dataclass(frozen=True)
 class StatedFacts:
-    """What a user says of recorded data where its files do not, or are wrong; as `infer_scene` takes it."""
+    """What a user states about recorded data where the files are silent or wrong; arguments of `infer_scene`."""
 
     family: str | None = None
     gravity: Sequence[float] | None = None
@@ -35,9 +35,7 @@ class StatedFacts:
 
     @property
     def options(self) -> Options:
-        """The same for the converter of foreign formats."""
-        from nmpm.data.convert import Options
-
+        """The same as options for the conversion of a foreign format."""
         return Options(
             family=self.family,
             gravity=None if self.gravity is None else tuple(map(float, self.gravity)),
@@ -47,22 +45,22 @@ class StatedFacts:
 
 
 class DataSource(abc.ABC):
-    """A source of trajectories; below it, one class per kind. Nothing is read or simulated before it is asked for."""
+    """Abstract source of trajectories, one subclass per kind. Files are read and datasets simulated on first use."""
 
     @property
     @abc.abstractmethod
     def description(self) -> str:
-        """What the data are, in words; simulated data are named so."""
+        """The data in words; simulated data are called simulated."""
 
     @property
     @abc.abstractmethod
     def folder(self) -> Path:
-        """A folder in the native layout that holds at least what is evaluated on; made if it is not there yet."""
+        """Folder in the native layout with at least the splits for evaluation; created on first use."""
 
     @property
     @abc.abstractmethod
     def scene(self) -> Scene:
-        """The facts that the trajectories share."""
+        """The scene that the trajectories share."""
 
     @cached_property
     def metadata(self) -> Metadata:
@@ -70,22 +68,22 @@ class DataSource(abc.ABC):
         return read_metadata(self.folder)
 
     def recordings(self, name: str) -> SplitRecordings:
-        """The trajectories of a split: "train", "valid" or "test".
+        """The trajectories of the split "train", "valid" or "test".
 
         Raises:
-            DataError: if there is no such split, or its file is damaged.
+            DataError: if the split is missing or its file is damaged.
         """
         paths = split_paths(self.folder)
         if name not in paths:
-            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split at all'}).")
+            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split'}).")
         return SplitRecordings(Split(paths[name]), self.metadata, self.scene)
 
     def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
-        """What to train on.
+        """The trajectories to train on, and which of their windows make up which batch.
 
         Args:
             length: Frames of a window.
-            plan: The other entries of `WindowPlan`, without `frames`.
+            plan: The other fields of `WindowPlan`, except `frames`.
         """
         recordings = self.recordings("train")
         frames = tuple(map(recordings.split.frames, range(len(recordings))))
@@ -98,7 +96,7 @@ class FolderSource(DataSource):
 
     Args:
         path: The dataset.
-        stated: What its files leave open.
+        stated: What its files do not state.
     """
 
     path: Path
@@ -112,8 +110,6 @@ class FolderSource(DataSource):
     def folder(self) -> Path:
         if not self.path.exists() or split_paths(self.path):
             return self.path
-        from nmpm.data.convert.cache import native_folder
-
         return native_folder(self.path, self.stated.options)
 
     @cached_property
@@ -128,7 +124,7 @@ class FolderSource(DataSource):
 
 @dataclass(frozen=True)
 class HubSource(FolderSource):
-    """A dataset published on the Hugging Face hub, fetched on first use.
+    """A dataset on the Hugging Face hub, downloaded on first use.
 
     Args:
         path: Its name, e.g. "WaterRamps" of `iSach/NeuralMPM`.
@@ -140,8 +136,6 @@ class HubSource(FolderSource):
 
     @cached_property
     def folder(self) -> Path:
-        from nmpm.data.convert.cache import native_folder
-        from nmpm.data.hub import hub_folder
 
         return native_folder(hub_folder(str(self.path)), self.stated.options)
 
@@ -152,7 +146,7 @@ class EmbeddedSource(DataSource):
 
     Args:
         name: One of `nmpm.data.catalog.catalog()`.
-        generate: Options of `nmpm.data.catalog.ensure`.
+        generate: Keyword arguments of `nmpm.data.catalog.ensure`.
     """
 
     name: str
@@ -180,7 +174,7 @@ class EmbeddedSource(DataSource):
 
 @dataclass(frozen=True)
 class SimulatedSource(EmbeddedSource):
-    """Training on trajectories fresh from the simulator, none seen twice; evaluation on those of the dataset."""
+    """Trains on new trajectories from the simulator, each in one buffer only; evaluates on the embedded dataset."""
 
     @property
     def description(self) -> str:

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from tests.data.convert.test_pickles import Runs
 
 from nmpm.data.convert import GnsNpz, Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
+from tests.data.convert.test_rollout_pickle import Runs
 
 METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 7, "dim": 2, "dt": 0.0025}
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from nmpm.data.convert import Options, RolloutPickle, convert
-from nmpm.data.convert.rollout_pickle import load_pickled, numbers
+from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import Split, Trajectory
 from nmpm.errors import DataError
 
@@ -132,9 +132,9 @@ def test_what_is_no_rollout_says_what_is_missing(tmp_path):
 
 
 def test_numbers_may_be_objects_but_nothing_else():
-    np.testing.assert_array_equal(numbers(np.array([1, 2.5, np.int64(3)], object), "here"), [1, 2.5, 3])
+    np.testing.assert_array_equal(number_array(np.array([1, 2.5, np.int64(3)], object), "here"), [1, 2.5, 3])
     with pytest.raises(DataError, match="here: numbers are due, found objects such as str"):
-        numbers(np.array(["a", 1], object), "here")
+        number_array(np.array(["a", 1], object), "here")
 
 
 def test_recorded_rollout_equals_the_record_beside_it(recorded, tmp_path):

@@ -123,7 +123,7 @@ class TestBuffer:
         for index, window in enumerate(islice(buffer.batches(), 20)):
             for row, (trajectory, start) in enumerate(buffer.plan.batch(index, 0, 1)):
                 count = int(window.mask[row].sum())
-                truth = torch.from_numpy(buffer.source.split.read(trajectory, start, start + 5).position)
+                truth = torch.from_numpy(buffer.provider.split.read(trajectory, start, start + 5).position)
                 assert torch.equal(window.frames[row, :, :count], truth[:, :count])
                 assert torch.equal(window.obstacle[row], truth[0, count:])
 

@@ -71,7 +71,7 @@ def test_unknown_material_is_named(make_dataset):
     recordings = recordings_of(folder)
     with h5py.File(folder / "train.h5", "a") as file:
         file["00001/particle_type"][0] = 5
-    with pytest.raises(DataError, match=r"trajectory 00001: its material 'water' \(type 5\) is unknown.*goop"):
+    with pytest.raises(DataError, match=r"trajectory 00001: the material 'water' \(type 5\) is not in the scene.*goop"):
         recordings[1]
     with h5py.File(folder / "train.h5", "a") as file:
         file["00001/particle_type"][0] = 8
@@ -82,7 +82,7 @@ def test_unknown_material_is_named(make_dataset):
 def test_padding_of_a_batch(make_dataset):
     recordings = recordings_of(make_dataset(statics=2))
     chosen = [recordings[i] for i in range(3)]
-    window = PaddedRecordings.stack(chosen, recordings.scene).window([0, 1, 2], [0, 3, 6], 5)
+    window = PaddedRecordings.stack(chosen, recordings.scene).gather([0, 1, 2], [0, 3, 6], 5)
     assert window.frames.shape == (3, 5, 7, 2)
     assert window.mask.sum(dim=1).tolist() == [5, 7, 6]
     assert window.obstacle_mask.all()
