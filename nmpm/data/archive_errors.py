@@ -1,4 +1,4 @@
-"""What reading a damaged archive raises: zipfile, zlib and NumPy each have errors of their own."""
+"""Exceptions that reading a damaged archive raises in zipfile, zlib and NumPy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import zlib
 ZIP_ERRORS: tuple[type[Exception], ...] = (
     OSError,
     EOFError,
-    RuntimeError,  # it says that it is encrypted, or packed in a way that Python does not know
+    RuntimeError,  # encrypted, or compressed by an unknown method
     struct.error,
     zlib.error,
     zipfile.BadZipFile,
@@ -18,7 +18,7 @@ ZIP_ERRORS: tuple[type[Exception], ...] = (
 
 NPZ_ERRORS: tuple[type[Exception], ...] = (
     *ZIP_ERRORS,
-    KeyError,  # the archive lists other arrays than it has
+    KeyError,  # a listed array is missing
     ValueError,
-    tokenize.TokenError,  # of an array's header, which is Python's notation
+    tokenize.TokenError,  # from an array's header, which is a Python literal
 )

@@ -243,6 +243,45 @@ class TestModule:
         source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
         assert module.buffer_device(source, plan).type == held_on
 
+    @pytest.mark.parametrize(("device", "pinned"), [("cuda", True), ("cpu", False)])
+    @pytest.mark.parametrize("loader", ["train", "val", "test", "predict"])
+    def test_batches_for_a_gpu_are_pinned(self, make_dataset, monkeypatch, device, pinned, loader):
+        calls = []
+        monkeypatch.setattr(Window, "pin_memory", lambda window: calls.append(window) or window)
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 0))
+        module = as_rank(module_of(make_dataset()), 0, 1, device)
+        windows = list(islice(getattr(module, f"{loader}_dataloader")(), 2))
+        assert all(any(window is call for call in calls) for window in windows) == pinned
+        assert bool(calls) == pinned
+
+    def test_a_buffer_on_the_gpu_gives_batches_as_they_are(self, make_dataset, monkeypatch):
+        monkeypatch.setattr(Window, "pin_memory", lambda window: pytest.fail("pinned"))
+        module = as_rank(module_of(make_dataset()), 0, 1)
+        loader = module.train_dataloader()
+        module.trainer.strategy.root_device = torch.device("cuda")
+        loader.buffer.device = torch.device("meta")
+        assert next(iter(loader)).frames.device.type == "meta"
+
+    @pytest.mark.parametrize(("device", "non_blocking"), [("cuda:0", True), ("cpu", False)])
+    def test_copies_to_a_gpu_do_not_block(self, make_dataset, monkeypatch, device, non_blocking):
+        copies = []
+        monkeypatch.setattr(Window, "to", lambda window, *args, **options: copies.append((args, options)) or window)
+        module = module_of(make_dataset())
+        window = next(iter(module.train_dataloader()))
+        assert module.transfer_batch_to_device(window, torch.device(device), 0) is window
+        assert copies == [((torch.device(device),), {"non_blocking": non_blocking})]
+
+    def test_the_trainer_uses_the_datamodules_transfer(self, make_dataset, tmp_path, monkeypatch):
+        devices, original = [], TrajectoryDataModule.transfer_batch_to_device
+
+        def transfer(self, batch, device, dataloader_idx):
+            devices.append(device.type)
+            return original(self, batch, device, dataloader_idx)
+
+        monkeypatch.setattr(TrajectoryDataModule, "transfer_batch_to_device", transfer)
+        trainer_of(tmp_path, max_steps=2).fit(Recorder(), datamodule=module_of(make_dataset()))
+        assert devices == ["cpu", "cpu"]
+
     def test_works_without_a_trainer(self, make_dataset):
         loader = module_of(make_dataset()).train_dataloader()
         window = next(iter(loader))

@@ -75,6 +75,10 @@ class Task(Generic[T]):
     def cancel(self) -> None:
         """Makes the function stop at its next `raise_if_abandoned`, and waits until its thread has ended."""
         self._cancelled.set()
+        self.join()
+
+    def join(self) -> None:
+        """Waits until the thread has ended, whatever the outcome."""
         self._thread.join()
 
 
@@ -89,7 +93,8 @@ def map_in_threads(function: Callable[[S], T], items: Sequence[S], workers: int)
     The threads belong to the current task: cancelling it cancels them.
 
     Raises:
-        Exception: the first that the function raised; items that were not begun by then are skipped.
+        Exception: the first that the function raised, once the items that were begun by then are done; others are
+            skipped.
     """
     waiting: SimpleQueue[tuple[int, S]] = SimpleQueue()
     for numbered in enumerate(items):
@@ -109,8 +114,13 @@ def map_in_threads(function: Callable[[S], T], items: Sequence[S], workers: int)
             raise
 
     cancelled = _cancelled.get() or threading.Event()
-    for task in [Task(work, cancelled) for _ in range(min(workers, len(items)))]:
-        task.result()
+    tasks = [Task(work, cancelled) for _ in range(min(workers, len(items)))]
+    try:
+        for task in tasks:
+            task.result()
+    finally:
+        for task in tasks:
+            task.join()
     return [values[index] for index in range(len(items))]
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nmpm.data.loading.background import map_in_threads, run_in_thread
+from nmpm.data.loading.background import AbandonedError, map_in_threads, raise_if_abandoned, run_in_thread
 
 
 def test_gives_the_result_of_another_thread():
@@ -16,6 +16,40 @@ def test_gives_the_result_of_another_thread():
 def test_gives_the_error_to_whoever_asks():
     with pytest.raises(ZeroDivisionError):
         run_in_thread(lambda: 1 // 0).result()
+
+
+def test_cancelling_stops_the_work_and_its_own_threads():
+    begun, ended, before = threading.Event(), [], set(threading.enumerate())
+
+    def work(item: int) -> None:
+        begun.set()
+        try:
+            while True:
+                raise_if_abandoned()
+        except AbandonedError:
+            ended.append(item)
+            raise
+
+    task = run_in_thread(map_in_threads, work, range(2), 2)
+    assert begun.wait(60)
+    task.cancel()
+    assert set(threading.enumerate()) <= before
+    with pytest.raises(AbandonedError):
+        task.result()
+    assert ended
+    assert task.failed
+
+
+def test_a_cancelled_task_stops_waiting_for_another():
+    release = threading.Event()
+    slow = run_in_thread(release.wait, 60)
+    waiting = run_in_thread(slow.result)
+    waiting.cancel()
+    with pytest.raises(AbandonedError):
+        waiting.result()
+    assert not slow.failed
+    release.set()
+    assert slow.result() is True
 
 
 @given(items=st.lists(st.integers(), max_size=20), workers=st.integers(1, 5))
@@ -38,7 +72,7 @@ def test_spread_stops_at_an_error():
 
 def test_the_program_ends_although_work_is_left():
     script = """
-from nmpm.data.loading.background import raise_if_abandoned, run_in_thread
+from nmpm.data.loading.background import AbandonedError, raise_if_abandoned, raise_if_abandoned, run_in_thread
 
 def work():
     while True:

@@ -1,4 +1,5 @@
 import dataclasses
+import threading
 from collections import Counter
 from itertools import islice
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, read_metadata
+from nmpm.data.loading.background import raise_if_abandoned
 from nmpm.data.loading.buffer import MotionSampler, TrajectoryBuffer
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
@@ -149,6 +151,24 @@ class TestBuffer:
         monkeypatch.setattr(Split, "read", lambda self, i, *a: (read.update([i]), original(self, i, *a))[1])
         list(islice(buffer.batches(), 50))
         assert read == {0: 1, 1: 1, 2: 1}
+
+    def test_closing_the_iterator_ends_its_thread(self, make_dataset, monkeypatch):
+        buffer = buffer_of(make_dataset(train=((12, 5),) * 8), buffer_size=2)
+        before, read_ahead, original = set(threading.enumerate()), threading.Event(), SplitRecordings.load
+
+        def slow(recordings, indices):
+            if threading.current_thread() is threading.main_thread():
+                return original(recordings, indices)
+            read_ahead.set()
+            while True:
+                raise_if_abandoned()
+
+        monkeypatch.setattr(SplitRecordings, "load", slow)
+        batches = buffer.batches()
+        next(batches)
+        assert read_ahead.wait(60)
+        batches.close()
+        assert set(threading.enumerate()) <= before
 
     def test_a_bad_trajectory_read_ahead_is_reported(self, make_dataset):
         folder = make_dataset(train=((12, 5),) * 8)

@@ -1,4 +1,5 @@
 import dataclasses
+import threading
 from itertools import islice
 
 import pytest
@@ -6,6 +7,7 @@ import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split
+from nmpm.data.loading.background import AbandonedError, run_in_thread
 from nmpm.data.loading.buffer import TrajectoryBuffer
 from nmpm.data.loading.simulated import SimulatedRecordings
 from nmpm.data.loading.window_plan import EndlessWindowPlan
@@ -69,6 +71,26 @@ def test_a_failed_simulation_is_reported():
     fast = dataclasses.replace(TINY, blocks=dataclasses.replace(TINY.blocks, speed=1e200))
     with pytest.raises(ConfigError, match=r"Preset goop, seed .*finite"):
         SimulatedRecordings(fast).load([0, 1])
+
+
+def test_closing_stops_simulations_and_a_later_request_starts_anew(monkeypatch):
+    simulate, begun, endless = MpmPreset.simulate, threading.Event(), [True]
+
+    def waits(preset, seed, progress):
+        begun.set()
+        while endless:
+            progress(0)
+        return simulate(preset, seed, progress=progress)
+
+    monkeypatch.setattr(MpmPreset, "simulate", waits)
+    recordings = live()
+    waiting = run_in_thread(recordings.load, [0, 1])
+    assert begun.wait(60)
+    recordings.close()
+    with pytest.raises(AbandonedError):
+        waiting.result()
+    endless.clear()
+    assert len(recordings.load([0, 1])) == 2
 
 
 def test_too_long_a_horizon():
