@@ -116,7 +116,7 @@ class TestResuming:
         assert resumed.seen == straight.seen[6:]
         assert torch.equal(resumed.offset, straight.offset)
 
-    def test_an_interrupted_batch_is_seen_again(self, make_dataset, tmp_path):
+    def test_an_interrupted_batch_is_repeated(self, make_dataset, tmp_path):
         folder = make_dataset(train=TRAIN)
         straight, broken, resumed = Recorder(), Recorder(fail_at=4), Recorder()
         trainer_of(tmp_path, max_steps=9).fit(straight, datamodule=module_of(folder))
@@ -166,7 +166,7 @@ def as_rank(module: TrajectoryDataModule, rank: int, world: int, device: str = "
 class TestEvaluation:
     @pytest.mark.parametrize("world", [1, 2, 3])
     @pytest.mark.parametrize("batch_size", [1, 2, 8])
-    def test_every_trajectory_once_over_all_ranks(self, make_dataset, world, batch_size):
+    def test_each_trajectory_is_on_exactly_one_rank(self, make_dataset, world, batch_size):
         sizes = ((12, 5), (15, 4), (12, 6), (12, 7), (15, 3), (13, 2), (12, 3))
         folder = make_dataset(test=sizes)
         seen: Counter[int] = Counter()
@@ -237,7 +237,7 @@ class TestModule:
         assert not set(map(float, batches[0])) & set(map(float, batches[1]))
 
     @pytest.mark.parametrize(("free", "held_on"), [(10**9, "cuda"), (1000, "cpu")])
-    def test_holds_the_buffer_on_a_gpu_where_it_fits(self, make_dataset, monkeypatch, free, held_on):
+    def test_the_buffer_is_on_the_gpu_if_it_fits(self, make_dataset, monkeypatch, free, held_on):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
         module = as_rank(module_of(make_dataset()), 0, 1, device="cuda")
         source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
@@ -305,7 +305,7 @@ class TestModule:
             ({"name": "goop", "family": "deepmind"}, "family cannot be combined with the simulated dataset goop"),
         ],
     )
-    def test_contradictory_options(self, options, named):
+    def test_contradictory_options_are_refused(self, options, named):
         with pytest.raises(ConfigError, match=named):
             TrajectoryDataModule(**options)
 

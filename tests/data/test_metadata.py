@@ -67,7 +67,7 @@ class TestMetadata:
         write_metadata(folder, metadata)
         assert read_metadata(folder) == metadata
 
-    def test_family_where_the_file_is_silent(self, write_keys):
+    def test_family_where_the_file_does_not_name_types(self, write_keys):
         folder = write_keys(particle_types=None)
         with pytest.raises(DataError, match=r"particle_types.*deepmind, jax-sph, lagrangebench"):
             read_metadata(folder)
@@ -76,10 +76,10 @@ class TestMetadata:
         with pytest.raises(ConfigError, match=r"'dmcf'.*deepmind, jax-sph, lagrangebench"):
             read_metadata(folder, "dmcf")
 
-    def test_the_file_knows_better_than_the_family(self, write_keys):
+    def test_the_file_overrides_the_family(self, write_keys):
         assert read_metadata(write_keys(), "lagrangebench").particle_types == {3: "boundary", 7: "goop"}
 
-    def test_lagrangebench_habits(self, write_keys):
+    def test_lagrangebench_metadata(self, write_keys):
         folder = write_keys(periodic_boundary_conditions=[True, False, True], write_every=100, sequence_length=None)
         with pytest.raises(DataError, match="'sequence_length' is missing"):
             read_metadata(folder)

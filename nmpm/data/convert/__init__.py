@@ -1,6 +1,6 @@
-"""Everybody's trajectories, brought into the native layout.
+"""Converts datasets of other formats into the native layout.
 
-A format is one class in one file; `FORMATS` lists them in the order in which they are tried.
+Each format is one class in one file; `FORMATS` lists them in the order in which they are detected.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ def open_dataset(path: Path, format_name: str | None = None, options: Options | 
 
     Args:
         path: A file or folder.
-        format_name: Name of the format; found out when left out.
-        options: What the files leave open.
+        format_name: Name of the format; detected when left out.
+        options: Facts that the files do not state.
 
     Raises:
-        DataError: if there is nothing, of no known format, or damaged.
-        ConfigError: if there is no such format, or an option cannot be.
+        DataError: if the path is missing, of no known format, or damaged.
+        ConfigError: if there is no format of that name, or an option is invalid.
     """
-    kind = find_format(format_name, FORMATS) if format_name else detect_format(Path(path), FORMATS)
-    return kind.open(Path(path), options or Options())
+    dataset_format = find_format(format_name, FORMATS) if format_name else detect_format(Path(path), FORMATS)
+    return dataset_format.open(Path(path), options or Options())
 
 
 def convert(
@@ -46,21 +46,21 @@ def convert(
     options: Options | None = None,
     ids: Mapping[int, int] | None = None,
 ) -> tuple[str, ...]:
-    """Converts a dataset of any format into the native layout, all of it or nothing.
+    """Converts a dataset of any format into the native layout; after an error nothing is left.
 
     Args:
         source: A file or folder.
         destination: A folder that does not exist yet, or is empty.
-        format_name: Name of the source's format; found out when left out.
-        options: What the files leave open.
-        ids: New particle type ids by old ones, for whoever reads the result; those not named stay.
+        format_name: Name of the source's format; detected when left out.
+        options: Facts that the files do not state.
+        ids: New particle type ids by old ones; other ids stay.
 
     Returns:
-        What was taken for what, and what is odd, as sentences.
+        Notes on assumptions and inconsistencies, as sentences.
 
     Raises:
-        DataError: if the source is missing, damaged or of no known format, or the destination is taken.
-        ConfigError: if there is no such format, or an option cannot be.
+        DataError: if the source is missing, damaged or of no known format, or the destination exists.
+        ConfigError: if there is no format of that name, or an option is invalid.
     """
-    opened = open_dataset(source, format_name, options)
-    return write_native(renumber_types(opened, ids) if ids else opened, destination)
+    dataset = open_dataset(source, format_name, options)
+    return write_native(renumber_types(dataset, ids) if ids else dataset, destination)

@@ -1,4 +1,4 @@
-"""Foreign datasets into the native layout: all of it or nothing, streamed, and with what was odd about it said."""
+"""Detects formats, and streams opened datasets into the native layout."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ NOTES = "conversion"
 
 
 def detect_format(path: Path, formats: Sequence[DatasetFormat]) -> DatasetFormat:
-    """The format of a file or folder.
+    """Detects the format of a file or folder.
 
     Raises:
-        DataError: if there is nothing, or it looks like none of the formats.
+        DataError: if the path is missing, or looks like none of the formats.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder.")
     found = next((kind for kind in formats if kind.recognises(path)), None)
     if found is None:
-        held = ", ".join(sorted(item.name for item in path.iterdir())[:8]) if path.is_dir() else "a file"
+        content = ", ".join(sorted(item.name for item in path.iterdir())[:8]) if path.is_dir() else "a file"
         raise DataError(
-            f"{path}: of no format that is known ({', '.join(kind.name for kind in formats)}); found"
-            f" {held or 'nothing'}. Name the --format, or bring the arrays by nmpm.write_trajectories."
+            f"{path}: no known format ({', '.join(kind.name for kind in formats)}); found"
+            f" {content or 'nothing'}. State the --format, or write the arrays with nmpm.write_trajectories."
         )
     return found
 
 
 def find_format(name: str, formats: Sequence[DatasetFormat]) -> DatasetFormat:
-    """The format of that name.
+    """The format with a name.
 
     Raises:
-        ConfigError: if there is none.
+        ConfigError: if there is no such format; lists the known ones.
     """
     for kind in formats:
         if kind.name == name:
@@ -57,14 +57,14 @@ def write_native(source: ForeignDataset, destination: Path) -> tuple[str, ...]:
         destination: A folder that does not exist yet, or is empty.
 
     Returns:
-        The source's notes, and what was seen while writing.
+        The source's notes, and those of the conversion.
 
     Raises:
-        DataError: if the destination is taken or cannot be written, or the source is damaged; nothing is left then.
+        DataError: if the destination exists or cannot be written, or the source is damaged; nothing is left then.
     """
     destination = Path(destination)
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        raise DataError(f"{destination}: is there already; choose another folder, or delete this one.")
+        raise DataError(f"{destination}: exists already; choose another folder, or delete this one.")
     try:
         with _replacing_folder(destination) as part:
             return _write(source, part)
@@ -74,7 +74,7 @@ def write_native(source: ForeignDataset, destination: Path) -> tuple[str, ...]:
 
 @contextmanager
 def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """A folder beside the given one, which becomes it once all went well and is gone otherwise."""
+    """Yields a temporary folder, which is renamed to the given one on success and deleted otherwise."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     for stale in folder.parent.glob(f".{folder.name}.*.part"):
         if not _is_running(stale.name.split(".")[-2]):

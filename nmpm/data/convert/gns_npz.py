@@ -2,7 +2,7 @@
 
 Members are named `simulation_trajectory_0` or `simulation_0`, and so on; each holds (positions (T, N, D), one type or
 (N,) types) and in some datasets a material property, one or (N,). Newer files hold one member, `gns_data`, with a row
-per trajectory. NumPy stores objects as a pickle, which is read by the restricted reader of `pickles`.
+per trajectory. NumPy stores objects as a pickle, which is read by the restricted unpickler.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class GnsNpz(DatasetFormat):
         return ForeignDataset(
             metadata=metadata,
             splits={split: Rereadable(partial(_trajectories, files[split], names)) for split, names in members.items()},
-            notes=(f"Particle types are read after the {family} family.",),
+            notes=(f"Particle types have the meaning of the {family} family.",),
             counts={split: None if names == (_ALL,) else len(names) for split, names in members.items()},
         )
 
@@ -58,7 +58,7 @@ def _found(path: Path) -> list[Path]:
 
 
 def _members(path: Path) -> tuple[str, ...]:
-    """Names of the trajectories, those with numbers in order of the numbers."""
+    """Names of the members, ordered by the numbers in them."""
     check_regular(path)
     try:
         with zipfile.ZipFile(path) as file:
@@ -66,7 +66,7 @@ def _members(path: Path) -> tuple[str, ...]:
     except NPZ_ERRORS as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
     if not names:
-        raise DataError(f"{path}: the file holds no array.")
+        raise DataError(f"{path}: the file has no array.")
     return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d+", name)]))
 
 
@@ -80,7 +80,7 @@ def _trajectories(path: Path, names: tuple[str, ...]) -> Iterator[Trajectory]:
 
 
 def _array(path: Path, name: str) -> Any:
-    """The content of a member, unpickled by the restricted reader where it holds objects."""
+    """The content of a member; objects are read by the restricted unpickler."""
     where = f"{path}: {name}"
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
@@ -91,7 +91,7 @@ def _array(path: Path, name: str) -> Any:
     if kind.hasobject:
         return load_pickled(data, where)
     if len(data) != int(np.prod(shape)) * kind.itemsize:
-        raise DataError(f"{where}: holds {len(data)} bytes, not an array of {kind} and shape {shape}.")
+        raise DataError(f"{where}: has {len(data)} bytes, not those of an array of {kind} and shape {shape}.")
     return np.frombuffer(data, kind).reshape(shape, order="F" if fortran else "C")
 
 
@@ -105,10 +105,12 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 def _trajectory(row: Any, where: str) -> Trajectory:
     parts: list[Any] = [*row] if isinstance(row, np.ndarray | list | tuple) else []
     if len(parts) not in (2, 3):
-        raise DataError(f"{where}: (positions, types) are due, perhaps with a property; found {len(parts)} parts.")
+        raise DataError(
+            f"{where}: expected (positions, types) or (positions, types, property); found {len(parts)} parts."
+        )
     position = number_array(parts[0], f"{where}: positions")
     if position.ndim != 3:
-        raise DataError(f"{where}: positions should have the shape (T, N, D); they have {position.shape}.")
+        raise DataError(f"{where}: positions must have the shape (T, N, D); they have {position.shape}.")
     types = _per_particle(parts[1], position.shape[1], f"{where}: types").astype(np.int64)
     fields = {}
     if len(parts) == 3:
@@ -120,8 +122,10 @@ def _trajectory(row: Any, where: str) -> Trajectory:
 
 
 def _per_particle(value: Any, particles: int, where: str) -> np.ndarray:
-    """(N,) numbers: one each, or one for all."""
+    """(N,) numbers, from one per particle or one for all."""
     found = number_array(value, where)
     if found.size not in (1, particles) or found.ndim > 1:
-        raise DataError(f"{where}: one number, or one for each of {particles} particles is due; shape {found.shape}.")
+        raise DataError(
+            f"{where}: expected one number, or one for each of {particles} particles; found shape {found.shape}."
+        )
     return np.broadcast_to(found.reshape(-1), particles).copy()

@@ -1,4 +1,4 @@
-"""Our own layout, which LagrangeBench shares: read like the others, to bring what the user states into its metadata."""
+"""The native layout, which LagrangeBench shares; converting it writes the user's options into its metadata."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ class Native(DatasetFormat):
     def open(self, path: Path, options: Options) -> ForeignDataset:
         metadata = options.apply_to(read_metadata(path, options.family))
         splits = {name: Split(file) for name, file in split_paths(path).items()}
-        family = f"Particle types are read after the {options.family} family, where {METADATA_FILE} does not name them."
+        family = (
+            f"Particle types have the meaning of the {options.family} family where {METADATA_FILE} does not name them."
+        )
         return ForeignDataset(
             metadata=metadata,
             splits={name: Rereadable(partial(_trajectories, split)) for name, split in splits.items()},

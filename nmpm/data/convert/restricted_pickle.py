@@ -18,13 +18,13 @@ import numpy as np
 from nmpm.errors import DataError
 
 _NDARRAY = "numpy.ndarray"
-"""Stands for the class, so that a pickle cannot call it and claim memory."""
+"""Stand-in for the class: calling it would let a pickle allocate any amount of memory."""
 
 _KINDS = re.compile(r"[biuf][1248]|c8|c16|O8|O4|[SU]\d{1,4}")
 
 
 class _Kind:
-    """Stands for a dtype: NumPy's own takes a state that it does not check."""
+    """Stand-in for a dtype, whose own `__setstate__` does not check its argument."""
 
     def __init__(self, code: str, *_: object) -> None:
         self.code, self.order = code, "="
@@ -37,7 +37,7 @@ class _Kind:
             raise pickle.UnpicklingError("a structured array")
 
     def read(self, data: bytes | bytearray, shape: Sequence[int], order: Literal["C", "F"] = "C") -> np.ndarray:
-        """The array that these bytes are."""
+        """Converts bytes to an array."""
         kind = np.dtype(object if self.code.startswith("O") else self.order.replace("|", "=") + self.code)
         if kind.hasobject or len(data) != math.prod(shape) * kind.itemsize:
             raise pickle.UnpicklingError(f"{len(data)} bytes for an array of {kind} and shape {tuple(shape)}")
@@ -45,7 +45,7 @@ class _Kind:
 
 
 class _Array:
-    """Stands for an array while its pickle is read."""
+    """Stand-in for an array while its pickle is read."""
 
     value: np.ndarray | tuple[list[Any], tuple[int, ...], bool]
 
@@ -60,7 +60,7 @@ class _Array:
 
 def _array(kind: object, *_: object) -> _Array:
     if kind is not _NDARRAY:
-        raise pickle.UnpicklingError("an array of a class of its own")
+        raise pickle.UnpicklingError("an array of a subclass")
     return _Array()
 
 
@@ -73,14 +73,14 @@ def _from_buffer(data: bytes | bytearray, kind: _Kind, shape: Sequence[int], ord
 
 
 def _encode(text: str, encoding: str) -> bytes:
-    """How bytes are written below pickle protocol 3."""
+    """Decodes bytes as pickle protocols below 3 write them."""
     if encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError(f"text in {encoding}")
     return text.encode("latin1")
 
 
 def _no_bytes() -> bytes:
-    """How b"" is written there."""
+    """Decodes b"" as pickle protocols below 3 write it."""
     return b""
 
 
@@ -104,18 +104,18 @@ _ALLOWED: Mapping[tuple[str, str], Any] = _BASICS | {
 class _ArraysOnly(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is not needed for arrays and not run")
+            raise pickle.UnpicklingError(f"it requests {module}.{name}, which arrays do not need and which is not run")
         return _ALLOWED[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError(f"it refers to something outside of itself ({pid!r})")
+        raise pickle.UnpicklingError(f"it refers to an external object ({pid!r})")
 
 
 def load_pickled(data: bytes, where: str) -> Any:
-    """What a pickle of arrays, numbers, strings and containers of them holds.
+    """Reads a pickle of arrays, numbers, strings and containers of them.
 
     Raises:
-        DataError: if it is damaged, or would run anything but the constructors of arrays.
+        DataError: if it is damaged, or requests anything but the constructors of arrays.
     """
     try:
         return _resolve(_ArraysOnly(io.BytesIO(data)).load(), {})
@@ -125,7 +125,7 @@ def load_pickled(data: bytes, where: str) -> Any:
 
 
 def _resolve(value: Any, done: dict[int, Any]) -> Any:
-    """The content with arrays in the place of what stands for them; each thing once, however often it occurs."""
+    """Replaces the stand-ins by arrays; an object that occurs several times is converted once."""
     if id(value) not in done:
         done[id(value)] = _resolve_one(value, done)
     return done[id(value)]
@@ -148,17 +148,17 @@ def _resolve_one(value: Any, done: dict[int, Any]) -> Any:
 
 
 def number_array(value: Any, where: str) -> np.ndarray:
-    """An array of numbers, also where each number is an object of its own.
+    """Converts an array of numbers, or of objects that are numbers.
 
     Raises:
-        DataError: if it is something else.
+        DataError: if there is anything else.
     """
     array = np.asarray(value) if not isinstance(value, np.ndarray) else value
     if array.dtype == object:
         items = array.ravel().tolist()
         if not all(isinstance(item, int | float | np.number | np.bool_) for item in items):
-            raise DataError(f"{where}: numbers are due, found objects such as {type(items[0]).__name__}.")
+            raise DataError(f"{where}: expected numbers, found objects such as {type(items[0]).__name__}.")
         array = np.array(items).reshape(array.shape)
     if array.dtype.kind not in "biuf":
-        raise DataError(f"{where}: numbers are due, found {array.dtype}.")
+        raise DataError(f"{where}: expected numbers, found {array.dtype}.")
     return array

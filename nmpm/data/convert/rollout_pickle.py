@@ -35,8 +35,8 @@ class RolloutPickle(DatasetFormat):
             metadata=options.apply_to(_metadata(files[0], family)),
             splits={"test": Rereadable(partial(_trajectories, files))},
             notes=(
-                f"Particle types are read after the {family} family.",
-                "The true trajectories are taken as positions; the predictions are kept as the field"
+                f"Particle types have the meaning of the {family} family.",
+                "The true trajectories become the positions; the predictions are kept as the field"
                 " predicted_rollout, with the initial positions in front.",
             ),
             counts={"test": len(files)},
@@ -62,12 +62,12 @@ def _content(path: Path) -> dict[str, Any]:
 def _metadata(path: Path, family: str) -> Metadata:
     plain = _content(path)["metadata"]
     if not isinstance(plain, dict):
-        raise DataError(f"{path}: metadata should map keys to values; it is {type(plain).__name__}.")
+        raise DataError(f"{path}: metadata must map keys to values; it is {type(plain).__name__}.")
     return metadata_from_dict(_to_plain(plain), path, family)
 
 
 def _to_plain(value: Any) -> Any:
-    """NumPy's arrays and numbers as Python's."""
+    """Converts NumPy's arrays and numbers to Python's lists and numbers."""
     if isinstance(value, dict):
         return {str(key): _to_plain(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

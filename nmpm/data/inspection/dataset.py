@@ -1,4 +1,4 @@
-"""Puts an inspection together."""
+"""Inspects a dataset."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from nmpm.data.statistics import find_disagreements
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
-_BYTES = 2**28  # of positions per split that are looked at unless more are asked for
+_BYTES = 2**28  # of positions per split that are read by default
 _MOST_FINDINGS = 12
 
 
 @dataclass
 class _Tally:
-    """What the files say about their trajectories, without the positions."""
+    """Sizes, materials and gravities of all trajectories, read without their positions."""
 
     frames: dict[str, list[int]] = field(default_factory=dict)
     moving: dict[str, list[int]] = field(default_factory=dict)
@@ -34,14 +34,14 @@ class _Tally:
 
 
 def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection:
-    """Looks at a dataset, with a progress bar.
+    """Inspects a dataset, with a progress bar.
 
     Args:
-        origin: The dataset, and what is known beside its files.
-        trajectories: Of each split to look at in full, evenly spread; about 256 MiB of positions when left out.
+        origin: The dataset, and what the user states about it.
+        trajectories: Number of evenly spaced trajectories of each split to read; about 256 MiB when left out.
 
     Raises:
-        DataError: if there is no dataset, or nothing of it can be read.
+        DataError: if there is no dataset, or no trajectory can be read.
     """
     metadata = origin.metadata
     findings: list[str] = []
@@ -70,7 +70,7 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
                 findings.append(str(error))
             advance()
     if not np.isfinite(survey.observed).all():
-        raise DataError(f"{origin.folder}: none of its trajectories could be looked at. {findings[0]}")
+        raise DataError(f"{origin.folder}: none of its trajectories could be read. {findings[0]}")
     findings += find_disagreements(survey.statistics.result(), metadata.extra)
     findings += _lengths(tally, metadata)
     occupied, each = survey.occupied()
@@ -109,7 +109,7 @@ def _each(splits: Mapping[str, Split], chosen: Mapping[str, range]) -> Iterator[
 
 
 def _spread_evenly(split: Split, trajectories: int | None) -> range:
-    """Evenly spread trajectories."""
+    """Indices of evenly spaced trajectories."""
     if trajectories is None:
         size = sum(4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split)))
         trajectories = max(1, int(len(split) * min(1.0, _BYTES / size)))
@@ -176,12 +176,12 @@ def _varies(tally: _Tally) -> tuple[str, ...]:
 def _lengths(tally: _Tally, metadata: Metadata) -> list[str]:
     stated = [metadata.extra.get(f"sequence_length_{name}") for name in tally.frames]
     lengths = [metadata.sequence_length, *(value for value in stated if isinstance(value, int))]
-    # Stored are often one more than stated.
+    # Files often have one frame more than stated.
     odd = {n for counts in tally.frames.values() for n in counts} - {n + more for n in lengths for more in (0, 1)}
     if not odd:
         return []
-    held = f"{min(odd)}" if len(odd) == 1 else f"{min(odd)} to {max(odd)}"
-    return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {held} frames."]
+    lengths_found = f"{min(odd)}" if len(odd) == 1 else f"{min(odd)} to {max(odd)}"
+    return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {lengths_found} frames."]
 
 
 def _out_of_bounds_notes(survey: Survey, metadata: Metadata) -> list[str]:

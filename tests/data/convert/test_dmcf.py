@@ -33,7 +33,7 @@ def write(path: Path, content: object) -> Path:
     return path
 
 
-def test_every_number_arrives(tmp_path):
+def test_all_values_are_converted(tmp_path):
     made = frames()
     notes = convert(write(tmp_path / "a.msgpack.zst", made), tmp_path / "out")
     trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
@@ -57,12 +57,12 @@ def test_folders_are_splits(tmp_path):
     assert read_metadata(tmp_path / "out").dt == 0.01
 
 
-def test_particles_that_appear_are_refused(tmp_path):
+def test_a_changing_number_of_particles_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"frame 4: 9 particles, 5 at the start"):
         convert(write(tmp_path / "a.msgpack.zst", frames() + frames(1, 9)), tmp_path / "out")
 
 
-def test_without_the_packages_it_says_how_to_get_them(tmp_path, monkeypatch):
+def test_missing_packages_give_the_install_command(tmp_path, monkeypatch):
     path = write(tmp_path / "a.msgpack.zst", frames())
     monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(ConfigError, match=r"pip install 'nmpm\[convert\]'"):

@@ -53,11 +53,11 @@ def test_several_materials_and_gravity_per_trajectory(tmp_path, with_boundary):
     np.testing.assert_array_equal(trajectory.fields["heat"], heat)
 
 
-def test_an_unknown_name_needs_to_be_told(tmp_path):
+def test_an_unknown_dataset_needs_the_time_step_and_material(tmp_path):
     write(tmp_path / "mine" / "train" / "sim_0.h5")
     with pytest.raises(DataError, match=r"no published dataset is called 'mine'.*--dt"):
         convert(tmp_path / "mine", tmp_path / "out")
-    with pytest.raises(DataError, match=r"do not say what their particles are.*--types 5=water"):
+    with pytest.raises(DataError, match=r"do not state the particles' material.*--types 5=water"):
         convert(tmp_path / "mine", tmp_path / "out", options=Options(dt=0.01))
     convert(tmp_path / "mine", tmp_path / "out", options=Options(dt=0.01, types={5: "milk"}))
     assert FolderSource(tmp_path / "out").scene.materials == ("milk",)
@@ -67,12 +67,12 @@ def test_an_unknown_name_needs_to_be_told(tmp_path):
     ("change", "message"),
     [
         (lambda f: f.__delitem__("particles"), "'particles' is missing"),
-        (lambda f: (f.__delitem__("boundary"), f.__setitem__("boundary", np.zeros((3, 3, 2)))), "do not fit together"),
-        (lambda f: f.__setitem__("types", np.zeros(4, int)), r"types \(4,\) fit neither 5 particles"),
+        (lambda f: (f.__delitem__("boundary"), f.__setitem__("boundary", np.zeros((3, 3, 2)))), "do not match"),
+        (lambda f: f.__setitem__("types", np.zeros(4, int)), r"types \(4,\) match neither 5 particles"),
         (lambda f: f["particles"].__setitem__((2, 1, 0), np.nan), "particle 1 in frame 2"),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path, change, message):
+def test_inconsistent_content_is_refused_by_name(tmp_path, change, message):
     write(tmp_path / "Goop" / "train" / "sim_0.h5")
     with h5py.File(tmp_path / "Goop" / "train" / "sim_0.h5", "a") as file:
         change(file)
@@ -89,7 +89,7 @@ def test_truncated_files_are_named(tmp_path):
         convert(tmp_path / "Goop", tmp_path / "out")
 
 
-def test_a_boundary_that_moves_is_said_and_kept(tmp_path):
+def test_a_moving_boundary_is_noted_and_kept(tmp_path):
     path = tmp_path / "Goop" / "train" / "sim_0.h5"
     write(path)
     with h5py.File(path, "a") as file:

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from nmpm.data.loading.background import AbandonedError, map_in_threads, raise_if_abandoned, run_in_thread
 
 
-def test_gives_the_result_of_another_thread():
+def test_runs_in_another_thread():
     assert run_in_thread(threading.get_ident).result() != threading.get_ident()
 
 
-def test_gives_the_error_to_whoever_asks():
+def test_result_raises_the_function_error():
     with pytest.raises(ZeroDivisionError):
         run_in_thread(lambda: 1 // 0).result()
 
@@ -53,11 +53,11 @@ def test_a_cancelled_task_stops_waiting_for_another():
 
 
 @given(items=st.lists(st.integers(), max_size=20), workers=st.integers(1, 5))
-def test_spread_keeps_the_order(items, workers):
+def test_map_in_threads_keeps_the_order(items, workers):
     assert map_in_threads(lambda item: 2 * item, items, workers) == [2 * item for item in items]
 
 
-def test_spread_stops_at_an_error():
+def test_map_in_threads_stops_at_an_error():
     begun = []
 
     def work(item):
@@ -70,7 +70,7 @@ def test_spread_stops_at_an_error():
     assert begun == [0, 1, 2]
 
 
-def test_the_program_ends_although_work_is_left():
+def test_the_program_exits_while_a_task_runs():
     script = """
 from nmpm.data.loading.background import AbandonedError, raise_if_abandoned, raise_if_abandoned, run_in_thread
 
@@ -83,7 +83,7 @@ run_in_thread(work)
     assert subprocess.run([sys.executable, "-c", script], timeout=60, check=False).returncode == 0
 
 
-def test_the_program_ends_while_trajectories_are_read(make_dataset):
+def test_the_program_exits_while_trajectories_are_read(make_dataset):
     script = f"""
 from nmpm.data.datamodule import TrajectoryDataModule
 data = TrajectoryDataModule(path={str(make_dataset(train=((12, 5),) * 60))!r}, horizon=4, buffer_size=2, passes=0.01)

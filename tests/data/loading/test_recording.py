@@ -56,7 +56,7 @@ def test_padding_particles_of_a_file_are_dropped(make_dataset):
     np.testing.assert_array_equal(recordings[0].frames, recordings.split.read(0).position[:, [0, 1, 3, 4]])
 
 
-def test_positions_outside_the_domain_are_named(make_dataset):
+def test_positions_outside_the_domain_are_refused(make_dataset):
     folder = make_dataset()
     recordings = recordings_of(folder)
     with h5py.File(folder / "train.h5", "a") as file:
@@ -66,7 +66,7 @@ def test_positions_outside_the_domain_are_named(make_dataset):
     recordings[1]
 
 
-def test_unknown_material_is_named(make_dataset):
+def test_unknown_material_is_refused(make_dataset):
     folder = make_dataset(particle_types={3: "boundary", 5: "water", 7: "goop"})
     recordings = recordings_of(folder)
     with h5py.File(folder / "train.h5", "a") as file:
@@ -104,7 +104,7 @@ PERIODIC = Scene(
 
 @given(seed=st.integers(0, 1000), frames=st.integers(2, 40))
 @settings(max_examples=50, deadline=None)
-def test_unwrapping_undoes_wrapping(seed, frames):
+def test_unwrap_inverts_wrapping(seed, frames):
     generator = torch.Generator().manual_seed(seed)
     steps = (torch.rand(2, frames, 5, 2, generator=generator) - 0.5) * 0.9
     path = steps.cumsum(dim=1)

@@ -23,7 +23,7 @@ def live(**changes) -> SimulatedRecordings:
     return SimulatedRecordings(TINY, **({"workers": 2} | changes))
 
 
-def test_a_number_is_always_the_same_trajectory():
+def test_an_index_is_always_the_same_trajectory():
     one, other, again = live(), live(seed=1), live()
     assert torch.equal(one[3].frames, again.load([5, 3])[1].frames)
     assert one[3].frames.shape != one[4].frames.shape or not torch.equal(one[3].frames, one[4].frames)
@@ -39,7 +39,7 @@ def test_simulates_no_trajectory_twice_for_the_same_request(monkeypatch):
     assert len(seeds) == len(set(seeds)) == 4
 
 
-def test_batches_go_on_anywhere():
+def test_resumes_at_any_batch():
     straight = list(islice(TrajectoryBuffer(live(), PLAN).batches(), 12))
     resumed = list(islice(TrajectoryBuffer(live(), PLAN).batches(start=5), 7))
     for expected, window in zip(straight[5:], resumed, strict=True):
@@ -51,7 +51,7 @@ def test_no_trajectory_is_in_two_buffers_or_ranks():
     assert sorted(index for buffer in members for index in buffer) == list(range(24))
 
 
-def test_a_buffers_windows_are_all_seen():
+def test_all_windows_of_a_buffer_are_drawn():
     per_buffer = PLAN.batches_per_buffer(world=2)
     drawn = {window for index in range(per_buffer) for window in PLAN.batch(index, rank=1, world=2)}
     assert per_buffer == 3
@@ -67,7 +67,7 @@ def test_no_trajectory_is_seen_again_by_another_number_of_ranks(earlier, world):
     assert max(seen) < min(more) <= max(seen) + 2 * world
 
 
-def test_a_failed_simulation_is_reported():
+def test_errors_of_the_simulation_are_raised():
     fast = dataclasses.replace(TINY, blocks=dataclasses.replace(TINY.blocks, speed=1e200))
     with pytest.raises(ConfigError, match=r"Preset goop, seed .*finite"):
         SimulatedRecordings(fast).load([0, 1])
@@ -93,7 +93,7 @@ def test_closing_stops_simulations_and_a_later_request_starts_anew(monkeypatch):
     assert len(recordings.load([0, 1])) == 2
 
 
-def test_too_long_a_horizon():
+def test_a_horizon_longer_than_the_trajectories_is_refused():
     with pytest.raises(ConfigError, match=r"goop: its trajectories have 9 frames, .* needs 10"):
         TrajectoryBuffer(live(), dataclasses.replace(PLAN, length=10))
 
@@ -107,7 +107,7 @@ class TestDataModule:
             name="goop", source="simulate", horizon=3, batch_size=2, buffer_size=2, generate=options
         )
 
-    def test_trains_on_what_is_never_written(self, module):
+    def test_training_trajectories_are_not_written(self, module):
         window = next(iter(module.train_dataloader()))
         assert window.frames.shape[:2] == (2, 5)
         assert len(next(iter(module.val_dataloader())).frames) == 1
