@@ -236,12 +236,12 @@ def _make_source(
 ) -> DataSource:
     if path is not None:
         return FolderSource(Path(path), stated)
-    named: dict[str, Callable[[str], DataSource]] = {
+    sources: dict[str, Callable[[str], DataSource]] = {
         "disk": lambda known: EmbeddedSource(known, generate),
         "simulate": lambda known: SimulatedSource(known, generate),
         "hub": lambda known: HubSource(Path(known), stated),
     }
-    return named[source](str(name))
+    return sources[source](str(name))
 
 
 def _check_source(

@@ -1,4 +1,4 @@
-"""HDF5 files that may come from anybody, and disks that may be full.
+"""Reads HDF5 files from untrusted sources, and writes HDF5 files to disks that may be full.
 
 An HDF5 file can refer to other files (external links, external storage, virtual datasets), so that the bytes of any
 file would be read as positions; `check_self_contained` refuses these. HDF5 crashes the process when a write fails, so

@@ -107,7 +107,7 @@ def test_a_killed_simulation_resumes_with_the_same_bytes(tmp_path):
     while len(list(killed.glob(".parts/*.npz"))) < 3 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
     os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    process.wait(timeout=60)
     (killed / ".train.h5.99999.part").write_bytes(b"half a file")
     finished = {path.name: path.stat().st_mtime_ns for path in killed.glob(".parts/*.npz")}
     assert 3 <= len(finished) < 60

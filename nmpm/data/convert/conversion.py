@@ -109,9 +109,9 @@ def _write(source: ForeignDataset, folder: Path) -> tuple[str, ...]:
             write_split(folder / f"{name}.h5", _log_and_yield(source.splits[name], log, f"{name} split", advance))
             # The statistics are those of the first split, train where there is one.
             log.statistics_done = True
-    metadata, odd = log.final_metadata()
-    write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *odd]}))
-    return (*source.notes, *odd, *log.out_of_bounds_notes())
+    metadata, inconsistencies = log.final_metadata()
+    write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *inconsistencies]}))
+    return (*source.notes, *inconsistencies, *log.out_of_bounds_notes())
 
 
 def _log_and_yield(

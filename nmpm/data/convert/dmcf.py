@@ -145,10 +145,10 @@ def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
 
 def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
     positions = [_array(frame, "pos", f"{path}, frame {index}") for index, frame in enumerate(frames)]
-    odd = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
-    if odd:
+    changed = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
+    if changed:
         raise DataError(
-            f"{path}, frame {odd[0]}: {positions[odd[0]].shape[0]} particles, {positions[0].shape[0]} at the start."
+            f"{path}, frame {changed[0]}: {positions[changed[0]].shape[0]} particles, {positions[0].shape[0]} in frame 0."
             " A trajectory has a fixed number of particles; cut it where the number changes."
         )
     fluid, first = np.stack(positions), frames[0]

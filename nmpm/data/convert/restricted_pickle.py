@@ -91,9 +91,9 @@ _BASICS: dict[tuple[str, str], Any] = {
     ("__builtin__", "bytes"): _no_bytes,
 }
 _ALLOWED: Mapping[tuple[str, str], Any] = _BASICS | {
-    (module, name): made
+    (module, name): constructor
     for core in ("numpy.core", "numpy._core")
-    for (module, name), made in {
+    for (module, name), constructor in {
         (f"{core}.multiarray", "_reconstruct"): _array,
         (f"{core}.multiarray", "scalar"): _scalar,
         (f"{core}.numeric", "_frombuffer"): _from_buffer,

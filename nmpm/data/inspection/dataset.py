@@ -177,10 +177,12 @@ def _lengths(tally: _Tally, metadata: Metadata) -> list[str]:
     stated = [metadata.extra.get(f"sequence_length_{name}") for name in tally.frames]
     lengths = [metadata.sequence_length, *(value for value in stated if isinstance(value, int))]
     # Files often have one frame more than stated.
-    odd = {n for counts in tally.frames.values() for n in counts} - {n + more for n in lengths for more in (0, 1)}
-    if not odd:
+    unexpected = {n for counts in tally.frames.values() for n in counts} - {
+        n + more for n in lengths for more in (0, 1)
+    }
+    if not unexpected:
         return []
-    lengths_found = f"{min(odd)}" if len(odd) == 1 else f"{min(odd)} to {max(odd)}"
+    lengths_found = f"{min(unexpected)}" if len(unexpected) == 1 else f"{min(unexpected)} to {max(unexpected)}"
     return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {lengths_found} frames."]
 
 

@@ -28,7 +28,7 @@ class AbandonedError(Exception):
 
 
 def raise_if_abandoned() -> None:
-    """Stops work whose result nobody will use.
+    """Stops work whose result is no longer needed.
 
     Raises:
         AbandonedError: if the current task was cancelled or the program is about to exit.

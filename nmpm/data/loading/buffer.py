@@ -92,7 +92,7 @@ class _BufferContents:
 
 
 class TrajectoryBuffer:
-    """Endless batches of training windows, from trajectories held in memory.
+    """Endless batches of training windows, from trajectories in memory.
 
     While one buffer is in use, a thread reads the next: up to three times `plan.buffer_size` trajectories are in
     memory, however large the dataset is.
@@ -100,7 +100,7 @@ class TrajectoryBuffer:
     Args:
         provider: The trajectories.
         plan: Which windows make up which batch.
-        device: Where the trajectories are held and the windows are gathered.
+        device: Where the buffer is stored and the windows are gathered.
 
     Raises:
         DataError: if a trajectory is shorter than a window.

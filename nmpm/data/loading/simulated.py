@@ -22,7 +22,7 @@ _CACHED_REQUESTS = 2  # the buffer in use and the next
 class SimulatedRecordings:
     """The trajectories that a preset gives for a seed, simulated on request.
 
-    Index i is always the same trajectory, so that a resumed training sees the ones it would have seen.
+    Index i is always the same trajectory, so that a resumed training uses the same ones as an uninterrupted one.
 
     Args:
         preset: The family of scenes.

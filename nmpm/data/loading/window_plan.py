@@ -4,7 +4,7 @@ The trajectories of a dataset, reshuffled in each pass, form an endless sequence
 `buffer_size`. The windows of a buffer, reshuffled in each pass, form another endless sequence; batches are consecutive
 slices of it, assigned to the ranks in turn, until `passes` times as many windows as an average buffer holds have been
 drawn. So all windows are equally likely, no two ranks see the same window within a pass, and batch i of a rank is a
-pure function of the seed and the data: a resumed training continues with the batch it would have seen. The batches of
+pure function of the seed and the data: a resumed training has the same batches as an uninterrupted one. The batches of
 all ranks together equal that of one process with a batch as large; where the batch size or the number of ranks
 changes, training continues in the same sequence of windows (`WindowPlan.resume_after`).
 """

@@ -134,7 +134,7 @@ class TestFindings:
 
     def test_unknown_types(self, tmp_path, run):
         found = look(tmp_path, dataclasses.replace(run, particle_type=np.where(run.particle_type == 3, 42, 7)))
-        assert any("type 42 is unknown" in finding for finding in found.findings)
+        assert any("type 42 is not in the metadata" in finding for finding in found.findings)
         assert found.materials["type 42"] == (2, 2)
 
 
