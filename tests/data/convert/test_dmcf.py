@@ -58,7 +58,7 @@ def test_folders_are_splits(tmp_path):
 
 
 def test_a_changing_number_of_particles_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"frame 4: 9 particles, 5 at the start"):
+    with pytest.raises(DataError, match=r"frame 4: 9 particles, but 5 in frame 0"):
         convert(write(tmp_path / "a.msgpack.zst", frames() + frames(1, 9)), tmp_path / "out")
 
 
