@@ -148,8 +148,8 @@ def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
     changed = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
     if changed:
         raise DataError(
-            f"{path}, frame {changed[0]}: {positions[changed[0]].shape[0]} particles, but {positions[0].shape[0]} in frame"
-            " 0. A trajectory has a fixed number of particles; cut it where the number changes."
+            f"{path}, frame {changed[0]}: {positions[changed[0]].shape[0]} particles, but {positions[0].shape[0]}"
+            " in frame 0. A trajectory has a fixed number of particles; cut it where the number changes."
         )
     fluid, first = np.stack(positions), frames[0]
     wall = _wall(first, fluid.shape[2], path)
