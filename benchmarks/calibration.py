@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derived_seed, metadata_of
-from nmpm.data.progress import shown
-from nmpm.data.statistics import Statistics
+from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.progress import progress_bar
+from nmpm.data.statistics import MotionStatistics
 from nmpm.sim import load_preset
 
 ORIGINALS = {
@@ -35,9 +35,9 @@ TARGET = 0.15
 def simulated(name: str, trajectories: int, seed: int, workers: int) -> dict[str, list[float]]:
     """Statistics of trajectories of a preset, per frame, particles that move alone."""
     preset = load_preset(name)
-    statistics = Statistics(metadata_of(preset))
-    seeds = [derived_seed(seed, index) for index in range(trajectories)]
-    with ThreadPoolExecutor(workers) as pool, shown(f"Simulating {name}", trajectories) as advance:
+    statistics = MotionStatistics(preset_metadata(preset))
+    seeds = [derive_seed(seed, index) for index in range(trajectories)]
+    with ThreadPoolExecutor(workers) as pool, progress_bar(f"Simulating {name}", trajectories) as advance:
         for made in pool.map(preset.simulate, seeds):
             statistics.add(Trajectory(made.position, made.particle_type))
             advance()

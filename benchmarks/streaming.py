@@ -1,4 +1,4 @@
-"""Does training wait for its data? Windows per second of the buffer, and the share of a training that is waiting.
+"""Measures whether training waits for its data: windows per second of the buffer, and the share of time spent waiting.
 
 python benchmarks/streaming.py                    goop from disk and live from the simulator, 60 steps each
 python benchmarks/streaming.py --path FOLDER --family deepmind --gravity 0 -9.81
@@ -30,14 +30,14 @@ REPEATS = 5
 
 
 class QuietProfiler(SimpleProfiler):
-    """Keeps its table to itself."""
+    """A profiler that prints no table."""
 
     def summary(self) -> str:
         return ""
 
 
 def buffer_rate(data: TrajectoryDataModule, batches: int = 40) -> list[float]:
-    """Windows per second out of a filled buffer, several times."""
+    """Windows per second from a filled buffer, in several repetitions."""
     rates = []
     loader = iter(data.train_dataloader())
     next(loader)
@@ -49,8 +49,8 @@ def buffer_rate(data: TrajectoryDataModule, batches: int = 40) -> list[float]:
     return rates
 
 
-def waiting(data: TrajectoryDataModule, steps: int) -> dict[str, float]:
-    """A training's rate and the share of its time in which it waited for a batch; the first batch is not counted."""
+def training_rate(data: TrajectoryDataModule, steps: int) -> dict[str, float]:
+    """Windows per second of a training, and the share of time it waits for batches; the first batch is excluded."""
     profiler = QuietProfiler()
     model = EmulatorModule(data.scene, frames=FRAMES, unroll=UNROLL, processor=UNet(width=32, perceptron=(32,)))
     trainer = Trainer(
@@ -77,7 +77,7 @@ def waiting(data: TrajectoryDataModule, steps: int) -> dict[str, float]:
 
 
 def measure(data: TrajectoryDataModule, steps: int) -> dict[str, Any]:
-    """Both figures for one source of data."""
+    """Both measurements for one source of data."""
     rates = buffer_rate(data)
     return {
         "data": data.description,
@@ -86,12 +86,12 @@ def measure(data: TrajectoryDataModule, steps: int) -> dict[str, Any]:
             "least": min(rates),
             "most": max(rates),
         },
-        "training": waiting(data, steps),
+        "training": training_rate(data, steps),
     }
 
 
 def main() -> None:
-    """Measure, print a table, and write JSON if asked to."""
+    """Measures, prints a line per source, and writes JSON with --json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=60, help="training steps per source (default: 60)")
     parser.add_argument("--name", default="goop", help="embedded dataset (default: goop)")
@@ -99,17 +99,17 @@ def main() -> None:
     parser.add_argument("--family")
     parser.add_argument("--gravity", type=float, nargs="+")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     common: dict[str, Any] = {
         "horizon": FRAMES * UNROLL, "batch_size": BATCH, "passes": PASSES, "emphasis": EMPHASIS,
     }  # fmt: skip
-    if chosen.path:
-        sources = [{"path": chosen.path, "family": chosen.family, "gravity": chosen.gravity}]
+    if arguments.path:
+        sources = [{"path": arguments.path, "family": arguments.family, "gravity": arguments.gravity}]
     else:
-        sources = [{"name": chosen.name}, {"name": chosen.name, "source": "simulate"}]
+        sources = [{"name": arguments.name}, {"name": arguments.name, "source": "simulate"}]
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
-    rows = [measure(TrajectoryDataModule(**source, **common), chosen.steps) for source in sources]
-    sys.stdout.write(f"{device}; batch {BATCH}, {FRAMES} x {UNROLL} frames, {chosen.steps} steps\n")
+    rows = [measure(TrajectoryDataModule(**source, **common), arguments.steps) for source in sources]
+    sys.stdout.write(f"{device}; batch {BATCH}, {FRAMES} x {UNROLL} frames, {arguments.steps} steps\n")
     for row in rows:
         buffer, training = row["buffer_windows_per_second"], row["training"]
         sys.stdout.write(
@@ -117,8 +117,8 @@ def main() -> None:
             f"windows/s, training takes {training['windows_per_second']:.1f}, waits {training['waiting_share']:.2%} of "
             f"its time, {training['longest_wait_s']:.3f} s at most\n"
         )
-    if chosen.json:
-        chosen.json.write_text(json.dumps({"device": device, "sources": rows}, indent=1) + "\n", encoding="utf-8")
+    if arguments.json:
+        arguments.json.write_text(json.dumps({"device": device, "sources": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -19,10 +19,10 @@ from pathlib import Path
 import torch
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derived_seed, metadata_of
-from nmpm.data.progress import shown
-from nmpm.data.recording import Reader
-from nmpm.data.shelf import collate
+from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.progress import progress_bar
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.comparison import Comparison
@@ -38,9 +38,9 @@ def error(emulator: Emulator, preset: Preset, seeds: list[int], workers: int) ->
     """Errors of the emulator on scenes of a preset, in the box of that preset."""
     scene = preset.scene
     emulator = emulator.over(scene).eval()
-    reader = Reader(metadata_of(preset), scene)
+    reader = RecordingReader(preset_metadata(preset), scene)
     comparison = Comparison(scene, [MSE(HORIZONS)])
-    with ThreadPoolExecutor(workers) as pool, shown(f"{preset.name} box", len(seeds)) as advance:
+    with ThreadPoolExecutor(workers) as pool, progress_bar(f"{preset.name} box", len(seeds)) as advance:
         for made in pool.map(preset.simulate, seeds):
             window = collate([reader.recording(Trajectory(made.position, made.particle_type), preset.name)], scene)
             comparison.update(window, rollout(emulator, window.initial, window.target.shape[1]))
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     chosen = parser.parse_args()
     preset = load_preset(chosen.preset)
-    seeds = [derived_seed(chosen.seed, index) for index in range(chosen.scenes)]
+    seeds = [derive_seed(chosen.seed, index) for index in range(chosen.scenes)]
     models = {run.name: trained(run) for run in chosen.runs} | {name: Zoo.load(name).emulator for name in chosen.zoo}
     for name, emulator in models.items():
         for kind in (preset, dataclasses.replace(preset.widened(2), name="wide")):

@@ -20,8 +20,12 @@ class _Batched:
     """Dataclasses of tensors (B, …) of the same B scenes, which are moved, converted and picked together."""
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
-        """The same on another device."""
+        """The same on another device; `non_blocking` copies from pinned memory to a GPU do not block the host."""
         return self._mapped(lambda values: values.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> Self:
+        """The same in page-locked host memory, from which a GPU copies asynchronously."""
+        return self._mapped(Tensor.pin_memory)
 
     def double(self) -> Self:
         """The same in float64; indices and masks keep their types."""

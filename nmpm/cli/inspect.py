@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from nmpm.data.convert import Options
     from nmpm.data.inspection import Inspection
     from nmpm.data.inspection.facts import Range
-    from nmpm.data.origins import Folder
+    from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
 _EXAMPLES = """\
@@ -63,15 +63,15 @@ def run(words: list[str]) -> None:
         sys.stdout.write(f"\nno picture: {error}\n")
 
 
-def _origin(path: Path, options: Options) -> Folder:
-    from nmpm.data.convert.inplace import native_folder
-    from nmpm.data.origins import Folder, Stated
+def _origin(path: Path, options: Options) -> FolderSource:
+    from nmpm.data.convert.cache import native_folder
+    from nmpm.data.loading.sources import FolderSource, StatedFacts
 
     path = path.parent if path.suffix == ".h5" and path.is_file() else path
     if options.types or options.static is not None or options.dt is not None:
-        return Folder(native_folder(path, options))
+        return FolderSource(native_folder(path, options))
     boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
-    return Folder(path, Stated(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]  # (argparse gives plain lists)
+    return FolderSource(path, StatedFacts(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]  # (argparse gives plain lists)
 
 
 def lines(found: Inspection) -> Iterator[str]:
@@ -149,7 +149,7 @@ def _listed(title: str, items: Iterable[str]) -> Iterator[str]:
         yield from textwrap.wrap(item, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def _draw(origin: Folder, found: Inspection, path: Path) -> None:
+def _draw(origin: FolderSource, found: Inspection, path: Path) -> None:
     import numpy as np
 
     from nmpm.data.format import Split, split_paths

@@ -70,7 +70,7 @@ def _read(split: Split, index: int, family: str | None) -> LabelledTrajectories:
 def _describe(split: Split, trajectory: Trajectory, family: str | None) -> tuple[Scene, dict[int, str], frozenset[int]]:
     """Scene, names of the type ids and static ids: from a rollout's own attributes, otherwise from metadata.json."""
     from nmpm.data.format import read_metadata
-    from nmpm.data.scenes import infer_scene
+    from nmpm.data.scene_inference import infer_scene
     from nmpm.scene import Scene
 
     if "scene" in trajectory.attributes:

@@ -62,11 +62,11 @@ def run(words: list[str]) -> None:
 def _recorded(model: Pretrained, path: Path, index: int) -> Particles:
     """The state at the second frame of a recorded trajectory."""
     from nmpm.data.format import Split, read_metadata
-    from nmpm.data.recording import Recordings
-    from nmpm.data.shelf import collate
+    from nmpm.data.loading.padded_batch import collate
+    from nmpm.data.loading.recording import SplitRecordings
 
     metadata = read_metadata(path.parent, _family(model))
-    recordings = Recordings(Split(path), metadata, model.scene)
+    recordings = SplitRecordings(Split(path), metadata, model.scene)
     if not 0 <= index < len(recordings):
         raise ConfigError(f"--trajectory {index}: {path} holds trajectories 0 … {len(recordings) - 1}.")
     return collate([recordings[index]], model.scene, 2).initial

@@ -1,1 +1,1 @@
-"""Recorded trajectories: their files, the scenes they show, and the windows a model learns from."""
+"""Trajectories: file formats, metadata, conversion, simulation of embedded datasets, and batches for Lightning."""

@@ -1,6 +1,6 @@
-"""The embedded datasets: nothing to download, simulated on first use.
+"""The embedded datasets, simulated on first use instead of downloaded.
 
-`ensure("goop")` gives the folder of a dataset in the native format, and makes it if it is not there yet.
+`ensure("goop")` returns the folder of a dataset in the native layout, and simulates it first if it is missing.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from nmpm.data.generate import Request, generate
+from nmpm.data.generate import SimulationRequest, generate
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.sim import load_preset, preset_names
 
 
 @dataclass(frozen=True)
-class Entry:
+class CatalogEntry:
     """An embedded dataset.
 
     Args:
-        name: By which it is asked for.
+        name: Its name.
         preset: Name of the simulator's preset.
         counts: Trajectories in each of the splits train, valid and test.
-        seed: From which the seed of every trajectory is derived.
-        paper: Trajectories per split in the paper's dataset of the same kind, which `nmpm simulate` makes.
+        seed: The seeds of all trajectories are derived from it.
+        paper: Trajectories per split in the paper's dataset of the same name, for `nmpm simulate`.
     """
 
     name: str
@@ -44,7 +44,7 @@ def _splits(train: int, valid: int, test: int) -> Mapping[str, int]:
 
 
 _USUAL = (_splits(200, 10, 30), _splits(1000, 100, 100))
-"""Few enough to be simulated while one waits; as many as in the paper (arXiv 2408.15753)."""
+"""A number that is simulated within minutes; the number in the paper (arXiv 2408.15753)."""
 
 _COUNTS = {
     "goop": (_USUAL[0], _splits(1000, 30, 30)),
@@ -54,9 +54,9 @@ _COUNTS = {
 
 
 @cache
-def _entries() -> Mapping[str, Entry]:
-    """Every shipped preset is a dataset."""
-    return MappingProxyType({name: Entry(name, name, *_COUNTS.get(name, _USUAL)) for name in preset_names()})
+def _entries() -> Mapping[str, CatalogEntry]:
+    """One dataset for each shipped preset."""
+    return MappingProxyType({name: CatalogEntry(name, name, *_COUNTS.get(name, _USUAL)) for name in preset_names()})
 
 
 def dataset_home() -> Path:
@@ -69,46 +69,46 @@ def catalog() -> tuple[str, ...]:
     return tuple(_entries())
 
 
-def describe(name: str) -> Entry:
-    """What an embedded dataset is made of.
+def describe(name: str) -> CatalogEntry:
+    """The catalog's entry for an embedded dataset.
 
     Raises:
-        DataError: if there is none of that name.
+        DataError: if there is no dataset of that name.
     """
     if name not in _entries():
         raise DataError(
-            f"No embedded dataset is called {name!r}; there are: {', '.join(_entries())}. For data of your own, give"
+            f"No embedded dataset is called {name!r}; known: {', '.join(_entries())}. For your own data, give"
             " the path of their folder."
         )
     return _entries()[name]
 
 
 def scene(name: str) -> Scene:
-    """The facts that a dataset's trajectories share, without making it.
+    """The scene of an embedded dataset; simulates nothing.
 
     Raises:
-        DataError: if there is none of that name.
+        DataError: if there is no dataset of that name.
     """
     return load_preset(describe(name).preset).scene
 
 
-def request_of(
+def simulation_request(
     name: str, counts: Mapping[str, int] | None = None, frames: int | None = None, seed: int | None = None
-) -> Request:
-    """What `ensure` simulates for the same arguments.
+) -> SimulationRequest:
+    """The request that `ensure` simulates for the same arguments.
 
     Raises:
         DataError: if there is no dataset of that name.
-        ConfigError: if the counts or frames cannot be.
+        ConfigError: if counts or frames are invalid.
     """
     entry = describe(name)
     preset = load_preset(entry.preset)
     preset = preset if frames is None else preset.with_frames(frames)
-    return Request(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
+    return SimulationRequest(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
 
 
-def folder_of(name: str, request: Request) -> Path:
-    """Where a request is kept: the name and a fingerprint of all that determines the data."""
+def dataset_folder(name: str, request: SimulationRequest) -> Path:
+    """The folder of a request in the cache: the name and a hash of all that determines the data."""
     fingerprint = hashlib.sha256(json.dumps(request.to_dict(), sort_keys=True).encode()).hexdigest()[:10]
     return dataset_home() / "datasets" / f"{name}-{fingerprint}"
 
@@ -120,20 +120,20 @@ def ensure(
     seed: int | None = None,
     workers: int | None = None,
 ) -> Path:
-    """The folder of an embedded dataset, simulated now if it is not there yet.
+    """The folder of an embedded dataset, which is simulated now if it is missing.
 
     Args:
         name: One of `catalog()`.
         counts: Trajectories in each of the splits train, valid and test; the dataset's own when left out.
         frames: Simulated frames of a trajectory; the preset's own when left out.
-        seed: From which the seed of every trajectory is derived; the dataset's own when left out.
-        workers: Trajectories simulated at a time; as many as there are processor cores when left out.
+        seed: The seeds of all trajectories are derived from it; the dataset's own when left out.
+        workers: Trajectories simulated at a time; one per processor core when left out.
 
     Raises:
         DataError: if there is no dataset of that name, or its folder cannot be written.
-        ConfigError: if the counts or frames cannot be.
+        ConfigError: if counts or frames are invalid.
     """
-    request = request_of(name, counts, frames, seed)
-    folder = folder_of(name, request)
+    request = simulation_request(name, counts, frames, seed)
+    folder = dataset_folder(name, request)
     generate(request.preset, folder, request.counts, request.seed, workers)
     return folder

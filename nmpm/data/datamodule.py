@@ -1,4 +1,4 @@
-"""Trajectories for Lightning: windows to train on, whole trajectories to evaluate on."""
+"""Lightning datamodule: windows for training, whole trajectories for evaluation."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from typing import Any, Literal, get_args
 import torch
 from lightning.pytorch import LightningDataModule
 
-from nmpm.data.buffer import Source, TrajectoryBuffer
-from nmpm.data.evaluation import EvaluationLoader
-from nmpm.data.origins import Embedded, Folder, Hub, Live, Origin, Stated
-from nmpm.data.plan import Start, WindowPlan
+from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
+from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.loading.pinning import pin_for
+from nmpm.data.loading.sources import DataSource, EmbeddedSource, FolderSource, HubSource, SimulatedSource, StatedFacts
+from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
 
-_GPU_SHARE = 0.25  # of the free memory; the rest is for the model
+_GPU_SHARE = 0.25  # of the free GPU memory that the buffer may use; the rest is for the model
 
 
 @dataclass(frozen=True)
-class _Course:
-    """How training batches are cut from the plan: from where on, and of what size. Kept in checkpoints."""
+class _BatchHistory:
+    """Where in the plan the current batches start, and their size; saved in checkpoints."""
 
-    start: Start
+    start: PlanStart
     batch_size: int
     world: int
 
@@ -35,28 +36,29 @@ class _Course:
 class TrajectoryDataModule(LightningDataModule):
     """Recorded or simulated trajectories, as `Window` batches.
 
-    Training batches come without end (give the Trainer `max_steps`), each of windows of horizon + 2 frames, and go on
-    where training stopped when a checkpoint is resumed, with another number of processes or batch size too. Validation,
-    test and prediction batches hold whole trajectories, each once over all ranks; prediction uses the test split.
+    Training batches are endless (give the Trainer `max_steps`), of windows with horizon + 2 frames. A resumed training
+    continues with the batch that comes next, also with another number of processes or batch size. Validation, test and
+    prediction batches hold whole trajectories, each on exactly one rank; prediction uses the test split. Batches for a
+    GPU are in pinned memory and copied asynchronously.
 
     Args:
         path: A dataset: a folder in the native layout, or anything that `nmpm convert` reads, converted on first use.
-        name: Embedded dataset, simulated on first use; either this or `path`.
-        source: "disk"; or "simulate" to train on trajectories of `name` fresh from the simulator, never written and
-            never seen twice; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
+        name: EmbeddedSource dataset, simulated on first use; give either this or `path`.
+        source: "disk"; or "simulate" to train on new trajectories of `name` from the simulator, which are not written
+            and used in one buffer only; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
         horizon: Frames to predict in a training window: frames per bundle times bundles unrolled.
         batch_size: Training windows per batch and rank.
-        buffer_size: Training trajectories held in memory at a time; up to three times as many while others are read.
-        passes: How often the windows of a buffer are seen, on average, before the next buffer.
-        emphasis: Share of the training windows that is drawn in proportion to the motion in them, in [0, 1]; the rest
-            is drawn evenly. Worth it where recordings end in long rest.
-        seed: Order of the training windows.
-        family: What the type ids in recorded data mean where its metadata does not say: "deepmind", "lagrangebench",
-            "jax-sph".
+        buffer_size: Training trajectories in memory at a time; up to three times as many while the next are read.
+        passes: How often the windows of a buffer are drawn, on average, before the next buffer.
+        emphasis: Fraction of the training windows that is drawn in proportion to the motion in them, in [0, 1]; the
+            rest is drawn uniformly. Useful where recordings end with a long rest.
+        seed: Seed of the order of the training windows.
+        family: Meaning of the type ids in recorded data where its metadata does not state it: "deepmind",
+            "lagrangebench", "jax-sph".
         gravity: Acceleration in length/s² per axis, instead of that in the metadata of recorded data.
         boundary: "wall" or "periodic" per axis, likewise.
         bounds: (lower, upper) per axis, likewise.
-        limit_eval: Validate on the first so many trajectories only.
+        limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
 
@@ -89,72 +91,87 @@ class TrajectoryDataModule(LightningDataModule):
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
-        self.origin = _origin(path, name, source, Stated(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
+        self.data_source = _make_source(path, name, source, StatedFacts(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
-        self._course: _Course | None = None
+        self._provider: RecordingProvider | None = None
+        self._history: _BatchHistory | None = None
 
     def __str__(self) -> str:
-        # Lightning's own would go through the endless training batches.
-        return f"{type(self).__name__}({self.origin}, horizon={self.horizon}, batch_size={self.batch_size})"
+        # Lightning's default iterates over the endless training batches.
+        return f"{type(self).__name__}({self.data_source}, horizon={self.horizon}, batch_size={self.batch_size})"
 
     @property
     def scene(self) -> Scene:
-        """The scene of the dataset; an embedded one need not have been simulated for it.
+        """The scene of the dataset; for an embedded dataset nothing is simulated.
 
         Raises:
             DataError: if recorded files are missing or wrong.
             ConfigError: if there is no such embedded dataset.
         """
-        return self.origin.scene
+        return self.data_source.scene
 
     @property
     def description(self) -> str:
-        """What the data are, in words: simulated data are named so."""
-        return self.origin.description
+        """The data in words; simulated data are called simulated."""
+        return self.data_source.description
 
     def prepare_data(self) -> None:
-        """Simulates, fetches or converts the dataset on first use, in one process."""
-        _ = self.origin.folder
+        """Simulates, downloads or converts the dataset on first use, in one process."""
+        _ = self.data_source.folder
 
     def setup(self, stage: str) -> None:
-        """Forgets an earlier training, unless this one goes on with it."""
+        """Resets the position in the plan, unless a checkpoint is resumed."""
         if stage == "fit" and not self.batches_seen:
-            self._course = None
+            self._history = None
 
     def state_dict(self) -> dict[str, Any]:
-        """How the batches seen so far were cut; how many they are is in the Trainer's own progress."""
-        return asdict(self._course) if self._course is not None else {}
+        """Start and size of the current batches; how many were used is in the Trainer's own progress."""
+        return asdict(self._history) if self._history is not None else {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Takes up the training of a checkpoint."""
-        self._course = _Course(Start(**state["start"]), state["batch_size"], state["world"])
+        """Restores start and size of the batches from a checkpoint."""
+        self._history = _BatchHistory(PlanStart(**state["start"]), state["batch_size"], state["world"])
 
     def train_dataloader(self) -> TrainingLoader:
-        """Endless batches of training windows, from the first one on that was not seen before a resumed checkpoint."""
+        """Endless batches of training windows; after a resumed checkpoint, those that come next."""
         _, world = self.ranks
-        course = self._course or _Course(Start(), self.batch_size, world)
-        source, plan = self.origin.training(
+        history = self._history or _BatchHistory(PlanStart(), self.batch_size, world)
+        self._provider, plan = self.data_source.training_data(
             self.horizon + 2,
             batch_size=self.batch_size,
             buffer_size=self.buffer_size,
             passes=self.passes,
             seed=self.seed,
             emphasis=self.emphasis,
-            start=course.start,
+            start=history.start,
         )
-        plan = plan.after(self.batches_seen, course.batch_size, course.world, world)
-        self._course = _Course(plan.start, self.batch_size, world)
-        return TrainingLoader(TrajectoryBuffer(source, plan, self.buffer_device(source, plan)), self)
+        plan = plan.resume_after(self.batches_seen, history.batch_size, history.world, world)
+        self._history = _BatchHistory(plan.start, self.batch_size, world)
+        return TrainingLoader(TrajectoryBuffer(self._provider, plan, self.buffer_device(self._provider, plan)), self)
 
-    def buffer_device(self, source: Source, plan: WindowPlan) -> torch.device:
-        """Where the buffer is held: on the trainer's GPU if that has room, else in the processor's memory."""
-        device = self.trainer.strategy.root_device if self.trainer is not None else torch.device("cpu")
+    @property
+    def target_device(self) -> torch.device:
+        """The device that batches are copied to: the trainer's, or the CPU without a trainer."""
+        return self.trainer.strategy.root_device if self.trainer is not None else torch.device("cpu")
+
+    def transfer_batch_to_device(self, batch: Window, device: torch.device, dataloader_idx: int) -> Window:  # noqa: ARG002
+        """Copies a batch to a device; copies from pinned memory to a GPU do not block the host."""
+        return batch.to(device, non_blocking=device.type == "cuda")
+
+    def teardown(self, stage: str) -> None:  # noqa: ARG002
+        """Stops simulations that are still running for the next buffer."""
+        if self._provider is not None:
+            self._provider.close()
+
+    def buffer_device(self, provider: RecordingProvider, plan: WindowPlan) -> torch.device:
+        """The device that holds the buffer: the trainer's GPU if it has enough free memory, else the CPU."""
+        device = self.target_device
         if device.type != "cuda":
             return torch.device("cpu")
         free, _ = torch.cuda.mem_get_info(device)
-        needed = 2 * min(plan.buffer_size, len(plan.frames)) * source.most_bytes
+        needed = 2 * min(plan.buffer_size, len(plan.frames)) * provider.max_bytes
         return device if needed <= _GPU_SHARE * free else torch.device("cpu")
 
     def val_dataloader(self) -> EvaluationLoader:
@@ -171,55 +188,60 @@ class TrajectoryDataModule(LightningDataModule):
 
     def _evaluation(self, name: str, limit: int | None = None) -> EvaluationLoader:
         rank, world = self.ranks
-        return EvaluationLoader(self.origin.recordings(name), self.eval_batch_size, limit, rank, world)
+        return EvaluationLoader(
+            self.data_source.recordings(name), self.eval_batch_size, limit, rank, world, self.target_device
+        )
 
     @property
     def ranks(self) -> tuple[int, int]:
-        """This process's number, and how many there are."""
+        """Index of this process, and the number of processes."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)
 
     @property
     def batches_seen(self) -> int:
-        """How many training batches this rank has finished, over all epochs and interruptions."""
+        """Number of training batches that this rank has finished, over all epochs and resumed runs."""
         if self.trainer is None:
             return 0
         # Only `processed` is right in every checkpoint: `ready` counts a batch that was interrupted, `completed`
-        # misses the one after which the checkpoint was written.
+        # misses the batch after which the checkpoint was written.
         total = self.trainer.fit_loop.epoch_loop.batch_progress.total
         return int(total.processed)  # type: ignore[attr-defined]  # (of batches)
 
 
 class TrainingLoader:
-    """The training batches from where training stands, each time it is iterated.
+    """Iterates over the training batches, from the trainer's current batch on.
 
     Args:
-        buffer: Gives the batches.
-        owner: Knows where training stands.
+        buffer: Makes the batches.
+        owner: Knows the trainer's current batch, rank and device.
     """
 
     def __init__(self, buffer: TrajectoryBuffer, owner: TrajectoryDataModule) -> None:
         self.buffer, self.owner = buffer, owner
 
     def __iter__(self) -> Iterator[Window]:
-        return self.buffer.batches(self.owner.batches_seen, *self.owner.ranks)
+        batches = self.buffer.batches(self.owner.batches_seen, *self.owner.ranks)
+        return pin_for(self.owner.target_device, batches) if self.buffer.device.type == "cpu" else batches
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing: the Trainer's own progress says where to go on. That this exists tells Lightning so."""
+        """Empty: the Trainer's own progress suffices. Lightning takes a loader with this method for resumable."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Has nothing to restore."""
+        """Restores nothing."""
 
 
-def _origin(path: str | None, name: str | None, source: str, stated: Stated, generate: dict[str, Any]) -> Origin:
+def _make_source(
+    path: str | None, name: str | None, source: str, stated: StatedFacts, generate: dict[str, Any]
+) -> DataSource:
     if path is not None:
-        return Folder(Path(path), stated)
-    named: dict[str, Callable[[str], Origin]] = {
-        "disk": lambda known: Embedded(known, generate),
-        "simulate": lambda known: Live(known, generate),
-        "hub": lambda known: Hub(Path(known), stated),
+        return FolderSource(Path(path), stated)
+    sources: dict[str, Callable[[str], DataSource]] = {
+        "disk": lambda known: EmbeddedSource(known, generate),
+        "simulate": lambda known: SimulatedSource(known, generate),
+        "hub": lambda known: HubSource(Path(known), stated),
     }
-    return named[source](str(name))
+    return sources[source](str(name))
 
 
 def _check_source(

@@ -1,8 +1,8 @@
-"""What the particle type ids of the published dataset families mean.
+"""Meaning of the particle type ids in the published families of datasets.
 
-The same id means different things in different families, so a dataset either names its types in its metadata or says
+The same id means different things in different families, so a dataset either names its types in its metadata or states
 which family it follows. DeepMind: Sanchez-Gonzalez et al., ICML 2020. LagrangeBench: Toshev et al., NeurIPS 2023.
-JAX-SPH: Toshev et al., 2024; its walls of fixed temperature bear the id of LagrangeBench's rigid bodies.
+JAX-SPH: Toshev et al., 2024; its heated walls have the id of LagrangeBench's rigid bodies.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ STATIC_NAMES = frozenset({"boundary", "wall", "obstacle"})
 
 @dataclass(frozen=True)
 class Family:
-    """The types of one family of datasets.
+    """The particle types of one family of datasets.
 
     Args:
         types: Name of each particle type id.
-        static: Ids of the types that never move.
+        static: Ids of the types that do not move.
     """
 
     types: Mapping[int, str]
@@ -47,10 +47,10 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 
 
 def find_family(name: str) -> Family:
-    """The family of that name.
+    """The family with a name.
 
     Raises:
-        ConfigError: if there is none.
+        ConfigError: if there is no such family; lists the known ones.
     """
     if name not in FAMILIES:
         raise ConfigError(f"No family of particle types is called {name!r}; known: {', '.join(sorted(FAMILIES))}.")

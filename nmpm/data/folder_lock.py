@@ -1,4 +1,4 @@
-"""One process at a time in a folder."""
+"""A lock that lets one process at a time work in a folder."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, made if need be, against other processes; wait until they have let go of it.
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Locks a folder against other processes and threads, waiting until it is free; creates the folder if missing.
 
-    The lock is the system's and ends with the process, however it ends.
+    The lock is the operating system's, so that it is released however the process ends.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            _log.warning("Another process is at work in %s; waiting for it.", folder)
+            _log.warning("Another process works in %s; waiting for it to finish.", folder)
             fcntl.flock(file, fcntl.LOCK_EX)
         yield

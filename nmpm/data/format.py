@@ -1,15 +1,14 @@
-"""Trajectories on disk, in the layout that LagrangeBench shares.
+"""Trajectories on disk, in LagrangeBench's layout.
 
 A dataset is a folder with `metadata.json` and `train.h5`, `valid.h5`, `test.h5`. In each file there is a group per
 trajectory, named `00000`, `00001`, …, with the datasets `position` (T, N, D), float32, and `particle_type` (N,),
-integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`. Every further dataset of a group, such
-as `temperature` (T, N), is a field: kept as it is.
+integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`. All other datasets of a group, such as
+`temperature` (T, N), are fields and kept unchanged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm._support.atomic import replacing
+from nmpm.data.hdf5 import check_self_contained, open_hdf5, writable_hdf5
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
 from nmpm.data.metadata import read_metadata as read_metadata
@@ -38,12 +37,11 @@ class Trajectory:
     Args:
         position: (T, N, D) float32, in domain length.
         particle_type: (N,) int64 type ids.
-        attributes: What else is known of it, e.g. `gravity` (D,) in length/s², `seed`.
+        attributes: Further facts by name, e.g. `gravity` (D,) in length/s², `seed`.
         fields: Further arrays of numbers by name, of any shape and unit, e.g. `temperature` (T, N).
 
     Raises:
-        DataError: if the shapes do not fit together, a position is not a finite number, or a field not an array of
-            numbers.
+        DataError: if the shapes do not fit together, a position is not finite, or a field is not an array of numbers.
     """
 
     position: np.ndarray
@@ -61,16 +59,17 @@ class Trajectory:
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
-    """Writes trajectories, in order, into one file; the same ones give the same bytes.
+    """Writes trajectories, in order, into one file; equal trajectories give equal bytes.
 
     Raises:
-        DataError: if there are no trajectories.
+        DataError: if there are no trajectories, or the file cannot be written, e.g. on a full disk.
     """
     path, count = Path(path), 0
-    # The earliest format keeps no time stamps in groups.
-    with replacing(path) as part, h5py.File(part, "w", libver=("earliest", "v108")) as file:
+    # The earliest format has no time stamps in groups.
+    with writable_hdf5(path, libver=("earliest", "v108")) as (file, check_written):
         for count, trajectory in enumerate(trajectories, start=1):
             _write_trajectory(file.create_group(f"{count - 1:05d}"), trajectory)
+            check_written()
         if not count:
             raise DataError(f"{path}: there are no trajectories to write.")
 
@@ -104,21 +103,21 @@ class _Entry:
 
 
 class Split:
-    """The trajectories of one file, read when asked for. Holds no open file, so it can be pickled and shared.
+    """The trajectories of one file, read on access. Keeps no file open, so that it can be pickled and shared.
 
     Args:
         path: The HDF5 file.
 
     Raises:
-        DataError: if the file is missing, damaged or not of the layout above.
+        DataError: if the file is missing, damaged, not of the layout above, or takes content from other files.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        if not self.path.is_file():
-            raise DataError(f"{self.path}: no such file{_neighbours(self.path)}.")
+        if not self.path.exists():
+            raise DataError(f"{self.path}: no such file{_other_files(self.path)}.")
         if not self._entries:
-            raise DataError(f"{self.path}: the file holds no trajectory; {_LAYOUT}.")
+            raise DataError(f"{self.path}: the file has no trajectory; {_LAYOUT}.")
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -142,27 +141,27 @@ class Split:
         return self._entries[index].particles
 
     def where(self, index: int) -> str:
-        """File and trajectory, for messages."""
+        """File and trajectory, for error messages."""
         return f"{self.path}, trajectory {self._entries[index].name}"
 
     def particle_type(self, index: int) -> np.ndarray:
         """The (N,) int64 type ids of a trajectory."""
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             return np.asarray(file[self._entries[index].name]["particle_type"][()], dtype=np.int64)
 
     def attributes(self, index: int) -> dict[str, Any]:
         """The attributes of a trajectory."""
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             return dict(file[self._entries[index].name].attrs)
 
     def fields(self, index: int) -> dict[str, np.ndarray]:
-        """Every dataset of a trajectory beside its positions and types, by name.
+        """All datasets of a trajectory except its positions and types, by name.
 
         Raises:
             DataError: if one does not hold numbers.
         """
         found: dict[str, np.ndarray] = {}
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
             names: list[str] = []
             group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
@@ -172,21 +171,21 @@ class Split:
                     _check_field(name, found[name], self.where(index))
         return found
 
-    def whole(self, index: int) -> Trajectory:
-        """A trajectory with all that its group holds.
+    def read_with_fields(self, index: int) -> Trajectory:
+        """Reads a trajectory with its fields.
 
         Raises:
-            DataError: if it cannot be read, or holds a position that is not a finite number.
+            DataError: if it cannot be read or a position is not finite.
         """
         return replace(self.read(index), fields=self.fields(index))
 
     def read(self, index: int, start: int = 0, stop: int | None = None) -> Trajectory:
-        """The frames from `start` up to `stop` (to the end when None) of a trajectory, without its fields.
+        """Reads the frames from `start` up to `stop` (to the end when None) of a trajectory, without its fields.
 
         Raises:
-            DataError: if they cannot be read or hold a position that is not a finite number.
+            DataError: if they cannot be read or a position is not finite.
         """
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
             position = np.asarray(group["position"][start:stop], dtype=np.float32)
             particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
@@ -196,7 +195,8 @@ class Split:
 
     @cached_property
     def _entries(self) -> tuple[_Entry, ...]:
-        with opened(self.path) as file:
+        with open_hdf5(self.path) as file:
+            check_self_contained(file, self.path)
             entries = tuple(_entry(group, name, self.path) for name, group in file.items())
         for entry in entries:
             if entry.dim != entries[0].dim:
@@ -204,19 +204,6 @@ class Split:
                     f"{self.path}, trajectory {entry.name}: {entry.dim} dimensions, {entries[0].dim} in the others."
                 )
         return entries
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[Any]:
-    """An open HDF5 file; whatever HDF5 stumbles over becomes a DataError that names the file."""
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise DataError(
-            f"{path}: cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again."
-        ) from error
 
 
 def _entry(group: Any, name: str, path: Path) -> _Entry:
@@ -233,7 +220,7 @@ def _entry(group: Any, name: str, path: Path) -> _Entry:
 
 
 def _check_arrays(position: Any, particle_type: Any, where: str) -> None:
-    """Checks kinds and shapes of two arrays or HDF5 datasets."""
+    """Checks dtypes and shapes of two arrays or HDF5 datasets."""
     wanted = {"position": ("f", 3, "floats of shape (T, N, D)"), "particle_type": ("iu", 1, "integers of shape (N,)")}
     for key, array in (("position", position), ("particle_type", particle_type)):
         kinds, axes, description = wanted[key]
@@ -260,17 +247,17 @@ def _check_finite(position: np.ndarray, where: str, first_frame: int) -> None:
         frame, particle, _ = map(int, np.argwhere(~np.isfinite(position))[0])
         raise DataError(
             f"{where}: position of particle {particle} in frame {first_frame + frame} is"
-            f" {position[frame, particle].tolist()}; every position must be a finite number. Leave the run out, or"
-            " cut it before that frame."
+            f" {position[frame, particle].tolist()}; positions must be finite. Remove the trajectory, or cut it"
+            " before that frame."
         )
 
 
-def _neighbours(path: Path) -> str:
+def _other_files(path: Path) -> str:
     found = sorted(file.name for file in path.parent.glob("*.h5"))
     return f" (beside it: {', '.join(found)})" if found else ""
 
 
 def split_paths(folder: Path) -> Mapping[str, Path]:
-    """The split files that a dataset's folder has, by name, in the order train, valid, test."""
+    """The split files in a dataset's folder, by name, in the order train, valid, test."""
     paths = {name: Path(folder) / f"{name}.h5" for name in SPLITS}
-    return {name: path for name, path in paths.items() if path.is_file()}
+    return {name: path for name, path in paths.items() if path.exists()}

@@ -1,8 +1,8 @@
-"""Simulated datasets: made in parallel, resumed after an interruption, the same bytes whoever makes them.
+"""Simulates datasets in parallel; resumes after an interruption; gives the same bytes for any number of workers.
 
-A folder in the making holds `.parts`: what was asked for, and a file for each finished trajectory. Once a split has all
-of its parts they become its HDF5 file; `metadata.json` comes last and marks the dataset as complete. Every file appears
-whole or not at all, so that the same call goes on wherever the last one was stopped.
+An unfinished folder contains `.parts`, with the request and a file for each finished trajectory. When all parts of a
+split are there they are assembled into its HDF5 file; `metadata.json` is written last and marks the dataset as
+complete. Files are written atomically, so that a repeated call continues where the last one stopped.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 
 from nmpm._support.atomic import replacing
 from nmpm._support.version import __version__
-from nmpm.data.archives import DAMAGED_NPZ
-from nmpm.data.folder_lock import locked
+from nmpm.data.archive_errors import NPZ_ERRORS
+from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,
@@ -34,8 +34,8 @@ from nmpm.data.format import (
     write_metadata,
     write_split,
 )
-from nmpm.data.progress import shown
-from nmpm.data.statistics import Statistics
+from nmpm.data.progress import progress_bar
+from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
@@ -47,24 +47,24 @@ _KEY = "simulation"
 _log = logging.getLogger(__name__)
 
 
-def _are_counts(counts: object) -> bool:
-    """Whether these are numbers of trajectories, one for each split."""
+def _is_valid_counts(counts: object) -> bool:
+    """Whether these are valid numbers of trajectories for all splits."""
     if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):
         return False
     return all(isinstance(number, int) and number >= 0 for number in counts.values())
 
 
 @dataclass(frozen=True)
-class Request:
-    """A dataset to simulate.
+class SimulationRequest:
+    """Everything that determines a simulated dataset.
 
     Args:
         preset: The family of scenes.
-        counts: Trajectories in each of the splits train, valid and test; a split of 0 gets no file.
-        seed: From which the seed of every trajectory is derived.
+        counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
+        seed: The seeds of all trajectories are derived from it.
 
     Raises:
-        ConfigError: if a split is unknown, missing or empty.
+        ConfigError: if a split is unknown or missing, all are empty, or a number is negative.
     """
 
     preset: Preset
@@ -72,7 +72,7 @@ class Request:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not _are_counts(self.counts) or not self.splits or self.seed < 0:
+        if not _is_valid_counts(self.counts) or not self.splits or self.seed < 0:
             raise ConfigError(
                 f"counts = {self.counts}, seed = {self.seed}: give the number of trajectories in each of "
                 f"{', '.join(SPLITS)}, as in {{train: 3, valid: 1, test: 1}}, at least 1 in all; neither they nor the "
@@ -81,65 +81,65 @@ class Request:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """The splits that have trajectories."""
+        """Names of the splits that have trajectories."""
         return tuple(split for split in SPLITS if self.counts[split])
 
     def to_dict(self) -> dict[str, Any]:
-        """What determines the data, as plain lists, strings and numbers."""
+        """The request as plain lists, strings and numbers."""
         counts = {split: self.counts[split] for split in SPLITS}
         return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": self.preset.revision}
 
     def trajectory_seed(self, split: str, index: int) -> int:
-        """Seed of one trajectory, whatever the number of others."""
-        return derived_seed(self.seed, SPLITS.index(split), index)
+        """Seed of one trajectory; independent of the counts."""
+        return derive_seed(self.seed, SPLITS.index(split), index)
 
 
-def derived_seed(*entropy: int) -> int:
-    """A seed that depends on all of the numbers."""
+def derive_seed(*entropy: int) -> int:
+    """A seed that depends on all the numbers."""
     return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def generate(
     preset: Preset, folder: Path, counts: Mapping[str, int], seed: int = 0, workers: int | None = None
 ) -> None:
-    """Simulate a dataset into a folder, unless it is there already.
+    """Simulates a dataset into a folder, unless it is complete already.
 
-    Any number of processes may ask for the same folder: the first one makes it, the others wait for it.
+    Several processes may call this for the same folder: the first one simulates, the others wait for it.
 
     Args:
         preset: The family of scenes.
-        folder: Where to; made if need be.
-        counts: Trajectories in each of the splits train, valid and test; a split of 0 gets no file.
-        seed: From which the seed of every trajectory is derived.
-        workers: Trajectories simulated at a time; as many as there are processor cores when left out.
+        folder: The dataset's folder; created if missing.
+        counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
+        seed: The seeds of all trajectories are derived from it.
+        workers: Trajectories simulated at a time; one per processor core when left out.
 
     Raises:
-        ConfigError: if the preset or the counts cannot be.
-        DataError: if the folder holds other data than asked for, or cannot be written.
+        ConfigError: if preset or counts are invalid.
+        DataError: if the folder has other data than requested, or cannot be written.
     """
-    request, folder = Request(preset, counts, seed), Path(folder)
-    if _is_complete(request, folder):  # Without the lock, which needs a folder that can be written.
+    request, folder = SimulationRequest(preset, counts, seed), Path(folder)
+    if _is_complete(request, folder):  # without the lock, which needs a writable folder
         return
     try:
-        with locked(folder):
+        with lock_folder(folder):
             _complete(request, folder, workers or os.cpu_count() or 1)
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be written ({error}). What is finished stays; once there is room and permission, "
-            "the same call goes on from there."
+            f"{folder}: cannot be written ({error}). Finished trajectories are kept; free space or correct the"
+            " permissions, and repeat the call to continue."
         ) from error
 
 
-def _complete(request: Request, folder: Path, workers: int) -> None:
+def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
     if _is_complete(request, folder):
         return
-    _open_parts(request, folder)
-    _sweep(folder)
+    _prepare_parts(request, folder)
+    _remove_stale_files(folder)
     _simulate_parts(request, folder, workers)
     for split in request.splits:
         _assemble(request, folder, split)
-    metadata = metadata_of(request.preset)
-    first, statistics = Split(folder / f"{request.splits[0]}.h5"), Statistics(metadata)
+    metadata = preset_metadata(request.preset)
+    first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
     for index in range(len(first)):
         statistics.add(first.read(index))
     extra = metadata.extra | statistics.result() | {_KEY: request.to_dict()}
@@ -147,61 +147,59 @@ def _complete(request: Request, folder: Path, workers: int) -> None:
     shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
 
-def _is_complete(request: Request, folder: Path) -> bool:
+def _is_complete(request: SimulationRequest, folder: Path) -> bool:
     if not (folder / METADATA_FILE).is_file():
         return False
     _check_same(request, read_metadata(folder).extra.get(_KEY), folder)
     return True
 
 
-def _open_parts(request: Request, folder: Path) -> None:
-    """Note what the parts are for, or make sure that those which are there are for the same."""
-    note = folder / _PARTS / _REQUEST
-    if note.is_file():
-        _check_same(request, json.loads(note.read_text(encoding="utf-8")), folder)
+def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
+    """Writes the request beside the parts, or checks that existing parts belong to the same request."""
+    path = folder / _PARTS / _REQUEST
+    if path.is_file():
+        _check_same(request, json.loads(path.read_text(encoding="utf-8")), folder)
         return
     foreign = [f"{split}.h5" for split in SPLITS if (folder / f"{split}.h5").exists()]
     if foreign:
-        raise DataError(f"{folder}: {', '.join(foreign)} is there already and not simulated; choose another folder.")
-    with replacing(note) as temporary:
+        raise DataError(f"{folder}: {', '.join(foreign)} exists already and was not simulated; choose another folder.")
+    with replacing(path) as temporary:
         temporary.write_text(json.dumps(request.to_dict(), indent=1), encoding="utf-8")
 
 
-def _check_same(request: Request, found: Any, folder: Path) -> None:
+def _check_same(request: SimulationRequest, found: Any, folder: Path) -> None:
     asked = json.loads(json.dumps(request.to_dict()))
     found = found if isinstance(found, dict) else {}
     differing = [key for key in asked if found.get(key) != asked[key]]
     if differing:
         what = "; ".join(_difference(key, found.get(key), asked[key]) for key in differing)
-        raise DataError(
-            f"{folder}: holds other data than asked for: {what}. Choose another folder, or delete this one."
-        )
+        raise DataError(f"{folder}: has other data than requested: {what}. Choose another folder, or delete this one.")
 
 
 def _difference(key: str, found: Any, asked: Any) -> str:
     if isinstance(asked, dict) and isinstance(found, dict):
         inner = [name for name in asked if found.get(name) != asked[name]]
         return ", ".join(_difference(f"{key}.{name}", found.get(name), asked[name]) for name in inner)
-    return f"{key} is {found}, asked {asked}"
+    return f"{key} is {found}, requested {asked}"
 
 
-def _sweep(folder: Path) -> None:
-    """Remove what killed processes left half-written; the lock says that no other is writing."""
+def _remove_stale_files(folder: Path) -> None:
+    """Removes files that killed processes left incomplete; the lock guarantees that no other process is writing."""
     for stale in [*folder.glob(".*.part*"), *(folder / _PARTS).glob(".*.part*")]:
         stale.unlink(missing_ok=True)
 
 
-def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
+def _simulate_parts(request: SimulationRequest, folder: Path, workers: int) -> None:
     wanted = [(s, i) for s in request.splits if not (folder / f"{s}.h5").is_file() for i in range(request.counts[s])]
     missing = [(s, i) for s, i in wanted if not _part(folder, s, i).is_file()]
     if not missing:
         return
     total = sum(request.counts.values())
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
-    # Threads suffice, as the kernels hold no lock; they need no second start of the interpreter, and die with it.
+    # Threads suffice, as the simulators' compiled loops release the GIL.
     pool = ThreadPoolExecutor(min(workers, len(missing)))
     try:
-        with shown(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
+        with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
             for future in as_completed([pool.submit(_simulate_part, request, folder, s, i) for s, i in missing]):
                 future.result()
                 advance()
@@ -209,21 +207,21 @@ def _simulate_parts(request: Request, folder: Path, workers: int) -> None:
         pool.shutdown(cancel_futures=True)
 
 
-def _simulate_part(request: Request, folder: Path, split: str, index: int) -> None:
-    made = request.preset.simulate(request.trajectory_seed(split, index))
+def _simulate_part(request: SimulationRequest, folder: Path, split: str, index: int) -> None:
+    run = request.preset.simulate(request.trajectory_seed(split, index))
     with replacing(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
-        np.savez(file, position=made.position, particle_type=made.particle_type, **made.attributes)
+        np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)
 
 
 def _part(folder: Path, split: str, index: int) -> Path:
     return folder / _PARTS / f"{split}-{index:05d}.npz"
 
 
-def _assemble(request: Request, folder: Path, split: str) -> None:
+def _assemble(request: SimulationRequest, folder: Path, split: str) -> None:
     path = folder / f"{split}.h5"
     parts = [_part(folder, split, index) for index in range(request.counts[split])]
     if not path.is_file():
-        with shown(f"Writing {path.name}", len(parts)) as advance:
+        with progress_bar(f"Writing {path.name}", len(parts)) as advance:
             write_split(path, _read_parts(parts, advance))
     for part in parts:
         part.unlink(missing_ok=True)
@@ -235,13 +233,15 @@ def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Traj
             with np.load(part, allow_pickle=False) as arrays:
                 attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
                 yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
-        except DAMAGED_NPZ as error:
-            raise DataError(f"{part}: damaged ({error}); delete it, and the same call makes it again.") from error
+        except NPZ_ERRORS as error:
+            raise DataError(
+                f"{part}: damaged ({error}); delete it and repeat the call, which simulates it again."
+            ) from error
         advance()
 
 
-def metadata_of(preset: Preset) -> Metadata:
-    """What holds for every trajectory that a preset simulates."""
+def preset_metadata(preset: Preset) -> Metadata:
+    """The metadata of the trajectories that a preset simulates."""
     scene = preset.scene
     return Metadata(
         bounds=scene.bounds,
@@ -253,6 +253,7 @@ def metadata_of(preset: Preset) -> Metadata:
         domain=scene.domain,
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,
+        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
         extra={
             "default_connectivity_radius": round(1.8 * scene.particle_spacing, 6),
             "num_particles_max": preset.max_particles,

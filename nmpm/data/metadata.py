@@ -1,8 +1,9 @@
-"""The `metadata.json` of a dataset: DeepMind's keys, and a few that say what DeepMind's leave open.
+"""The `metadata.json` of a dataset: DeepMind's keys, and optional ones for facts that DeepMind's do not state.
 
 Required are `bounds`, `dt`, `dim` and `sequence_length` (as in DeepMind's files this may be one less than the frames
 stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `domain`, `gravity` (length/s²),
-`particle_volume` (length ** dim) and `periodic_boundary_conditions`. All other keys are kept as they are.
+`particle_volume` (length ** dim), `densities` ({"water": 1000}, kg / length ** dim) and
+`periodic_boundary_conditions`. All other keys are kept unchanged.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from nmpm._support.atomic import replacing
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
@@ -27,7 +29,7 @@ _LENGTH_KEYS = ("sequence_length", "sequence_length_train", "sequence_length_tes
 
 @dataclass(frozen=True)
 class Metadata:
-    """What holds for every trajectory of a dataset.
+    """Facts that all trajectories of a dataset share.
 
     Args:
         bounds: Where particles may be, (lower, upper) per axis, in domain length.
@@ -35,11 +37,12 @@ class Metadata:
         dim: Number of space dimensions.
         sequence_length: Frames per trajectory as the dataset declares them.
         particle_types: Name of each particle type id.
-        static_types: Ids of the types that never move.
-        periodic: Whether each axis wraps; nowhere when left out.
+        static_types: Ids of the types that do not move.
+        periodic: Whether each axis is periodic; none when left out.
         domain: What a grid should cover, (lower, upper) per axis, or None.
         gravity: Acceleration in length/s² per axis, or None where unknown.
         particle_volume: Volume of a particle in length ** dim, or None where unknown.
+        densities: Mass density of materials in kg / length ** dim, by name; empty where unknown.
         extra: Every other key of the file, unchanged.
     """
 
@@ -53,6 +56,7 @@ class Metadata:
     domain: tuple[Interval, ...] | None = None
     gravity: tuple[float, ...] | None = None
     particle_volume: float | None = None
+    densities: dict[str, float] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,17 +70,17 @@ class Metadata:
         return tuple(sorted(i for i in names if i not in self.static_types and names[i] != PADDING))
 
     def check_types(self, particle_type: np.ndarray, where: str) -> None:
-        """Makes sure that every id in an array is known.
+        """Raises an error if an array has an unknown type id.
 
         Raises:
-            DataError: naming the unknown ids, and `where` they were met.
+            DataError: names the unknown ids, and `where` they occur.
         """
         unknown = sorted(set(np.unique(particle_type).tolist()) - set(self.particle_types))
         if unknown:
             known = ", ".join(f"{i} {name}" for i, name in sorted(self.particle_types.items()))
             raise DataError(
                 f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {known}). Name it in"
-                f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or where data are converted'
+                f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or at conversion'
                 f" (--types {unknown[0]}=sand), or choose another family"
                 f" ({', '.join(sorted(FAMILIES))})."
             )
@@ -87,26 +91,26 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
 
     Args:
         folder: The dataset's folder.
-        family: What type ids mean ("deepmind", "lagrangebench") where the file does not say so itself.
+        family: Meaning of the type ids ("deepmind", "lagrangebench", "jax-sph") where the file does not state it.
 
     Raises:
-        DataError: if the file is missing, is not JSON, lacks a key or holds a wrong value.
+        DataError: if the file is missing or not JSON, or a key is missing or has a wrong value.
         ConfigError: if there is no such family.
     """
     path = Path(folder) / METADATA_FILE
-    return metadata_from_dict(_loaded(path), path, family)
+    return metadata_from_dict(_load_json(path), path, family)
 
 
 def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None = None) -> Metadata:
-    """The metadata in a JSON object, checked.
+    """Validates the metadata in a JSON object.
 
     Args:
         plain: The object; numbers, strings, lists and objects.
-        where: The file it comes from, for messages.
-        family: What type ids mean where it does not say so itself.
+        where: Its file, for error messages.
+        family: Meaning of the type ids where it does not state it.
 
     Raises:
-        DataError: if a key is missing or holds a wrong value.
+        DataError: if a key is missing or has a wrong value.
         ConfigError: if there is no such family.
     """
     keys = _Keys(where, dict(plain))
@@ -125,12 +129,17 @@ def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None
         domain=keys.take("domain", _intervals(dim), None),
         gravity=keys.take("gravity", _vector(dim), None),
         particle_volume=keys.take("particle_volume", _positive, None),
+        densities=keys.take("densities", _densities, {}),
         extra=keys.left,
     )
 
 
 def write_metadata(folder: Path, metadata: Metadata) -> None:
-    """Writes `metadata.json`, in one step; `read_metadata` gives the same back."""
+    """Writes `metadata.json` atomically, so that `read_metadata` returns equal metadata.
+
+    Raises:
+        DataError: if the file cannot be written, e.g. on a full disk.
+    """
     solver_steps = metadata.extra.get("write_every", 1)
     plain: dict[str, Any] = {
         "bounds": metadata.bounds,
@@ -143,17 +152,25 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         "domain": metadata.domain,
         "gravity": metadata.gravity,
         "particle_volume": metadata.particle_volume,
+        "densities": metadata.densities or None,
     }
     plain = {key: value for key, value in plain.items() if value is not None} | metadata.extra
-    with replacing(Path(folder) / METADATA_FILE) as part:
-        part.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    path = Path(folder) / METADATA_FILE
+    try:
+        with replacing(path) as part:
+            part.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise DataError(
+            f"{path}: cannot be written ({error.strerror}). Free space, or choose another folder."
+        ) from error
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _load_json(path: Path) -> dict[str, Any]:
     if not path.parent.is_dir():
-        raise DataError(f"{path.parent}: no such folder. Give the folder that holds {METADATA_FILE}.")
-    if not path.is_file():
-        raise DataError(f"{path}: no such file. A dataset needs one with bounds, dt, dim and sequence_length.")
+        raise DataError(f"{path.parent}: no such folder. Give the folder that contains {METADATA_FILE}.")
+    if not path.exists():
+        raise DataError(f"{path}: no such file. A dataset needs this file, with bounds, dt, dim and sequence_length.")
+    check_regular(path)
     try:
         plain = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -164,7 +181,7 @@ def _loaded(path: Path) -> dict[str, Any]:
 
 
 class _Keys:
-    """The keys of a JSON object, taken one by one; each error names the file and the key."""
+    """Validates and removes the keys of a JSON object one by one; errors name the file and the key."""
 
     _REQUIRED = object()
 
@@ -196,16 +213,16 @@ def _types(keys: _Keys, family: str | None) -> tuple[dict[int, str], frozenset[i
     types = keys.take("particle_types", _names, dict(fallback.types) if fallback else None)
     if types is None:
         raise DataError(
-            f"{keys.path}: the key 'particle_types' is missing, so nobody knows what the type ids mean. Add it, e.g."
+            f"{keys.path}: the key 'particle_types' is missing, so the type ids have no meaning. Add it, e.g."
             f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
         )
-    named = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
-    return types, keys.take("static_types", _ids, fallback.static if fallback else named)
+    walls = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
+    return types, keys.take("static_types", _ids, fallback.static if fallback else walls)
 
 
 def _sequence_length(keys: _Keys) -> int:
-    found = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
-    length: int = keys.take(found, _whole) if found == _LENGTH_KEYS[0] else keys.peek(found, _whole)
+    key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
+    length: int = keys.take(key, _whole) if key == _LENGTH_KEYS[0] else keys.peek(key, _whole)
     return length
 
 
@@ -221,9 +238,15 @@ def _positive(value: Any) -> float:
     return float(value)
 
 
+def _densities(value: Any) -> dict[str, float]:
+    if not isinstance(value, Mapping):
+        raise TypeError('positive numbers by material, e.g. {"water": 1000}')
+    return {str(name): _positive(density) for name, density in value.items()}
+
+
 def _whole(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError("a whole number above 0")
+        raise ValueError("a positive integer")
     return value
 
 
@@ -235,11 +258,11 @@ def _ids(value: Any) -> frozenset[int]:
 
 def _names(value: Any) -> dict[int, str]:
     if not isinstance(value, Mapping) or not value or not all(isinstance(name, str) for name in value.values()):
-        raise ValueError('an object of ids and names, e.g. {"7": "goop"}')
+        raise ValueError('an object that maps ids to names, e.g. {"7": "goop"}')
     try:
         types = {int(i): name for i, name in value.items()}
     except ValueError as error:
-        raise ValueError('an object whose keys are whole numbers, e.g. {"7": "goop"}') from error
+        raise ValueError('an object whose keys are integers, e.g. {"7": "goop"}') from error
     return types
 
 
@@ -270,7 +293,7 @@ def _flags(dim: int) -> Callable[[Any], tuple[bool, ...]]:
     def parse(value: Any) -> tuple[bool, ...]:
         # LagrangeBench gives three flags to two-dimensional scenes as well.
         if not isinstance(value, list) or len(value) < dim or not all(isinstance(flag, bool) for flag in value):
-            raise ValueError(f"a list of at least {dim} truth values, one per axis")
+            raise ValueError(f"a list of at least {dim} booleans, one per axis")
         return tuple(value[:dim])
 
     return parse

@@ -1,4 +1,4 @@
-"""Progress bars with an estimate of the time that is left."""
+"""Progress bars with an estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 @contextmanager
-def shown(what: str, total: int | None, done: int = 0) -> Iterator[Callable[[], None]]:
-    """A progress bar on standard error; gives the function that moves it on by one.
+def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Callable[[], None]]:
+    """Shows a progress bar on standard error; yields the function that advances it by one.
 
     Args:
-        what: What is being done.
-        total: How many times the bar moves in all; None where nobody knows.
-        done: How many of them are done already.
+        what: Description of the work.
+        total: Number of steps; None where it is unknown.
+        done: Steps that are done already.
     """
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("ETA"),

@@ -18,7 +18,7 @@ def foreign(tmp_path):
 def test_converts_and_says_what_it_took(foreign, tmp_path, capsys):
     assert main(["convert", str(foreign), str(tmp_path / "out"), "--gravity", "0,-9.81", "--types", "5=oil"]) == 0
     said = capsys.readouterr().out
-    assert "- Particle types are read after the deepmind family." in said
+    assert "- Particle types have the meaning of the deepmind family." in said
     assert f"nmpm inspect {tmp_path / 'out'}" in said
     metadata = read_metadata(tmp_path / "out")
     assert metadata.gravity == (0.0, -9.81)

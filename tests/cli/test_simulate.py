@@ -4,7 +4,7 @@ from PIL import Image
 
 from nmpm.cli import main
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.origins import Folder
+from nmpm.data.loading.sources import FolderSource
 from nmpm.sim import preset_names
 
 
@@ -20,7 +20,7 @@ def test_makes_a_dataset_to_train_on(tmp_path, capsys):
     assert main([*words, "--out", str(tmp_path / "ramps"), "--workers", "1"]) == 0
     assert "wrote 2 train, 1 valid trajectories" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "ramps").glob("*.h5")) == ["train.h5", "valid.h5"]
-    origin = Folder(tmp_path / "ramps")
+    origin = FolderSource(tmp_path / "ramps")
     assert origin.scene.obstacles
     assert origin.recordings("train")[0].obstacle.shape[0] > 0
     extra = read_metadata(tmp_path / "ramps").extra
@@ -43,7 +43,7 @@ def test_a_scene_of_ones_own_starts_from_a_copy(tmp_path, capsys):
     (tmp_path / "thick.yaml").write_text(text.replace("name: goop", "name: thick").replace("60.0 ", "90.0 "))
     words = ["simulate", str(tmp_path / "thick.yaml"), "--train", "1", "--valid", "0", "--test", "0", "--frames", "1"]
     assert main([*words, "--out", str(tmp_path / "thick")]) == 0
-    assert Folder(tmp_path / "thick").scene.materials == ("goop",)
+    assert FolderSource(tmp_path / "thick").scene.materials == ("goop",)
 
 
 def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):

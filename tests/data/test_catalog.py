@@ -15,7 +15,7 @@ def home(tmp_path, monkeypatch) -> Path:
     return tmp_path / "home"
 
 
-def test_home_is_the_environments_or_the_users_cache(home, monkeypatch):
+def test_cache_folder_from_the_environment_or_the_home(home, monkeypatch):
     assert catalog.dataset_home() == home
     monkeypatch.delenv("NMPM_HOME")
     assert catalog.dataset_home() == Path.home() / ".cache" / "nmpm"
@@ -26,14 +26,14 @@ def test_goop_is_embedded():
     assert dict(catalog.describe("goop").counts) == {"train": 200, "valid": 10, "test": 30}
 
 
-def test_the_scene_is_known_without_simulating(home):
+def test_scene_without_simulating(home):
     scene = catalog.scene("goop")
     assert scene.materials == ("goop",)
     assert scene.bounds == ((0.1, 0.9), (0.1, 0.9))
     assert not home.exists()
 
 
-def test_ensure_makes_a_dataset_once(home):
+def test_ensure_simulates_once(home):
     folder = catalog.ensure("goop", counts=COUNTS, frames=2)
     assert folder.parent == home / "datasets"
     assert folder.name.startswith("goop-")
@@ -46,7 +46,7 @@ def test_ensure_makes_a_dataset_once(home):
 
 def test_the_folder_depends_on_all_that_determines_the_data(home):
     variants = [{}, {"seed": 1}, {"frames": 2}, {"counts": COUNTS}]
-    folders = {catalog.folder_of("goop", catalog.request_of("goop", **variant)) for variant in variants}
+    folders = {catalog.dataset_folder("goop", catalog.simulation_request("goop", **variant)) for variant in variants}
     assert len(folders) == len(variants)
 
 

@@ -116,7 +116,7 @@ class TestResuming:
         assert resumed.seen == straight.seen[6:]
         assert torch.equal(resumed.offset, straight.offset)
 
-    def test_an_interrupted_batch_is_seen_again(self, make_dataset, tmp_path):
+    def test_an_interrupted_batch_is_repeated(self, make_dataset, tmp_path):
         folder = make_dataset(train=TRAIN)
         straight, broken, resumed = Recorder(), Recorder(fail_at=4), Recorder()
         trainer_of(tmp_path, max_steps=9).fit(straight, datamodule=module_of(folder))
@@ -166,7 +166,7 @@ def as_rank(module: TrajectoryDataModule, rank: int, world: int, device: str = "
 class TestEvaluation:
     @pytest.mark.parametrize("world", [1, 2, 3])
     @pytest.mark.parametrize("batch_size", [1, 2, 8])
-    def test_every_trajectory_once_over_all_ranks(self, make_dataset, world, batch_size):
+    def test_each_trajectory_is_on_exactly_one_rank(self, make_dataset, world, batch_size):
         sizes = ((12, 5), (15, 4), (12, 6), (12, 7), (15, 3), (13, 2), (12, 3))
         folder = make_dataset(test=sizes)
         seen: Counter[int] = Counter()
@@ -178,7 +178,7 @@ class TestEvaluation:
                 assert len(batch) == len(window.frames) <= batch_size
                 seen.update(batch)
                 for row, index in enumerate(batch):
-                    truth = torch.from_numpy(module.origin.recordings("test").split.read(index).position)
+                    truth = torch.from_numpy(module.data_source.recordings("test").split.read(index).position)
                     assert torch.equal(window.frames[row, :, window.mask[row]], truth)
         assert seen == Counter(range(7))
 
@@ -223,7 +223,7 @@ class TestEmbedded:
         model = Recorder()
         trainer_of(tmp_path, max_steps=2).fit(model, datamodule=module)
         assert len(model.seen) == 2
-        assert len(module.origin.recordings("train")) == 2
+        assert len(module.data_source.recordings("train")) == 2
 
     def test_unknown_option(self):
         with pytest.raises(ConfigError, match="'count'"):
@@ -237,11 +237,50 @@ class TestModule:
         assert not set(map(float, batches[0])) & set(map(float, batches[1]))
 
     @pytest.mark.parametrize(("free", "held_on"), [(10**9, "cuda"), (1000, "cpu")])
-    def test_holds_the_buffer_on_a_gpu_where_it_fits(self, make_dataset, monkeypatch, free, held_on):
+    def test_the_buffer_is_on_the_gpu_if_it_fits(self, make_dataset, monkeypatch, free, held_on):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
         module = as_rank(module_of(make_dataset()), 0, 1, device="cuda")
-        source, plan = module.origin.training(5, batch_size=2, buffer_size=2, passes=1, seed=0)
+        source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
         assert module.buffer_device(source, plan).type == held_on
+
+    @pytest.mark.parametrize(("device", "pinned"), [("cuda", True), ("cpu", False)])
+    @pytest.mark.parametrize("loader", ["train", "val", "test", "predict"])
+    def test_batches_for_a_gpu_are_pinned(self, make_dataset, monkeypatch, device, pinned, loader):
+        calls = []
+        monkeypatch.setattr(Window, "pin_memory", lambda window: calls.append(window) or window)
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 0))
+        module = as_rank(module_of(make_dataset()), 0, 1, device)
+        windows = list(islice(getattr(module, f"{loader}_dataloader")(), 2))
+        assert all(any(window is call for call in calls) for window in windows) == pinned
+        assert bool(calls) == pinned
+
+    def test_a_buffer_on_the_gpu_gives_batches_as_they_are(self, make_dataset, monkeypatch):
+        monkeypatch.setattr(Window, "pin_memory", lambda window: pytest.fail("pinned"))
+        module = as_rank(module_of(make_dataset()), 0, 1)
+        loader = module.train_dataloader()
+        module.trainer.strategy.root_device = torch.device("cuda")
+        loader.buffer.device = torch.device("meta")
+        assert next(iter(loader)).frames.device.type == "meta"
+
+    @pytest.mark.parametrize(("device", "non_blocking"), [("cuda:0", True), ("cpu", False)])
+    def test_copies_to_a_gpu_do_not_block(self, make_dataset, monkeypatch, device, non_blocking):
+        copies = []
+        monkeypatch.setattr(Window, "to", lambda window, *args, **options: copies.append((args, options)) or window)
+        module = module_of(make_dataset())
+        window = next(iter(module.train_dataloader()))
+        assert module.transfer_batch_to_device(window, torch.device(device), 0) is window
+        assert copies == [((torch.device(device),), {"non_blocking": non_blocking})]
+
+    def test_the_trainer_uses_the_datamodules_transfer(self, make_dataset, tmp_path, monkeypatch):
+        devices, original = [], TrajectoryDataModule.transfer_batch_to_device
+
+        def transfer(self, batch, device, dataloader_idx):
+            devices.append(device.type)
+            return original(self, batch, device, dataloader_idx)
+
+        monkeypatch.setattr(TrajectoryDataModule, "transfer_batch_to_device", transfer)
+        trainer_of(tmp_path, max_steps=2).fit(Recorder(), datamodule=module_of(make_dataset()))
+        assert devices == ["cpu", "cpu"]
 
     def test_works_without_a_trainer(self, make_dataset):
         loader = module_of(make_dataset()).train_dataloader()
@@ -266,7 +305,7 @@ class TestModule:
             ({"name": "goop", "family": "deepmind"}, "family cannot be combined with the simulated dataset goop"),
         ],
     )
-    def test_contradictory_options(self, options, named):
+    def test_contradictory_options_are_refused(self, options, named):
         with pytest.raises(ConfigError, match=named):
             TrajectoryDataModule(**options)
 

@@ -178,7 +178,7 @@ class TestBadFiles:
             Split(file).read(0, frame if start else 0)
         Split(file).read(1)
 
-    def test_writing_what_could_not_be_read(self):
+    def test_non_finite_positions_cannot_be_written(self):
         position = np.zeros((3, 2, 2))
         position[2, 1, 0] = np.nan
         with pytest.raises(DataError, match="particle 1 in frame 2"):

@@ -42,7 +42,7 @@ def made(tmp_path_factory) -> Path:
     return folder
 
 
-def test_holds_the_simulated_trajectories_in_order(made):
+def test_contains_the_simulated_trajectories_in_order(made):
     for split, count in COUNTS.items():
         assert len(Split(made / f"{split}.h5")) == count
     read = Split(made / "valid.h5").read(0)
@@ -79,26 +79,26 @@ def test_metadata_has_the_statistics_of_the_training_split(made):
         np.testing.assert_allclose(extra[f"{key}_std"], values.std(0), rtol=1e-9)
 
 
-def test_two_workers_make_the_same_bytes(made, tmp_path):
+def test_bytes_do_not_depend_on_the_number_of_workers(made, tmp_path):
     generate(TINY, tmp_path, COUNTS, seed=5, workers=2)
     assert fingerprints(tmp_path) == fingerprints(made)
     assert not (tmp_path / ".parts").exists()
 
 
-def test_more_trajectories_begin_with_the_same_ones(made, tmp_path):
+def test_trajectories_do_not_depend_on_the_counts(made, tmp_path):
     generate(TINY, tmp_path, {"train": 2, "valid": 1, "test": 3}, seed=5)
     np.testing.assert_array_equal(
         Split(tmp_path / "test.h5").read(1).position, Split(made / "test.h5").read(1).position
     )
 
 
-def test_a_finished_dataset_is_left_alone(made):
+def test_a_complete_dataset_is_not_rewritten(made):
     before = {path: path.stat().st_mtime_ns for path in made.iterdir()}
     generate(TINY, made, COUNTS, seed=5)
     assert {path: path.stat().st_mtime_ns for path in made.iterdir()} == before
 
 
-def test_killed_and_called_again_it_makes_the_same_bytes(tmp_path):
+def test_a_killed_simulation_resumes_with_the_same_bytes(tmp_path):
     counts = {"train": 60, "valid": 1, "test": 1}
     killed = tmp_path / "killed"
     arguments = [json.dumps(TINY.to_dict()), str(killed), json.dumps(counts)]
@@ -107,7 +107,7 @@ def test_killed_and_called_again_it_makes_the_same_bytes(tmp_path):
     while len(list(killed.glob(".parts/*.npz"))) < 3 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
     os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    process.wait(timeout=60)
     (killed / ".train.h5.99999.part").write_bytes(b"half a file")
     finished = {path.name: path.stat().st_mtime_ns for path in killed.glob(".parts/*.npz")}
     assert 3 <= len(finished) < 60
@@ -135,7 +135,7 @@ def interrupted(folder: Path, monkeypatch, seed: int = 0) -> None:
             generate(TINY, folder, COUNTS, seed, workers=1)
 
 
-def test_goes_on_with_the_parts_that_are_there(tmp_path, monkeypatch):
+def test_resumes_with_the_existing_parts(tmp_path, monkeypatch):
     interrupted(tmp_path, monkeypatch)
     assert len(list(tmp_path.glob(".parts/*.npz"))) == 4
     simulated: list[int] = []
@@ -145,13 +145,13 @@ def test_goes_on_with_the_parts_that_are_there(tmp_path, monkeypatch):
     assert len(simulated) == 3
 
 
-def test_two_at_once_do_not_disturb_each_other(made, tmp_path):
+def test_concurrent_calls_give_the_same_bytes(made, tmp_path):
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda _: generate(TINY, tmp_path, COUNTS, seed=5, workers=1), range(2)))
     assert fingerprints(tmp_path) == fingerprints(made)
 
 
-def test_a_full_disk_is_an_error_that_can_be_mended(made, tmp_path, monkeypatch):
+def test_a_full_disk_is_an_error_and_the_next_call_continues(made, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -168,19 +168,19 @@ def test_a_full_disk_is_an_error_that_can_be_mended(made, tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     ("preset", "counts", "seed", "message"),
     [
-        (TINY, COUNTS, 6, "seed is 5, asked 6"),
-        (TINY, {**COUNTS, "train": 5}, 5, "counts.train is 4, asked 5"),
-        (dataclasses.replace(TINY, frames=31), COUNTS, 5, "preset.frames is 30, asked 31"),
+        (TINY, COUNTS, 6, "seed is 5, requested 6"),
+        (TINY, {**COUNTS, "train": 5}, 5, "counts.train is 4, requested 5"),
+        (dataclasses.replace(TINY, frames=31), COUNTS, 5, "preset.frames is 30, requested 31"),
     ],
 )
-def test_a_folder_of_other_data_is_refused(made, preset, counts, seed, message):
+def test_a_folder_with_other_data_is_refused(made, preset, counts, seed, message):
     with pytest.raises(DataError, match=f"{message}.*[Cc]hoose another folder, or delete"):
         generate(preset, made, counts, seed)
 
 
-def test_a_folder_in_the_making_of_other_data_is_refused(tmp_path, monkeypatch):
+def test_an_unfinished_folder_of_other_data_is_refused(tmp_path, monkeypatch):
     interrupted(tmp_path, monkeypatch, seed=1)
-    with pytest.raises(DataError, match="seed is 1, asked 2"):
+    with pytest.raises(DataError, match="seed is 1, requested 2"):
         generate(TINY, tmp_path, COUNTS, seed=2)
 
 
@@ -200,7 +200,7 @@ def test_a_damaged_part_is_named(tmp_path, monkeypatch):
     assert not (tmp_path / "train.h5").exists()
 
 
-def test_a_split_of_none_gets_no_file(tmp_path):
+def test_no_file_for_an_empty_split(tmp_path):
     generate(TINY, tmp_path, {"train": 0, "valid": 1, "test": 0})
     assert [path.name for path in tmp_path.glob("*.h5")] == ["valid.h5"]
     assert len(read_metadata(tmp_path).extra["vel_std"]) == 2
@@ -213,6 +213,6 @@ IMPOSSIBLE = ({"train": 1}, {**COUNTS, "test": -1}, NONE, {**COUNTS, "more": 1},
 
 
 @pytest.mark.parametrize("counts", IMPOSSIBLE)
-def test_counts_that_cannot_be_are_refused(tmp_path, counts):
+def test_invalid_counts_are_refused(tmp_path, counts):
     with pytest.raises(ConfigError, match="train, valid, test"):
         generate(TINY, tmp_path, counts)

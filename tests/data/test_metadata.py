@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import METADATA_FILE, Metadata, read_metadata, write_metadata
+from nmpm.data.generate import preset_metadata
 from nmpm.errors import ConfigError, DataError
+from nmpm.sim import load_preset
 
 GOOD = {
     "bounds": [[0.1, 0.9], [0.1, 0.9]],
@@ -67,7 +69,7 @@ class TestMetadata:
         write_metadata(folder, metadata)
         assert read_metadata(folder) == metadata
 
-    def test_family_where_the_file_is_silent(self, write_keys):
+    def test_family_where_the_file_does_not_name_types(self, write_keys):
         folder = write_keys(particle_types=None)
         with pytest.raises(DataError, match=r"particle_types.*deepmind, jax-sph, lagrangebench"):
             read_metadata(folder)
@@ -76,10 +78,10 @@ class TestMetadata:
         with pytest.raises(ConfigError, match=r"'dmcf'.*deepmind, jax-sph, lagrangebench"):
             read_metadata(folder, "dmcf")
 
-    def test_the_file_knows_better_than_the_family(self, write_keys):
+    def test_the_file_overrides_the_family(self, write_keys):
         assert read_metadata(write_keys(), "lagrangebench").particle_types == {3: "boundary", 7: "goop"}
 
-    def test_lagrangebench_habits(self, write_keys):
+    def test_lagrangebench_metadata(self, write_keys):
         folder = write_keys(periodic_boundary_conditions=[True, False, True], write_every=100, sequence_length=None)
         with pytest.raises(DataError, match="'sequence_length' is missing"):
             read_metadata(folder)
@@ -143,3 +145,18 @@ class TestMetadata:
         metadata.check_types(np.array([7, 3, 7]), "here")
         with pytest.raises(DataError, match=r"here: unknown particle type 5, 9 \(known: 3 boundary, 7 goop\).*family"):
             metadata.check_types(np.array([9, 7, 5, 5]), "here")
+
+
+def test_densities_are_read_by_material_and_must_be_positive(write_keys):
+    assert read_metadata(write_keys(densities={"goop": 1000})).densities == {"goop": 1000.0}
+    for wrong in ({"goop": 0}, [1000], {"goop": "heavy"}):
+        with pytest.raises(DataError, match="densities = .* should be"):
+            read_metadata(write_keys(densities=wrong))
+
+
+def test_densities_of_a_preset_reach_the_scene_of_its_dataset(tmp_path):
+    preset = load_preset("multimaterial")
+    write_metadata(tmp_path, preset_metadata(preset))
+    metadata = read_metadata(tmp_path)
+    assert tuple(metadata.densities[name] for name in preset.scene.materials) == preset.scene.densities
+    assert len(set(preset.scene.densities)) > 1

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Trajectory
-from nmpm.data.statistics import Statistics, disagreements, first_that_moves
+from nmpm.data.statistics import MotionStatistics, find_disagreements, first_moving_particle
 from tests.conftest import made_up_metadata, made_up_trajectory
 
 
-def test_equal_those_of_all_numbers_at_once():
+def test_equal_those_computed_at_once():
     trajectories = [made_up_trajectory(12, 5), made_up_trajectory(9, 8, seed=1)]
-    statistics = Statistics(made_up_metadata())
+    statistics = MotionStatistics(made_up_metadata())
     for trajectory in trajectories:
         statistics.add(trajectory)
     steps = [np.diff(t.position.astype(np.float64), axis=0) for t in trajectories]
@@ -21,18 +21,18 @@ def test_equal_those_of_all_numbers_at_once():
     np.testing.assert_allclose(found["acc_std"], acceleration.std(0), rtol=1e-9)
 
 
-def test_obstacles_do_not_count():
-    with_walls, without = Statistics(made_up_metadata()), Statistics(made_up_metadata())
+def test_static_particles_are_excluded():
+    with_walls, without = MotionStatistics(made_up_metadata()), MotionStatistics(made_up_metadata())
     trajectory = made_up_trajectory(9, 6, statics=4)
     with_walls.add(trajectory)
     without.add(Trajectory(trajectory.position[:, :6], trajectory.particle_type[:6]))
     assert with_walls.result() == without.result()
 
 
-def test_a_step_across_a_period_is_a_short_one():
+def test_displacements_use_the_minimum_image():
     x = np.mod(0.1 + 0.3 * np.arange(8), 0.8) + 0.1
     position = np.stack([x, np.full(8, 0.5)], axis=-1)[:, None].astype(np.float32)
-    statistics = Statistics(made_up_metadata(periodic=(True, False)))
+    statistics = MotionStatistics(made_up_metadata(periodic=(True, False)))
     statistics.add(Trajectory(position, np.array([7])))
     found = statistics.result()
     assert found["vel_mean"] == pytest.approx([0.3, 0.0], abs=1e-6)
@@ -41,25 +41,25 @@ def test_a_step_across_a_period_is_a_short_one():
 
 
 def test_two_frames_have_no_acceleration():
-    statistics = Statistics(made_up_metadata())
+    statistics = MotionStatistics(made_up_metadata())
     statistics.add(made_up_trajectory(2, 3))
     assert set(statistics.result()) == {"vel_mean", "vel_std"}
 
 
-def test_only_differences_worth_a_word_are_named():
+def test_small_differences_are_ignored():
     measured = {"vel_std": [1.0, 2.0], "acc_std": [1.0, 1.0]}
-    assert disagreements(measured, {"vel_std": [1.09, 1.85], "acc_std": [1.0, 1.0]}) == []
-    (sentence,) = disagreements(measured, {"vel_std": [1.2, 2.0]})
+    assert find_disagreements(measured, {"vel_std": [1.09, 1.85], "acc_std": [1.0, 1.0]}) == []
+    (sentence,) = find_disagreements(measured, {"vel_std": [1.2, 2.0]})
     assert "vel_std = (1.2, 2); these trajectories have (1, 2)" in sentence
-    assert len(disagreements(measured, {"vel_std": [1.0]})) == 1
-    assert disagreements(measured, {"vel_std": "unknown"}) == []
+    assert len(find_disagreements(measured, {"vel_std": [1.0]})) == 1
+    assert find_disagreements(measured, {"vel_std": "unknown"}) == []
 
 
-def test_finds_the_first_that_moves():
+def test_first_moving_particle():
     position = np.zeros((4, 3, 2), np.float32)
     position[2, 2] = 0.01
     chosen = np.array([True, False, True])
     extent = ((0.0, 1.0), (0.0, 1.0))
-    assert first_that_moves(position, chosen, extent) == 2
-    assert first_that_moves(position, np.array([True, True, False]), extent) is None
-    assert first_that_moves(position, chosen, ((0.0, 100.0),) * 2) is None
+    assert first_moving_particle(position, chosen, extent) == 2
+    assert first_moving_particle(position, np.array([True, True, False]), extent) is None
+    assert first_moving_particle(position, chosen, ((0.0, 100.0),) * 2) is None

@@ -1,6 +1,6 @@
-"""Everybody's trajectories, brought into the native layout.
+"""Converts datasets of other formats into the native layout.
 
-A format is one class in one file; `FORMATS` lists them in the order in which they are tried.
+Each format is one class in one file; `FORMATS` lists them in the order in which they are detected.
 """
 
 from __future__ import annotations
@@ -8,35 +8,35 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from nmpm.data.convert.base import Format as Format
+from nmpm.data.convert.base import DatasetFormat as DatasetFormat
+from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
-from nmpm.data.convert.base import Source as Source
+from nmpm.data.convert.conversion import detect_format, find_format, write_native
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
-from nmpm.data.convert.pickles import RolloutPickle
-from nmpm.data.convert.renumber import renumbered
-from nmpm.data.convert.run import detect, named, write_source
+from nmpm.data.convert.renumbering import renumber_types
+from nmpm.data.convert.rollout_pickle import RolloutPickle
 
-FORMATS: tuple[Format, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
+FORMATS: tuple[DatasetFormat, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
 
 
-def open_source(path: Path, format_name: str | None = None, options: Options | None = None) -> Source:
+def open_dataset(path: Path, format_name: str | None = None, options: Options | None = None) -> ForeignDataset:
     """Opens a dataset of any format.
 
     Args:
         path: A file or folder.
-        format_name: Name of the format; found out when left out.
-        options: What the files leave open.
+        format_name: Name of the format; detected when left out.
+        options: Facts that the files do not state.
 
     Raises:
-        DataError: if there is nothing, of no known format, or damaged.
-        ConfigError: if there is no such format, or an option cannot be.
+        DataError: if the path is missing, of no known format, or damaged.
+        ConfigError: if there is no format of that name, or an option is invalid.
     """
-    kind = named(format_name, FORMATS) if format_name else detect(Path(path), FORMATS)
-    return kind.open(Path(path), options or Options())
+    dataset_format = find_format(format_name, FORMATS) if format_name else detect_format(Path(path), FORMATS)
+    return dataset_format.open(Path(path), options or Options())
 
 
 def convert(
@@ -46,21 +46,21 @@ def convert(
     options: Options | None = None,
     ids: Mapping[int, int] | None = None,
 ) -> tuple[str, ...]:
-    """Converts a dataset of any format into the native layout, all of it or nothing.
+    """Converts a dataset of any format into the native layout; after an error nothing is left.
 
     Args:
         source: A file or folder.
         destination: A folder that does not exist yet, or is empty.
-        format_name: Name of the source's format; found out when left out.
-        options: What the files leave open.
-        ids: New particle type ids by old ones, for whoever reads the result; those not named stay.
+        format_name: Name of the source's format; detected when left out.
+        options: Facts that the files do not state.
+        ids: New particle type ids by old ones; other ids stay.
 
     Returns:
-        What was taken for what, and what is odd, as sentences.
+        Notes on assumptions and inconsistencies, as sentences.
 
     Raises:
-        DataError: if the source is missing, damaged or of no known format, or the destination is taken.
-        ConfigError: if there is no such format, or an option cannot be.
+        DataError: if the source is missing, damaged or of no known format, or the destination exists.
+        ConfigError: if there is no format of that name, or an option is invalid.
     """
-    opened = open_source(source, format_name, options)
-    return write_source(renumbered(opened, ids) if ids else opened, destination)
+    dataset = open_dataset(source, format_name, options)
+    return write_native(renumber_types(dataset, ids) if ids else dataset, destination)

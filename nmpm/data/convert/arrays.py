@@ -1,4 +1,4 @@
-"""One's own data, from arrays in memory or from a generator."""
+"""Writes your own data, from arrays in memory or from a generator, in the native layout."""
 
 from __future__ import annotations
 
@@ -16,47 +16,48 @@ STATIC_NAME = "boundary"
 
 
 def write_trajectories(path: str | Path, trajectories: Iterable[Trajectory | np.ndarray], scene: Scene) -> None:
-    """Writes one split of a dataset of one's own, and the metadata beside it.
+    """Writes one split of a dataset, and the metadata beside it.
 
     Call it once per split, for example with "mydata/train.h5", "mydata/valid.h5" and "mydata/test.h5"; then
-    `nmpm fit --data.path mydata` trains on them. Trajectories are taken one by one, so that a generator may make them.
+    `nmpm fit --data.path mydata` trains on them. Trajectories are written one by one and can come from a
+    generator.
 
     Args:
-        path: The file to write; its name says which split it is.
-        trajectories: In each, `particle_type` i means `scene.materials[i]`, and the number after the last material,
-            `len(scene.materials)`, means particles that never move. A bare (T, N, D) array of positions, in domain
-            length, will do where there is one material and nothing else. Attributes (`gravity`, in length/s²) and
+        path: The file to write; its name states the split.
+        trajectories: In each, `particle_type` i means `scene.materials[i]`, and the id after the last material,
+            `len(scene.materials)`, means static particles. A bare (T, N, D) array of positions, in domain length,
+            suffices for a scene with one material and no obstacles. Attributes (`gravity`, in length/s²) and
             further fields are kept.
-        scene: What they are trajectories of.
+        scene: The trajectories' scene.
 
     Raises:
-        ConfigError: if the file's name is not that of a split.
-        DataError: if a trajectory does not fit the scene, or the metadata that are there say otherwise.
+        ConfigError: if the file is not named after a split.
+        DataError: if a trajectory does not fit the scene, existing metadata state another one, or writing fails.
     """
     path, metadata = Path(path), _metadata(scene)
     if path.name not in {f"{split}.h5" for split in SPLITS}:
-        raise ConfigError(f"{path}: the file should be called {', '.join(f'{s}.h5' for s in SPLITS[:-1])} or test.h5.")
+        raise ConfigError(f"{path}: the file must be named {', '.join(f'{s}.h5' for s in SPLITS[:-1])} or test.h5.")
     if (path.parent / METADATA_FILE).is_file():
         found = read_metadata(path.parent)
         if replace(found, sequence_length=1, extra={}) != replace(metadata, extra={}):
-            raise DataError(f"{path.parent / METADATA_FILE}: states another scene. Choose another folder for this one.")
+            raise DataError(f"{path.parent / METADATA_FILE}: states another scene. Choose another folder.")
         metadata = found
     lengths: list[int] = []
-    write_split(path, _checked(trajectories, scene, path, lengths))
+    write_split(path, _check_trajectories(trajectories, scene, path, lengths))
     longest = max(metadata.sequence_length, *lengths)
     write_metadata(path.parent, replace(metadata, sequence_length=longest))
 
 
-def _checked(
+def _check_trajectories(
     trajectories: Iterable[Trajectory | np.ndarray], scene: Scene, path: Path, lengths: list[int]
 ) -> Iterator[Trajectory]:
     kinds = len(scene.materials) + scene.obstacles
     low, high = np.asarray(scene.domain).T
     for index, item in enumerate(trajectories):
         where = f"{path}: trajectory {index}"
-        trajectory = item if isinstance(item, Trajectory) else _bare(item, kinds, where)
+        trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
         if trajectory.position.shape[2] != scene.dim:
-            raise DataError(f"{where} has {trajectory.position.shape[2]} axes, the scene {scene.dim}.")
+            raise DataError(f"{where} has {trajectory.position.shape[2]} axes, the scene has {scene.dim}.")
         types = np.unique(trajectory.particle_type)
         if types.min() < 0 or types.max() >= kinds:
             known = ", ".join(f"{i} {name}" for i, name in _types(scene).items())
@@ -66,18 +67,19 @@ def _checked(
             frame, particle, axis = map(int, np.argwhere(outside)[0])
             raise DataError(
                 f"{where}, frame {frame}: particle {particle} is at {trajectory.position[frame, particle].tolist()},"
-                f" outside the domain {scene.domain[axis]} of axis {axis}. Give the scene a domain that holds all."
+                f" outside the domain {scene.domain[axis]} of axis {axis}."
+                " Give the scene a domain that contains all positions."
             )
         lengths.append(len(trajectory.position))
         yield trajectory
 
 
-def _bare(position: np.ndarray, kinds: int, where: str) -> Trajectory:
+def _from_bare_array(position: np.ndarray, kinds: int, where: str) -> Trajectory:
     position = np.asarray(position)
     if kinds > 1:
-        raise DataError(f"{where} is a bare array, but the scene has {kinds} kinds of particles: give a Trajectory.")
+        raise DataError(f"{where} is a bare array, but the scene has {kinds} particle types: give a Trajectory.")
     if position.ndim != 3 or position.dtype.kind != "f":
-        raise DataError(f"{where} should be floats of shape (T, N, D); it is {position.dtype} {position.shape}.")
+        raise DataError(f"{where} must be floats of shape (T, N, D); it is {position.dtype} {position.shape}.")
     return Trajectory(position, np.zeros(position.shape[1], dtype=np.int64))
 
 

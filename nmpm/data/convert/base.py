@@ -1,4 +1,4 @@
-"""What every reader of a foreign format gives, and what it may be told."""
+"""The interface of format readers, and the options that users give them."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
 
-UNSTATED = 0
-"""For `Metadata.sequence_length`, where the files leave it open: conversion puts in what it finds."""
+UNKNOWN_LENGTH = 0
+"""`Metadata.sequence_length` where the files do not state it; the conversion sets the length that it finds."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a user says where files leave it open or are wrong; None leaves it to the files.
+    """What a user states where the files are silent or wrong; None takes what the files state.
 
     Args:
-        family: What type ids mean: "deepmind", "lagrangebench", "jax-sph".
-        types: Names of type ids, beside or instead of those of the family and the files.
-        static: Type ids that never move.
+        family: Meaning of the type ids: "deepmind", "lagrangebench", "jax-sph".
+        types: Names of type ids; they override those of the family and the files.
+        static: Type ids that do not move.
         bounds: Where particles may be, (lower, upper) per axis, in domain length.
         dt: Time between stored frames, in seconds.
         gravity: Acceleration in length/s² per axis.
-        periodic: Whether each axis wraps.
+        periodic: Whether each axis is periodic.
     """
 
     family: str | None = None
@@ -39,18 +39,18 @@ class Options:
     gravity: tuple[float, ...] | None = None
     periodic: tuple[bool, ...] | None = None
 
-    def applied(self, metadata: Metadata) -> Metadata:
-        """The metadata as the user corrects them; the family is left to whoever reads the type ids.
+    def apply_to(self, metadata: Metadata) -> Metadata:
+        """The metadata with the user's corrections; the family is applied where the type ids are read.
 
         Raises:
-            ConfigError: if a value does not fit the number of axes, or cannot be.
+            ConfigError: if a value does not match the number of axes, or is invalid.
         """
         for name in ("bounds", "gravity", "periodic"):
             value = getattr(self, name)
             if value is not None and len(value) != metadata.dim:
                 raise ConfigError(f"{name} = {value} needs one entry for each of the data's {metadata.dim} axes.")
         if self.dt is not None and not self.dt > 0:
-            raise ConfigError(f"dt = {self.dt} must be positive: the seconds between stored frames.")
+            raise ConfigError(f"dt = {self.dt} must be positive: seconds between stored frames.")
         changes: dict[str, Any] = {name: getattr(self, name) for name in ("dt", "gravity", "periodic", "static")}
         changes["static_types"] = changes.pop("static")
         if self.bounds is not None:
@@ -63,11 +63,11 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Reread(Iterable[Trajectory]):
-    """Trajectories read anew each time they are iterated over.
+class Rereadable(Iterable[Trajectory]):
+    """Trajectories that are read again in each iteration.
 
     Args:
-        start: Begins a new reading.
+        start: Starts a new iteration.
     """
 
     start: Callable[[], Iterator[Trajectory]]
@@ -76,20 +76,20 @@ class Reread(Iterable[Trajectory]):
         return self.start()
 
 
-def split_of(stem: str) -> str | None:
-    """The split that a file's name begins with: "test_sub" means test."""
+def split_name(stem: str) -> str | None:
+    """The split that a file's name begins with, or None: "test_sub" means test."""
     return next((split for split in SPLITS if stem.lower().startswith(split)), None)
 
 
 @dataclass(frozen=True)
-class Source:
-    """A foreign dataset, opened.
+class ForeignDataset:
+    """An opened dataset of another format.
 
     Args:
-        metadata: What holds for every trajectory.
-        splits: Trajectories of "train", "valid" and "test", as far as there are any; read one by one, each time anew.
-        notes: Sentences for the user: what was taken for what, and what is odd.
-        counts: Trajectories per split, where known without reading them all.
+        metadata: Facts that all trajectories share.
+        splits: Trajectories of the splits "train", "valid" and "test" that exist; read one by one, in each iteration.
+        notes: Sentences for the user, on assumptions and inconsistencies.
+        counts: Trajectories per split; None where only reading them all would tell.
     """
 
     metadata: Metadata
@@ -98,23 +98,23 @@ class Source:
     counts: Mapping[str, int | None] = field(default_factory=dict)
 
 
-class Format(abc.ABC):
-    """A foreign format; below it, one class per format."""
+class DatasetFormat(abc.ABC):
+    """Abstract reader of a format, one subclass per format."""
 
     name: ClassVar[str]
-    """By which it can be asked for."""
+    """The format's name."""
 
     summary: ClassVar[str]
-    """One line for the help."""
+    """One line for the command line's help."""
 
     @abc.abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Whether a file or folder looks like this format; cheap, and never raises."""
+        """Whether a file or folder looks like this format; cheap, raises nothing."""
 
     @abc.abstractmethod
-    def open(self, path: Path, options: Options) -> Source:
-        """A dataset of this format.
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        """Opens a dataset of this format.
 
         Raises:
-            DataError: if a file is missing, damaged or not of this format; names it.
+            DataError: if a file is missing, damaged or not of this format; names the file.
         """

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import Format, Options, Reread, Source, split_of
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
 from nmpm.errors import DataError
@@ -22,7 +22,7 @@ from nmpm.errors import DataError
 _SUFFIX = ".tfrecord"
 
 
-class DeepMind(Format):
+class DeepMind(DatasetFormat):
     """A folder of TFRecord files with a `metadata.json`, or one such file beside it."""
 
     name: ClassVar[str] = "deepmind"
@@ -31,21 +31,21 @@ class DeepMind(Format):
     def recognises(self, path: Path) -> bool:
         return any(path.glob(f"*{_SUFFIX}")) if path.is_dir() else path.suffix == _SUFFIX and path.is_file()
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
         family = options.family or "deepmind"
         folder = next(iter(files.values())).parent
-        metadata = options.applied(read_metadata(folder, family))
+        metadata = options.apply_to(read_metadata(folder, family))
         offsets = {split: record_offsets(file) for split, file in files.items()}
         for split, file in files.items():
             if not offsets[split]:
-                raise DataError(f"{file}: the file holds no record.")
-        return Source(
+                raise DataError(f"{file}: the file has no record.")
+        return ForeignDataset(
             metadata=metadata,
-            splits={s: Reread(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
-            notes=(f"Particle types are read after the {family} family.", *_naming(files)),
+            splits={s: Rereadable(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
+            notes=(f"Particle types have the meaning of the {family} family.", *_naming(files)),
             counts={split: len(found) for split, found in offsets.items()},
         )
 
@@ -53,13 +53,15 @@ class DeepMind(Format):
 def _files(path: Path) -> dict[str, Path]:
     """The TFRecord of each split."""
     found = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path] * (path.suffix == _SUFFIX and path.is_file())
-    named = {split: [file for file in found if split_of(file.stem) == split] for split in SPLITS}
-    for split, files in named.items():
+    by_split = {split: [file for file in found if split_name(file.stem) == split] for split in SPLITS}
+    for split, files in by_split.items():
         if len(files) > 1:
-            raise DataError(f"{path}: {', '.join(f.name for f in files)} all mean {split}; give one of the files.")
-    if len(found) == 1 and not any(named.values()):
-        named["test"] = found
-    return {split: files[0] for split, files in named.items() if files}
+            raise DataError(
+                f"{path}: {', '.join(f.name for f in files)} all belong to the split {split}; give one of the files."
+            )
+    if len(found) == 1 and not any(by_split.values()):
+        by_split["test"] = found
+    return {split: files[0] for split, files in by_split.items() if files}
 
 
 def _naming(files: dict[str, Path]) -> list[str]:
@@ -102,12 +104,14 @@ def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
 
 
 def _numbers(feature: Feature, kind: np.dtype[Any], where: str) -> np.ndarray:
-    """A feature's numbers: as they are, or out of the one string that holds them."""
+    """A feature's numbers, which may be packed into one string."""
     if isinstance(feature, np.ndarray):
         return feature
     if len(feature) != 1 or len(feature[0]) % kind.itemsize:
         sizes = [len(part) for part in feature]
-        raise DataError(f"{where}: one string of {kind.itemsize}-byte numbers is due; found strings of {sizes} bytes.")
+        raise DataError(
+            f"{where}: expected one string of {kind.itemsize}-byte numbers; found strings of {sizes} bytes."
+        )
     return np.frombuffer(feature[0], kind)
 
 
@@ -118,11 +122,11 @@ def _attribute(feature: Feature) -> object:
 
 
 def _field(steps: list[Feature], particles: int, dim: int, where: str) -> np.ndarray:
-    """(T, k) numbers per frame; (T, N, D) where they are as many as a position's."""
+    """(T, k) numbers per frame; (T, N, D) where k is N·D."""
     rows = [_numbers(step, np.dtype("<f4"), where) for step in steps]
     if len({len(row) for row in rows}) > 1:
         raise DataError(
-            f"{where}: frames hold {min(map(len, rows))} to {max(map(len, rows))} numbers; all need as many."
+            f"{where}: frames have {min(map(len, rows))} to {max(map(len, rows))} numbers; all need equally many."
         )
     values = np.stack(rows) if rows else np.empty((0, 0), np.float32)
     return values.reshape(len(values), particles, dim) if values.shape[1] == particles * dim else values

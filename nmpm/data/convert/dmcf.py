@@ -3,7 +3,7 @@
 Prantl et al., "Guaranteed conservation of momentum for learning particle-based fluid dynamics", 2022.
 
 A file is one trajectory: a MessagePack array of maps with `pos` and `vel` (N, D), in the first also `box` and
-`box_normals` (M, D), the solid around. The y axis is upright.
+`box_normals` (M, D), the solid boundary. The y axis points up.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import UNSTATED, Format, Options, Reread, Source, split_of
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import ConfigError, DataError
 
 _SUFFIX = ".msgpack.zst"
@@ -26,8 +27,8 @@ _DT, _GRAVITY = 0.02, -9.81
 _MOST_BYTES = 2**31  # of one frame
 
 
-class Dmcf(Format):
-    """A file, a folder of files, or folders train, valid and test of them."""
+class Dmcf(DatasetFormat):
+    """One file, a folder of files, or folders train, valid and test with files."""
 
     name: ClassVar[str] = "dmcf"
     summary: ClassVar[str] = "DMCF's *.msgpack.zst files (needs the extra: pip install nmpm[convert])"
@@ -35,20 +36,20 @@ class Dmcf(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_files(path))
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no *{_SUFFIX} file there.")
         family = options.family or "lagrangebench"
         sample = next(iter(files.values()))[0]
         first = next(_frames(sample), {})
-        return Source(
-            metadata=options.applied(_metadata(first, find_family(family).types, options, sample)),
-            splits={split: Reread(partial(_trajectories, found)) for split, found in files.items()},
+        return ForeignDataset(
+            metadata=options.apply_to(_metadata(first, find_family(family).types, options, sample)),
+            splits={split: Rereadable(partial(_trajectories, found)) for split, found in files.items()},
             notes=(
-                f"The fluid becomes particle type {_FLUID}, the solid around it type {_WALL} ({family} family).",
-                *(() if options.dt else (f"The files do not state dt; {_DT:g} s was taken (--dt).",)),
-                *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y was taken.",)),
+                f"The fluid becomes particle type {_FLUID}, the solid boundary type {_WALL} ({family} family).",
+                *(() if options.dt else (f"The files do not state dt; {_DT:g} s is assumed (--dt).",)),
+                *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
             ),
             counts={split: len(found) for split, found in files.items()},
         )
@@ -56,7 +57,7 @@ class Dmcf(Format):
 
 def _files(path: Path) -> dict[str, tuple[Path, ...]]:
     if path.is_file():
-        return {split_of(path.name) or "test": (path,)} if path.name.endswith(_SUFFIX) else {}
+        return {split_name(path.name) or "test": (path,)} if path.name.endswith(_SUFFIX) else {}
     folders = {split: sorted((path / split).glob(f"*{_SUFFIX}")) for split in SPLITS}
     if not any(folders.values()):
         folders = {"test": sorted(path.glob(f"*{_SUFFIX}"))}
@@ -64,36 +65,37 @@ def _files(path: Path) -> dict[str, tuple[Path, ...]]:
 
 
 def _frames(path: Path) -> Iterator[dict[str, Any]]:
-    """The frames of a file, one at a time; whatever fails within names the file."""
+    """Yields the frames of a file; errors name the file."""
     try:
         import msgpack
         import zstandard
     except ImportError as error:
         raise ConfigError(f"{path}: reading it needs more packages: pip install 'nmpm[convert]'.") from error
+    check_regular(path)
     try:
         with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
             reader = msgpack.Unpacker(stream, raw=True, max_buffer_size=_MOST_BYTES)
             for index in range(reader.read_array_header()):
-                yield _decoded(reader.unpack(), f"{path}, frame {index}")
+                yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
     except (zstandard.ZstdError, msgpack.UnpackException, ValueError, OSError, RecursionError, MemoryError) as error:
         reason = str(error)[:200] or type(error).__name__
         raise DataError(f"{path}: cannot be read ({reason}). Is it complete? Copy or download it again.") from error
 
 
-def _decoded(frame: Any, where: str) -> dict[str, Any]:
+def _decode_frame(frame: Any, where: str) -> dict[str, Any]:
     if not isinstance(frame, dict) or not all(isinstance(key, bytes) for key in frame):
-        raise DataError(f"{where}: a map with names is due, found {type(frame).__name__}.")
+        raise DataError(f"{where}: expected a map with names, found {type(frame).__name__}.")
     return {key.decode("utf-8", "replace"): _value(value, f"{where}, {key!r}") for key, value in frame.items()}
 
 
 def _value(value: Any, where: str) -> Any:
-    """An array out of the map that msgpack-numpy makes of it; anything else as it is."""
+    """Decodes an array from msgpack-numpy's map; other values stay."""
     if not isinstance(value, dict) or b"nd" not in value:
         return value
     try:
         kind = np.dtype(bytes(value[b"type"]).decode("ascii"))
         if kind.kind not in "biuf":
-            raise ValueError(f"numbers are due, found {kind}")
+            raise ValueError(f"expected numbers, found {kind}")
         flat = np.frombuffer(value[b"data"], kind)
         return flat.reshape([int(side) for side in value[b"shape"]]) if value[b"nd"] else flat.reshape(())
     except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:
@@ -109,7 +111,7 @@ def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -
         bounds=bounds,
         dt=options.dt or _DT,
         dim=dim,
-        sequence_length=UNSTATED,
+        sequence_length=UNKNOWN_LENGTH,
         particle_types=dict(types),
         static_types=frozenset({_WALL}),
         gravity=tuple(_GRAVITY if axis == 1 else 0.0 for axis in range(dim)),
@@ -119,12 +121,12 @@ def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -
 def _array(frame: dict[str, Any], name: str, where: str) -> np.ndarray:
     found = frame.get(name)
     if not isinstance(found, np.ndarray) or found.ndim != 2 or 0 in found.shape or found.dtype.kind != "f":
-        raise DataError(f"{where}: {name!r} should be floats of shape (N, D).")
+        raise DataError(f"{where}: {name!r} must be floats of shape (N, D).")
     return found
 
 
 def _wall(first: dict[str, Any], dim: int, path: Path) -> np.ndarray:
-    """The solid around, (M, D); M = 0 where the first frame has none."""
+    """The solid boundary, (M, D); M = 0 where the first frame has none."""
     if "box" not in first:
         return np.empty((0, dim), np.float32)
     wall = _array(first, "box", f"{path}, frame 0")
@@ -137,17 +139,17 @@ def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
     for path in files:
         frames = list(_frames(path))
         if not frames:
-            raise DataError(f"{path}: the file holds no frame.")
+            raise DataError(f"{path}: the file has no frame.")
         yield _trajectory(frames, path)
 
 
 def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
     positions = [_array(frame, "pos", f"{path}, frame {index}") for index, frame in enumerate(frames)]
-    odd = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
-    if odd:
+    changed = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
+    if changed:
         raise DataError(
-            f"{path}, frame {odd[0]}: {positions[odd[0]].shape[0]} particles, {positions[0].shape[0]} at the start."
-            " Particles that appear or vanish cannot be represented; cut the trajectory where their number changes."
+            f"{path}, frame {changed[0]}: {positions[changed[0]].shape[0]} particles, but {positions[0].shape[0]}"
+            " in frame 0. A trajectory has a fixed number of particles; cut it where the number changes."
         )
     fluid, first = np.stack(positions), frames[0]
     wall = _wall(first, fluid.shape[2], path)
@@ -169,7 +171,7 @@ def _attributes(first: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """What frames hold beside positions: (T, …) where all have it in one shape, else that of the first frame."""
+    """Arrays beside the positions: (T, …) where all frames have one of equal shape, else that of the first frame."""
     fields = {}
     for key, value in frames[0].items():
         if key in ("pos", "box") or not isinstance(value, np.ndarray):

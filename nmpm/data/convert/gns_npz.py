@@ -2,7 +2,7 @@
 
 Members are named `simulation_trajectory_0` or `simulation_0`, and so on; each holds (positions (T, N, D), one type or
 (N,) types) and in some datasets a material property, one or (N,). Newer files hold one member, `gns_data`, with a row
-per trajectory. NumPy stores objects as a pickle, which is read by the restricted reader of `pickles`.
+per trajectory. NumPy stores objects as a pickle, which is read by the restricted unpickler.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.archives import DAMAGED_NPZ
-from nmpm.data.convert.base import Format, Options, Reread, Source, split_of
-from nmpm.data.convert.pickles import load_pickled, numbers
+from nmpm.data.archive_errors import NPZ_ERRORS
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
+from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
 _SUFFIX = ".npz"
 _ALL = "gns_data"
 
 
-class GnsNpz(Format):
+class GnsNpz(DatasetFormat):
     """A folder of train.npz, valid.npz, test.npz with a `metadata.json`, or one such file beside it."""
 
     name: ClassVar[str] = "gns-npz"
@@ -35,36 +36,37 @@ class GnsNpz(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_found(path)) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
 
-    def open(self, path: Path, options: Options) -> Source:
-        files = {split_of(file.stem) or "test": file for file in reversed(_found(path))}
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        files = {split_name(file.stem) or "test": file for file in reversed(_found(path))}
         if not files:
             raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
         family = options.family or "deepmind"
-        metadata = options.applied(read_metadata(next(iter(files.values())).parent, family))
+        metadata = options.apply_to(read_metadata(next(iter(files.values())).parent, family))
         members = {split: _members(files[split]) for split in SPLITS if split in files}
-        return Source(
+        return ForeignDataset(
             metadata=metadata,
-            splits={split: Reread(partial(_trajectories, files[split], names)) for split, names in members.items()},
-            notes=(f"Particle types are read after the {family} family.",),
+            splits={split: Rereadable(partial(_trajectories, files[split], names)) for split, names in members.items()},
+            notes=(f"Particle types have the meaning of the {family} family.",),
             counts={split: None if names == (_ALL,) else len(names) for split, names in members.items()},
         )
 
 
 def _found(path: Path) -> list[Path]:
     if path.is_dir():
-        return [file for split in SPLITS if (file := path / f"{split}{_SUFFIX}").is_file()]
+        return [file for split in SPLITS if (file := path / f"{split}{_SUFFIX}").exists()]
     return [path] if path.suffix == _SUFFIX and path.is_file() else []
 
 
 def _members(path: Path) -> tuple[str, ...]:
-    """Names of the trajectories, those with numbers in order of the numbers."""
+    """Names of the members, ordered by the numbers in them."""
+    check_regular(path)
     try:
         with zipfile.ZipFile(path) as file:
             names = [name.removesuffix(".npy") for name in file.namelist() if name.endswith(".npy")]
-    except DAMAGED_NPZ as error:
+    except NPZ_ERRORS as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
     if not names:
-        raise DataError(f"{path}: the file holds no array.")
+        raise DataError(f"{path}: the file has no array.")
     return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d+", name)]))
 
 
@@ -78,18 +80,18 @@ def _trajectories(path: Path, names: tuple[str, ...]) -> Iterator[Trajectory]:
 
 
 def _array(path: Path, name: str) -> Any:
-    """The content of a member, unpickled by the restricted reader where it holds objects."""
+    """The content of a member; objects are read by the restricted unpickler."""
     where = f"{path}: {name}"
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
             shape, fortran, kind = _header(file)
             data = file.read()
-    except DAMAGED_NPZ as error:
+    except NPZ_ERRORS as error:
         raise DataError(f"{where}: cannot be read ({str(error)[:200]}). Copy or download the file again.") from error
     if kind.hasobject:
         return load_pickled(data, where)
     if len(data) != int(np.prod(shape)) * kind.itemsize:
-        raise DataError(f"{where}: holds {len(data)} bytes, not an array of {kind} and shape {shape}.")
+        raise DataError(f"{where}: has {len(data)} bytes, not those of an array of {kind} and shape {shape}.")
     return np.frombuffer(data, kind).reshape(shape, order="F" if fortran else "C")
 
 
@@ -103,10 +105,12 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 def _trajectory(row: Any, where: str) -> Trajectory:
     parts: list[Any] = [*row] if isinstance(row, np.ndarray | list | tuple) else []
     if len(parts) not in (2, 3):
-        raise DataError(f"{where}: (positions, types) are due, perhaps with a property; found {len(parts)} parts.")
-    position = numbers(parts[0], f"{where}: positions")
+        raise DataError(
+            f"{where}: expected (positions, types) or (positions, types, property); found {len(parts)} parts."
+        )
+    position = number_array(parts[0], f"{where}: positions")
     if position.ndim != 3:
-        raise DataError(f"{where}: positions should have the shape (T, N, D); they have {position.shape}.")
+        raise DataError(f"{where}: positions must have the shape (T, N, D); they have {position.shape}.")
     types = _per_particle(parts[1], position.shape[1], f"{where}: types").astype(np.int64)
     fields = {}
     if len(parts) == 3:
@@ -118,8 +122,10 @@ def _trajectory(row: Any, where: str) -> Trajectory:
 
 
 def _per_particle(value: Any, particles: int, where: str) -> np.ndarray:
-    """(N,) numbers: one each, or one for all."""
-    found = numbers(value, where)
+    """(N,) numbers, from one per particle or one for all."""
+    found = number_array(value, where)
     if found.size not in (1, particles) or found.ndim > 1:
-        raise DataError(f"{where}: one number, or one for each of {particles} particles is due; shape {found.shape}.")
+        raise DataError(
+            f"{where}: expected one number, or one for each of {particles} particles; found shape {found.shape}."
+        )
     return np.broadcast_to(found.reshape(-1), particles).copy()

@@ -1,4 +1,4 @@
-"""Our own layout, which LagrangeBench shares: read like the others, to bring what the user states into its metadata."""
+"""The native layout, which LagrangeBench shares; converting it writes the user's options into its metadata."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from nmpm.data.convert.base import Format, Options, Reread, Source
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.format import METADATA_FILE, Split, Trajectory, read_metadata, split_paths
 
 
-class Native(Format):
+class Native(DatasetFormat):
     """A folder of train.h5, valid.h5, test.h5 with a `metadata.json`."""
 
     name: ClassVar[str] = "native"
@@ -20,17 +20,19 @@ class Native(Format):
     def recognises(self, path: Path) -> bool:
         return (path / METADATA_FILE).is_file() and bool(split_paths(path))
 
-    def open(self, path: Path, options: Options) -> Source:
-        metadata = options.applied(read_metadata(path, options.family))
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        metadata = options.apply_to(read_metadata(path, options.family))
         splits = {name: Split(file) for name, file in split_paths(path).items()}
-        family = f"Particle types are read after the {options.family} family, where {METADATA_FILE} does not name them."
-        return Source(
+        family = (
+            f"Particle types have the meaning of the {options.family} family where {METADATA_FILE} does not name them."
+        )
+        return ForeignDataset(
             metadata=metadata,
-            splits={name: Reread(partial(_trajectories, split)) for name, split in splits.items()},
+            splits={name: Rereadable(partial(_trajectories, split)) for name, split in splits.items()},
             notes=(family,) if options.family else (),
             counts={name: len(split) for name, split in splits.items()},
         )
 
 
 def _trajectories(split: Split) -> Iterator[Trajectory]:
-    return map(split.whole, range(len(split)))
+    return map(split.read_with_fields, range(len(split)))

@@ -1,8 +1,8 @@
 """NeuralMPM's datasets: a folder per split, a file `sim_*.h5` per trajectory.
 
 Each file holds `particles` (T, N, D), `boundary` (T, M, D) and, where there are several materials, `types` (N,) or
-(M + N,), the boundary's first; anything else, such as `grav`, is per trajectory. Nothing says how far frames are apart
-or where the walls are: for the published datasets (Rochman-Sharabi, Lewin, Louppe, 2025) a table does, by name.
+(M + N,), the boundary's first; anything else, such as `grav`, is per trajectory. The files state neither
+the time between frames nor the walls: for the published datasets (Rochman-Sharabi, Lewin, Louppe, 2025) a table does.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
-from nmpm.data.convert.base import UNSTATED, Format, Options, Reread, Source
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.families import find_family
-from nmpm.data.format import SPLITS, Metadata, Trajectory, opened
-from nmpm.data.statistics import first_that_moves
+from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.hdf5 import check_self_contained, open_hdf5
+from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
@@ -30,7 +31,7 @@ _GRAVITY = "grav"
 
 @dataclass(frozen=True)
 class _Published:
-    """What is known of a dataset: its one material (None: the files have types), box, and seconds between frames."""
+    """Facts about a published dataset: its only material (None: the files have types), box, seconds between frames."""
 
     material: int | None
     domain: tuple[Interval, ...]
@@ -52,8 +53,8 @@ _PUBLISHED = {
 }
 
 
-class NeuralMpm(Format):
-    """A folder of train, valid and test folders with `sim_*.h5` files, or one of these."""
+class NeuralMpm(DatasetFormat):
+    """A folder with folders train, valid and test of `sim_*.h5` files, or one of these."""
 
     name: ClassVar[str] = "neuralmpm"
     summary: ClassVar[str] = "NeuralMPM's folders of sim_*.h5 files, also from the hub's iSach/NeuralMPM"
@@ -61,25 +62,25 @@ class NeuralMpm(Format):
     def recognises(self, path: Path) -> bool:
         return bool(_files(path))
 
-    def open(self, path: Path, options: Options) -> Source:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no train, valid or test folder with sim_*.h5 files there.")
         known = _PUBLISHED.get(path.resolve().name.lower())
         first = next(_trajectories(next(iter(files.values()))[:1], known.material if known else None))
-        metadata = options.applied(_metadata(path, known, first, options))
+        metadata = options.apply_to(_metadata(path, known, first, options))
         material = known.material if known else _only_material(options, path, files)
         family = options.family or "deepmind"
-        return Source(
+        return ForeignDataset(
             metadata=metadata,
-            splits={split: Reread(partial(_trajectories, found, material)) for split, found in files.items()},
-            notes=(*_notes(path, known, first, metadata), f"Particle types are numbered after the {family} family."),
+            splits={split: Rereadable(partial(_trajectories, found, material)) for split, found in files.items()},
+            notes=(*_notes(path, known, first, metadata), f"Particle types have the ids of the {family} family."),
             counts={split: len(found) for split, found in files.items()},
         )
 
 
 def _files(path: Path) -> dict[str, tuple[Path, ...]]:
-    """The files of each split, in order of their numbers."""
+    """The files of each split, ordered by the numbers in their names."""
     folders = {split: path / split for split in SPLITS}
     if path.is_dir() and path.name in SPLITS and any(path.glob("sim_*.h5")):
         folders = {path.name: path}
@@ -97,8 +98,8 @@ def _metadata(path: Path, known: _Published | None, first: Trajectory, options: 
     dim = first.position.shape[2]
     if known is None and options.dt is None:
         raise DataError(
-            f"{path}: the files do not say how far frames are apart, and no published dataset is called"
-            f" {path.resolve().name!r} ({', '.join(_PUBLISHED)}). Give --dt, and --gravity and --bounds where"
+            f"{path}: the files do not state the time between frames, and no published dataset is called"
+            f" {path.resolve().name!r} ({', '.join(_PUBLISHED)}). Give --dt, and --gravity and --bounds if"
             " you know them."
         )
     low, high = first.position.min(axis=(0, 1)), first.position.max(axis=(0, 1))
@@ -107,7 +108,7 @@ def _metadata(path: Path, known: _Published | None, first: Trajectory, options: 
         bounds=known.domain if known and len(known.domain) == dim else observed,
         dt=known.dt if known else options.dt or 1.0,
         dim=dim,
-        sequence_length=UNSTATED,
+        sequence_length=UNKNOWN_LENGTH,
         particle_types=dict(family.types),
         static_types=frozenset({_BOUNDARY}),
         gravity=known.gravity if known and known.gravity and len(known.gravity) == dim else None,
@@ -118,40 +119,41 @@ def _notes(path: Path, known: _Published | None, first: Trajectory, metadata: Me
     notes = []
     if known is not None:
         notes.append(
-            f"Taken for the published {path.resolve().name}: dt {metadata.dt:g}, bounds {metadata.bounds}, gravity"
-            f" {metadata.gravity or 'as each file states'}."
+            f"Recognised as the published {path.resolve().name}: dt {metadata.dt:g}, bounds {metadata.bounds}, gravity"
+            f" {metadata.gravity or 'as stated in each file'}."
         )
     else:
         notes.append("Bounds are the extent of the first trajectory; give --bounds if you know them.")
     wall = first.particle_type == _BOUNDARY
-    if first_that_moves(first.position, wall, metadata.bounds) is not None:
+    if first_moving_particle(first.position, wall, metadata.bounds) is not None:
         notes.append("The boundary moves in the first trajectory.")
     if _GRAVITY in first.fields:
-        notes.append("`grav` is kept as a field as it is, and taken as gravity in length/s² where it has D numbers.")
+        notes.append("`grav` is kept as a field, and used as gravity in length/s² where it has D numbers.")
     return notes
 
 
 def _only_material(options: Options, path: Path, files: dict[str, tuple[Path, ...]]) -> int | None:
-    """The type of all particles where the files have none: the only one that the user names."""
-    with opened(next(iter(files.values()))[0]) as file:
+    """The type of all particles where the files have no types: the only one that the user names."""
+    with open_hdf5(next(iter(files.values()))[0]) as file:
         if "types" in file:
             return None
-    named = [i for i in options.types or {} if i != _BOUNDARY]
-    if len(named) != 1:
-        raise DataError(f"{path}: the files do not say what their particles are. Name it: --types 5=water.")
-    return named[0]
+    stated = [i for i in options.types or {} if i != _BOUNDARY]
+    if len(stated) != 1:
+        raise DataError(f"{path}: the files do not state the particles' material. State it: --types 5=water.")
+    return stated[0]
 
 
 def _trajectories(files: tuple[Path, ...], material: int | None) -> Iterator[Trajectory]:
     for path in files:
-        with opened(path) as file:
+        with open_hdf5(path) as file:
+            check_self_contained(file, path)
             content = {name: _values(file, name, path) for name in file}
         yield _trajectory(content, material, path)
 
 
 def _values(file: Any, name: str, path: Path) -> np.ndarray:
     if not isinstance(file[name], h5py.Dataset) or file[name].dtype.kind not in "biuf":
-        raise DataError(f"{path}: {name} should be an array of numbers.")
+        raise DataError(f"{path}: {name} must be an array of numbers.")
     return np.asarray(file[name][()])
 
 
@@ -161,11 +163,11 @@ def _trajectory(content: dict[str, np.ndarray], material: int | None, path: Path
     if wall.ndim == 2:
         wall = np.broadcast_to(wall, (frames, *wall.shape))
     if wall.shape[0] != frames or wall.shape[2] != dim:
-        raise DataError(f"{path}: particles {moving.shape} and boundary {wall.shape} do not fit together.")
+        raise DataError(f"{path}: particles {moving.shape} and boundary {wall.shape} do not match.")
     types = content.pop("types", np.full(particles, -1 if material is None else material))
     if types.ndim != 1 or len(types) not in (particles, particles + wall.shape[1]):
         raise DataError(
-            f"{path}: types {types.shape} fit neither {particles} particles nor these and all of the boundary."
+            f"{path}: types {types.shape} match neither {particles} particles nor particles and boundary together."
         )
     kinds = np.concatenate([types[-particles:], np.full(wall.shape[1], _BOUNDARY)]).astype(np.int64)
     gravity = content[_GRAVITY].astype(np.float64) if _GRAVITY in content else np.empty(0)
@@ -177,9 +179,9 @@ def _trajectory(content: dict[str, np.ndarray], material: int | None, path: Path
 
 
 def _positions(content: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray:
-    """Takes positions out of a file's content."""
+    """Removes an array of positions from a file's content and validates it."""
     array = content.pop(name, None)
     if array is None or array.dtype.kind != "f" or array.ndim not in ((3,) if name == "particles" else (2, 3)):
         found = "is missing" if array is None else f"is {array.dtype} of shape {array.shape}"
-        raise DataError(f"{path}: {name!r} {found}; floats of shape (T, N, D) are due.")
+        raise DataError(f"{path}: {name!r} {found}; expected floats of shape (T, N, D).")
     return array

@@ -2,7 +2,7 @@
 
 A record is its length (uint64), the length's checksum (uint32), the payload and the payload's checksum, little endian.
 Checksums are CRC-32C (RFC 3720, appendix B.4), rotated and shifted as TFRecord's format asks. A payload is a protocol
-buffer; of its wire format only what the messages of `tensorflow/core/example/example.proto` need is read here.
+buffer; of its wire format only the parts that `tensorflow/core/example/example.proto` uses are supported.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
 _MASK_DELTA = 0xA282EAD8
-_LARGEST = 2**33  # bytes of a record; whatever claims more is damaged
+_LARGEST = 2**33  # bytes of a record; a larger length means damage
 _BYTES, _FLOATS, _INTEGERS = 1, 2, 3  # fields of `Feature`
 
 Feature = list[bytes] | NDArray[np.float32] | NDArray[np.int64]
@@ -40,11 +41,12 @@ class SequenceExample:
 
 
 def record_offsets(path: Path) -> list[int]:
-    """Where the records of a file begin; the lengths are checked, the payloads are skipped.
+    """Byte offsets of the records of a file; lengths are checked, payloads are skipped.
 
     Raises:
         DataError: if the file is cut off or a length is damaged.
     """
+    check_regular(path)
     size = path.stat().st_size
     offsets: list[int] = []
     with path.open("rb") as file:
@@ -52,22 +54,22 @@ def record_offsets(path: Path) -> list[int]:
             offset = file.tell()
             length = _length(file, path, len(offsets), offset)
             if offset + 12 + length + 4 > size:
-                raise _damaged(path, len(offsets), offset, "the file ends within it")
+                raise _damage_error(path, len(offsets), offset, "the file ends within it")
             offsets.append(offset)
             file.seek(length + 4, 1)
     return offsets
 
 
 def read_record(path: Path, offset: int, index: int) -> SequenceExample:
-    """The record that begins at an offset.
+    """Reads the record at an offset.
 
     Args:
         path: The file.
         offset: From `record_offsets`.
-        index: Number of the record, for messages.
+        index: Index of the record, for error messages.
 
     Raises:
-        DataError: if the record is damaged or holds something else.
+        DataError: if the record is damaged or not a SequenceExample.
     """
     with path.open("rb") as file:
         file.seek(offset)
@@ -75,13 +77,13 @@ def read_record(path: Path, offset: int, index: int) -> SequenceExample:
         payload = file.read(length)
         checksum = file.read(4)
     if len(payload) < length or len(checksum) < 4:
-        raise _damaged(path, index, offset, "the file ends within it")
+        raise _damage_error(path, index, offset, "the file ends within it")
     if masked_crc(payload) != struct.unpack("<I", checksum)[0]:
-        raise _damaged(path, index, offset, "its checksum does not fit its content")
+        raise _damage_error(path, index, offset, "its checksum does not match its content")
     try:
         return _sequence_example(payload)
     except (ValueError, IndexError, struct.error) as error:
-        raise _damaged(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
+        raise _damage_error(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
 
 
 def masked_crc(data: bytes) -> int:
@@ -95,14 +97,14 @@ def crc32c(data: bytes) -> int:
     return int(_crc32c(np.frombuffer(data, np.uint8), _TABLE)) ^ 0xFFFFFFFF
 
 
-def _table() -> NDArray[np.uint32]:
+def _make_table() -> NDArray[np.uint32]:
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, np.uint32(0x82F63B78) ^ (table >> 1), table >> 1)
     return table.astype(np.uint32)
 
 
-_TABLE = _table()
+_TABLE = _make_table()
 
 
 def _crc_loop(data: NDArray[np.uint8], table: NDArray[np.uint32]) -> np.uint32:
@@ -118,14 +120,14 @@ _crc32c = numba.njit(cache=True, nogil=True)(_crc_loop)
 def _length(file: BinaryIO, path: Path, index: int, offset: int) -> int:
     header = file.read(12)
     if len(header) < 12:
-        raise _damaged(path, index, offset, "the file ends within its header")
+        raise _damage_error(path, index, offset, "the file ends within its header")
     length, checksum = struct.unpack("<QI", header)
     if masked_crc(header[:8]) != checksum or length > _LARGEST:
-        raise _damaged(path, index, offset, "the checksum of its length does not fit")
+        raise _damage_error(path, index, offset, "the checksum of its length does not match")
     return int(length)
 
 
-def _damaged(path: Path, index: int, offset: int, why: str) -> DataError:
+def _damage_error(path: Path, index: int, offset: int, why: str) -> DataError:
     return DataError(
         f"{path}: record {index}, at byte {offset}, cannot be read: {why}. Is it a complete TFRecord? Copy or"
         " download it again."
@@ -166,7 +168,7 @@ def _feature(message: bytes) -> Feature:
 
 
 def _integers(value: int | bytes) -> Iterator[int]:
-    """One number, or several packed into bytes; 64 bits in two's complement."""
+    """Yields one integer, or several packed into bytes; 64 bits in two's complement."""
     place = 0
     while isinstance(value, bytes) and place < len(value):
         number, place = _varint(value, place)
@@ -176,7 +178,7 @@ def _integers(value: int | bytes) -> Iterator[int]:
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Number and value of each field: an integer, or bytes for what has a length or a fixed width."""
+    """Yields number and value of each field: an integer, or bytes where it has a length or a fixed width."""
     place = 0
     while place < len(message):
         key, place = _varint(message, place)
@@ -206,10 +208,10 @@ def _varint(message: bytes, place: int) -> tuple[int, int]:
         if byte < 0x80:
             return value & 0xFFFFFFFFFFFFFFFF, place
         if shift > 63:
-            raise ValueError("a number that is too long")
+            raise ValueError("a varint that is too long")
 
 
 def _bytes(value: int | bytes) -> bytes:
     if not isinstance(value, bytes):
-        raise ValueError("a number where bytes are due")
+        raise ValueError("an integer instead of bytes")
     return value

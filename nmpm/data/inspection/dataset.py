@@ -1,4 +1,4 @@
-"""Puts an inspection together."""
+"""Inspects a dataset."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nmpm.data.format import Metadata, Split, split_paths
+from nmpm.data.inspection.anomalies import find_anomalies
 from nmpm.data.inspection.facts import Inspection, Range, SplitFacts
-from nmpm.data.inspection.oddities import oddities
 from nmpm.data.inspection.survey import Survey
-from nmpm.data.origins import Folder
-from nmpm.data.progress import shown
-from nmpm.data.statistics import disagreements
+from nmpm.data.loading.sources import FolderSource
+from nmpm.data.progress import progress_bar
+from nmpm.data.statistics import find_disagreements
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
-_BYTES = 2**28  # of positions per split that are looked at unless more are asked for
+_BYTES = 2**28  # of positions per split that are read by default
 _MOST_FINDINGS = 12
 
 
 @dataclass
 class _Tally:
-    """What the files say about their trajectories, without the positions."""
+    """Sizes, materials and gravities of all trajectories, read without their positions."""
 
     frames: dict[str, list[int]] = field(default_factory=dict)
     moving: dict[str, list[int]] = field(default_factory=dict)
@@ -33,15 +33,15 @@ class _Tally:
     gravities: set[tuple[float, ...] | None] = field(default_factory=set)
 
 
-def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
-    """Looks at a dataset, with a progress bar.
+def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection:
+    """Inspects a dataset, with a progress bar.
 
     Args:
-        origin: The dataset, and what is known beside its files.
-        trajectories: Of each split to look at in full, evenly spread; about 256 MiB of positions when left out.
+        origin: The dataset, and what the user states about it.
+        trajectories: Number of evenly spaced trajectories of each split to read; about 256 MiB when left out.
 
     Raises:
-        DataError: if there is no dataset, or nothing of it can be read.
+        DataError: if there is no dataset, or no trajectory can be read.
     """
     metadata = origin.metadata
     findings: list[str] = []
@@ -56,22 +56,22 @@ def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
     tally = _tally(splits, metadata)
     domain = scene.domain if scene else metadata.domain or metadata.bounds
     survey = Survey(metadata, domain)
-    chosen = {name: _chosen(split, trajectories) for name, split in splits.items()}
+    chosen = {name: _spread_evenly(split, trajectories) for name, split in splits.items()}
     spacing = _spacing(splits, chosen, metadata)
     fields: dict[str, tuple[int, ...]] = {}
-    with shown("Inspecting", sum(map(len, chosen.values()))) as advance:
+    with progress_bar("Inspecting", sum(map(len, chosen.values()))) as advance:
         for where, split, index in _each(splits, chosen):
             try:
                 trajectory = split.read(index)
                 fields = fields or {key: values.shape for key, values in split.fields(index).items()}
-                findings += oddities(trajectory, metadata, spacing, where)
+                findings += find_anomalies(trajectory, metadata, spacing, where)
                 survey.add(trajectory)
             except DataError as error:
                 findings.append(str(error))
             advance()
     if not np.isfinite(survey.observed).all():
-        raise DataError(f"{origin.folder}: none of its trajectories could be looked at. {findings[0]}")
-    findings += disagreements(survey.statistics.result(), metadata.extra)
+        raise DataError(f"{origin.folder}: none of its trajectories could be read. {findings[0]}")
+    findings += find_disagreements(survey.statistics.result(), metadata.extra)
     findings += _lengths(tally, metadata)
     occupied, each = survey.occupied()
     fall = np.median(survey.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
@@ -97,8 +97,8 @@ def inspect(origin: Folder, trajectories: int | None = None) -> Inspection:
         occupied_each=each,
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
         restless=len(survey.rests) - len(rests),
-        notes=(*_beyond(survey, metadata), *metadata.extra.get("conversion", ())),
-        findings=_shortened(findings),
+        notes=(*_out_of_bounds_notes(survey, metadata), *metadata.extra.get("conversion", ())),
+        findings=_truncate(findings),
     )
 
 
@@ -108,8 +108,8 @@ def _each(splits: Mapping[str, Split], chosen: Mapping[str, range]) -> Iterator[
             yield f"{name}, trajectory {split.names[index]}", split, index
 
 
-def _chosen(split: Split, trajectories: int | None) -> range:
-    """Evenly spread trajectories."""
+def _spread_evenly(split: Split, trajectories: int | None) -> range:
+    """Indices of evenly spaced trajectories."""
     if trajectories is None:
         size = sum(4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split)))
         trajectories = max(1, int(len(split) * min(1.0, _BYTES / size)))
@@ -176,15 +176,17 @@ def _varies(tally: _Tally) -> tuple[str, ...]:
 def _lengths(tally: _Tally, metadata: Metadata) -> list[str]:
     stated = [metadata.extra.get(f"sequence_length_{name}") for name in tally.frames]
     lengths = [metadata.sequence_length, *(value for value in stated if isinstance(value, int))]
-    # Stored are often one more than stated.
-    odd = {n for counts in tally.frames.values() for n in counts} - {n + more for n in lengths for more in (0, 1)}
-    if not odd:
+    # Files often have one frame more than stated.
+    unexpected = {n for counts in tally.frames.values() for n in counts} - {
+        n + more for n in lengths for more in (0, 1)
+    }
+    if not unexpected:
         return []
-    held = f"{min(odd)}" if len(odd) == 1 else f"{min(odd)} to {max(odd)}"
-    return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {held} frames."]
+    lengths_found = f"{min(unexpected)}" if len(unexpected) == 1 else f"{min(unexpected)} to {max(unexpected)}"
+    return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {lengths_found} frames."]
 
 
-def _beyond(survey: Survey, metadata: Metadata) -> list[str]:
+def _out_of_bounds_notes(survey: Survey, metadata: Metadata) -> list[str]:
     notes = []
     for axis, (low, high) in enumerate(metadata.bounds):
         seen_low, seen_high = survey.observed[:, axis].tolist()
@@ -196,7 +198,7 @@ def _beyond(survey: Survey, metadata: Metadata) -> list[str]:
     return notes
 
 
-def _shortened(findings: list[str]) -> tuple[str, ...]:
+def _truncate(findings: list[str]) -> tuple[str, ...]:
     if len(findings) <= _MOST_FINDINGS:
         return tuple(findings)
     return (*findings[:_MOST_FINDINGS], f"… and {len(findings) - _MOST_FINDINGS} more.")

@@ -1,4 +1,4 @@
-"""The answers of an inspection."""
+"""The results of an inspection."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from nmpm._support.plain_data import to_lists
 from nmpm.scene import Interval
 
 Range = tuple[int, int]
-"""Least and largest."""
+"""Smallest and largest value."""
 
 
 @dataclass(frozen=True)
 class SplitFacts:
-    """One split.
+    """Facts about one split.
 
     Args:
-        trajectories: In the file.
-        inspected: Looked at in full.
-        frames: Of a trajectory.
-        particles: Of a trajectory, those that move.
-        static: Of a trajectory, those that do not.
+        trajectories: Number of trajectories in the file.
+        inspected: Number of those that were read.
+        frames: Frames of a trajectory.
+        particles: Moving particles of a trajectory.
+        static: Static particles of a trajectory.
     """
 
     trajectories: int
@@ -34,15 +34,15 @@ class SplitFacts:
 
 @dataclass(frozen=True)
 class GridFacts:
-    """The data on one grid.
+    """Facts about the data on one grid.
 
     Args:
         cells: Cells along the longest side.
         shape: Cells along each axis.
-        per_cell: Particles per cell that holds any, the median over frames.
-        median_speed: Of the particles that move, in cells per frame.
-        high_speed: The 99.9% quantile, in cells per frame.
-        most_speed: The fastest, in cells per frame.
+        per_cell: Particles per occupied cell, median over frames.
+        median_speed: Median speed of the moving particles, in cells per frame.
+        high_speed: 99.9% quantile of their speeds, in cells per frame.
+        most_speed: Largest speed, in cells per frame.
     """
 
     cells: int
@@ -55,31 +55,31 @@ class GridFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was seen; lengths in domain length, times in seconds.
+    """The results; lengths in domain length, times in seconds.
 
     Args:
         path: Of the dataset.
         dim: Number of axes.
         dt: Time between frames.
         splits: By name.
-        materials: Particles of each material, least and largest in a trajectory, by name.
+        materials: Particles of each material in a trajectory, by name.
         stated_bounds: The metadata's.
         observed: Extent of all positions.
-        domain: What a grid should cover.
+        domain: Extent that a grid should cover.
         boundary: "wall" or "periodic" per axis.
-        gravity: Where it is known and the same for all.
-        first_acceleration: Median in the first frames, in length/s²; gravity, where particles begin in free fall.
-        spacing: Median distance to the nearest particle in first frames.
+        gravity: In length/s², where it is known and the same for all trajectories.
+        first_acceleration: Median in the first frames, in length/s²; equals gravity where particles start in free fall.
+        spacing: Median distance to the nearest neighbour in first frames.
         varies: What differs between trajectories: "gravity", "materials", "particles", "frames", "obstacles".
         fields: Shape of each further array, in the first trajectory.
         grids: Candidate grids.
-        recommended: Cells along the longest side.
-        occupied: Share of the domain that a particle is ever in: in all trajectories together.
-        occupied_each: The same, the median over trajectories.
-        rest: First frame from which a trajectory is at rest, the median, least and largest; None where none rests.
-        restless: Trajectories that are still moving at their end.
-        notes: What is worth knowing.
-        findings: What is suspicious.
+        recommended: Recommended cells along the longest side.
+        occupied: Fraction of the domain that a particle ever visits, in all trajectories together.
+        occupied_each: The same in one trajectory, median.
+        rest: First frame from which a trajectory is at rest: median, smallest, largest; None where none comes to rest.
+        restless: Trajectories that still move at their end.
+        notes: Notes that need no action.
+        findings: Anomalies.
     """
 
     path: str

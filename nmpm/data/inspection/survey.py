@@ -1,4 +1,4 @@
-"""One pass over trajectories that gathers what an inspection tells, in memory that does not grow with the dataset."""
+"""Accumulates an inspection's measurements over trajectories, in memory that does not grow with the dataset."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.inspection.anomalies import displacements
 from nmpm.data.inspection.facts import GridFacts
-from nmpm.data.inspection.oddities import steps
-from nmpm.data.statistics import Statistics
+from nmpm.data.statistics import MotionStatistics
 from nmpm.scene import Interval
 
 CANDIDATES = (16, 32, 64, 128, 256, 512)
-"""Cells along the longest side: powers of two, which networks that halve the grid can take."""
+"""Cells along the longest side: powers of two, as networks that halve the grid need."""
 
 PER_CELL = 2.0
 """Particles per occupied cell that a grid should have. The paper's grids have 1.3 to 3: 64 cells for its MPM scenes,
@@ -27,16 +27,16 @@ _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 
 
 
 class Survey:
-    """Takes trajectories one by one.
+    """Accumulates measurements; call `add` for each trajectory.
 
     Args:
         metadata: Of the dataset.
-        domain: What grids cover, (lower, upper) per axis.
+        domain: Extent of the grids, (lower, upper) per axis.
     """
 
     def __init__(self, metadata: Metadata, domain: Sequence[Interval]) -> None:
         self.metadata = metadata
-        self.statistics = Statistics(metadata)
+        self.statistics = MotionStatistics(metadata)
         self.low, high = np.asarray(domain).T
         self.extent = high - self.low
         self.longest = float(self.extent.max())
@@ -50,11 +50,11 @@ class Survey:
         self._shares: list[float] = []
 
     def shape(self, cells: int) -> tuple[int, ...]:
-        """Cells along each axis, as square as they can be."""
+        """Cells along each axis, as close to square as possible."""
         return tuple(max(1, round(cells * side / self.longest)) for side in self.extent.tolist())
 
     def add(self, trajectory: Trajectory) -> None:
-        """Takes a trajectory into account."""
+        """Adds a trajectory."""
         types, position = trajectory.particle_type, trajectory.position
         moving = np.isin(types, self.metadata.moving_types)
         present = moving | np.isin(types, list(self.metadata.static_types))
@@ -63,14 +63,14 @@ class Survey:
         if not moving.any():
             return
         self.statistics.add(trajectory)
-        step = steps(position[:, moving], self.metadata)
+        step = displacements(position[:, moving], self.metadata)
         speed = np.linalg.norm(step, axis=-1)
-        self._gather_speeds(speed)
+        self._add_speeds(speed)
         if len(step) > 1:
             self.falls.append(np.median(np.diff(step[:4], axis=0), axis=(0, 1)))
-        self._gather_cells(position[:, moving])
+        self._add_cells(position[:, moving])
 
-    def _gather_speeds(self, speed: np.ndarray) -> None:
+    def _add_speeds(self, speed: np.ndarray) -> None:
         if not len(speed):
             return
         self._counts += np.bincount(np.digitize(speed.ravel() / self.longest, _BINS), minlength=len(self._counts))
@@ -80,20 +80,20 @@ class Survey:
         first = int(awake[-1]) + 1 if len(awake) else 0
         self.rests.append(first if first < len(speed) else None)
 
-    def _gather_cells(self, position: np.ndarray) -> None:
+    def _add_cells(self, position: np.ndarray) -> None:
         chosen = np.unique(np.linspace(0, len(position) - 1, _FRAMES_ON_GRIDS).astype(int))
         for cells in CANDIDATES:
             for frame in chosen:
                 index = self._cells(position[frame], cells)
                 self._per_cell[cells].append(len(index) / len(np.unique(index)))
-        mine = np.zeros(self._mask.size, bool)
+        occupied_cells = np.zeros(self._mask.size, bool)
         for frame in position:
-            mine[self._cells(frame, _MASK_CELLS)] = True
-        self._shares.append(float(mine.mean()))
-        self._mask |= mine.reshape(self._mask.shape)
+            occupied_cells[self._cells(frame, _MASK_CELLS)] = True
+        self._shares.append(float(occupied_cells.mean()))
+        self._mask |= occupied_cells.reshape(self._mask.shape)
 
     def _cells(self, position: np.ndarray, cells: int) -> np.ndarray:
-        """Number of the cell that each of (N, D) particles is in."""
+        """Flat index of the cell that contains each of (N, D) particles, (N,)."""
         shape = np.array(self.shape(cells))
         place = np.floor((position - self.low) / self.extent * shape).astype(int)
         place = np.where(self.metadata.periodic, place % shape, np.clip(place, 0, shape - 1))
@@ -110,7 +110,7 @@ class Survey:
         )
 
     def grids(self) -> tuple[GridFacts, ...]:
-        """The data on each of the candidate grids."""
+        """Facts about the data on each candidate grid."""
         found = []
         for cells in CANDIDATES:
             size = self.longest / cells
@@ -120,7 +120,7 @@ class Survey:
         return tuple(found)
 
     def recommended(self) -> int:
-        """The candidate whose occupied cells hold most nearly `PER_CELL` particles, by ratio."""
+        """The candidate whose particles per occupied cell are closest to `PER_CELL`, by ratio."""
         ratios = {grid.cells: abs(math.log(grid.per_cell / PER_CELL)) for grid in self.grids() if grid.per_cell > 0}
         return min(ratios, key=lambda cells: ratios[cells]) if ratios else CANDIDATES[0]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derived_seed, metadata_of
+from nmpm.data.generate import derive_seed, preset_metadata
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.data.recording import Reader
-from nmpm.data.shelf import collate
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset
@@ -56,7 +56,7 @@ class Subject:
 
     def seeds(self, count: int) -> list[int]:
         """Seeds of scenes that no dataset holds."""
-        return [derived_seed(self.seed, _STREAM, index) for index in range(count)]
+        return [derive_seed(self.seed, _STREAM, index) for index in range(count)]
 
     def with_emulator(self, emulator: Emulator) -> Subject:
         """The same test of another emulator."""
@@ -65,7 +65,7 @@ class Subject:
 
 def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -> Window:
     """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the subject's device."""
-    longer, reader = preset.with_frames(frames + 1), Reader(metadata_of(preset), preset.scene)
+    longer, reader = preset.with_frames(frames + 1), RecordingReader(preset_metadata(preset), preset.scene)
     recordings = []
     for seed in subject.seeds(count):
         trajectory = longer.simulate(seed)

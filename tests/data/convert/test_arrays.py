@@ -3,7 +3,7 @@ import pytest
 
 import nmpm
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.origins import Folder
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 
 SCENE = nmpm.Scene(
@@ -30,26 +30,26 @@ def runs(number: int = 2, frames: int = 7) -> list[nmpm.Trajectory]:
     return made
 
 
-def test_what_is_written_is_a_dataset_to_train_on(tmp_path):
+def test_written_trajectories_can_be_trained_on(tmp_path):
     nmpm.write_trajectories(tmp_path / "mine" / "train.h5", iter(runs()), SCENE)
     nmpm.write_trajectories(tmp_path / "mine" / "test.h5", runs(1, 9), SCENE)
-    origin = Folder(tmp_path / "mine")
+    origin = FolderSource(tmp_path / "mine")
     assert origin.scene == SCENE
     recording = origin.recordings("train")[1]
     np.testing.assert_array_equal(recording.frames.numpy(), runs()[1].position[:, :4])
     assert recording.material.tolist() == [0, 0, 1, 1]
     assert recording.obstacle.shape == (1, 2)
-    whole = Split(tmp_path / "mine" / "train.h5").whole(0)
+    whole = Split(tmp_path / "mine" / "train.h5").read_with_fields(0)
     np.testing.assert_array_equal(whole.fields["heat"], runs()[0].fields["heat"])
     assert whole.attributes == {"seed": 0}
     assert read_metadata(tmp_path / "mine").sequence_length == 9
 
 
-def test_bare_arrays_will_do_for_one_material(tmp_path):
+def test_bare_arrays_suffice_for_one_material(tmp_path):
     position = np.random.default_rng(0).random((6, 3, 2))
     nmpm.write_trajectories(tmp_path / "train.h5", [position], ONE)
     np.testing.assert_array_equal(Split(tmp_path / "train.h5").read(0).position, position.astype(np.float32))
-    with pytest.raises(DataError, match="trajectory 0 is a bare array, but the scene has 3 kinds"):
+    with pytest.raises(DataError, match="trajectory 0 is a bare array, but the scene has 3 particle types"):
         nmpm.write_trajectories(tmp_path / "other" / "train.h5", [position], SCENE)
 
 
@@ -58,10 +58,10 @@ def test_bare_arrays_will_do_for_one_material(tmp_path):
     [
         (lambda p, t: (p + 1, t), r"trajectory 0, frame 0: particle \d is at .* outside the domain"),
         (lambda p, t: (p, t + 1), r"has particle types \[1, 2, 3\]; the scene has 0 honey, 1 milk, 2 boundary"),
-        (lambda p, t: (p[..., :1], t), "has 1 axes, the scene 2"),
+        (lambda p, t: (p[..., :1], t), "has 1 axes, the scene has 2"),
     ],
 )
-def test_what_does_not_fit_the_scene_is_refused_and_nothing_written(tmp_path, change, message):
+def test_trajectories_that_do_not_fit_the_scene_are_refused_and_nothing_is_written(tmp_path, change, message):
     wrong = nmpm.Trajectory(*change(runs()[0].position, runs()[0].particle_type))
     with pytest.raises(DataError, match=message):
         nmpm.write_trajectories(tmp_path / "train.h5", [wrong], SCENE)
@@ -72,5 +72,5 @@ def test_splits_of_different_scenes_do_not_mix(tmp_path):
     nmpm.write_trajectories(tmp_path / "train.h5", runs(), SCENE)
     with pytest.raises(DataError, match="states another scene"):
         nmpm.write_trajectories(tmp_path / "test.h5", [np.zeros((3, 2, 2))], ONE)
-    with pytest.raises(ConfigError, match="should be called train"):
+    with pytest.raises(ConfigError, match="must be named train"):
         nmpm.write_trajectories(tmp_path / "mine.h5", runs(), SCENE)

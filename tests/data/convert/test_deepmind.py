@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from nmpm.data.convert import DeepMind, Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert import records
 
@@ -32,13 +32,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "ramps"
 
 
-def test_every_number_arrives(folder, tmp_path):
+def test_all_values_are_converted(folder, tmp_path):
     convert(folder, tmp_path / "native")
     split = Split(tmp_path / "native" / "train.h5")
     assert len(split) == 2
     for index in range(2):
         position, particle_type = made(seed=index)
-        trajectory = split.whole(index)
+        trajectory = split.read_with_fields(index)
         np.testing.assert_array_equal(trajectory.position, position)
         np.testing.assert_array_equal(trajectory.particle_type, particle_type)
         np.testing.assert_array_equal(trajectory.fields["step_context"], np.full((5, 6), index))
@@ -50,14 +50,14 @@ def test_every_number_arrives(folder, tmp_path):
     assert infer_scene(tmp_path / "native").obstacles
 
 
-def test_one_file_is_a_dataset_too(folder, tmp_path):
+def test_a_single_file_is_a_dataset(folder, tmp_path):
     (folder / "test.tfrecord").rename(folder / "test_sub.tfrecord")
     notes = convert(folder / "test_sub.tfrecord", tmp_path / "native")
     assert (tmp_path / "native" / "test.h5").is_file()
     assert any("test_sub.tfrecord becomes the test split" in note for note in notes)
 
 
-def test_says_which_family_it_took(folder, tmp_path):
+def test_notes_name_the_family(folder, tmp_path):
     assert any("deepmind family" in note for note in convert(folder, tmp_path / "a"))
     assert any("jax-sph family" in n for n in convert(folder, tmp_path / "b", options=Options("jax-sph", {5: "oil"})))
     assert read_metadata(tmp_path / "b").particle_types[5] == "oil"
@@ -84,7 +84,7 @@ def test_options_must_fit_the_axes(folder, tmp_path):
 
 @given(place=st.integers(0, 5000), value=st.integers(0, 255), cut=st.integers(0, 5000))
 @settings(max_examples=80, deadline=None)
-def test_damage_within_the_messages_gives_errors_never_garbage(tmp_path_factory, place, value, cut):
+def test_damaged_messages_are_refused(tmp_path_factory, place, value, cut):
     """With checksums that fit, so that the parser itself meets the damage."""
     folder = tmp_path_factory.mktemp("damage")
     (folder / "metadata.json").write_text(json.dumps(METADATA))
@@ -102,7 +102,7 @@ def test_damage_within_the_messages_gives_errors_never_garbage(tmp_path_factory,
 
 
 class TestRecorded:
-    def test_sand_equals_the_rollout_pickled_beside_it(self, recorded, tmp_path):
+    def test_sand_equals_the_pickled_rollout(self, recorded, tmp_path):
         convert(recorded / "deepmind-sand-subset", tmp_path / "sand", "deepmind")
         trajectory = Split(tmp_path / "sand" / "test.h5").read(0)
         assert trajectory.position.shape == (321, 256, 2)
@@ -115,7 +115,7 @@ class TestRecorded:
 
     def test_forces_and_a_moving_tool_are_kept(self, recorded, tmp_path):
         notes = convert(recorded / "mpm-excavation-3d", tmp_path / "sand")
-        trajectory = Split(tmp_path / "sand" / "train.h5").whole(0)
+        trajectory = Split(tmp_path / "sand" / "train.h5").read_with_fields(0)
         assert trajectory.position.shape == (11, 26945, 3)
         assert trajectory.fields["force"].shape == (11, 3)
         tool = trajectory.position[:, trajectory.particle_type == 3]

@@ -33,10 +33,10 @@ def write(path: Path, content: object) -> Path:
     return path
 
 
-def test_every_number_arrives(tmp_path):
+def test_all_values_are_converted(tmp_path):
     made = frames()
     notes = convert(write(tmp_path / "a.msgpack.zst", made), tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     assert trajectory.position.shape == (4, 12, 3)
     for index, frame in enumerate(made):
         fluid = np.frombuffer(frame[b"pos"][b"data"], "<f4").reshape(5, 3)
@@ -57,12 +57,12 @@ def test_folders_are_splits(tmp_path):
     assert read_metadata(tmp_path / "out").dt == 0.01
 
 
-def test_particles_that_appear_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"frame 4: 9 particles, 5 at the start"):
+def test_a_changing_number_of_particles_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"frame 4: 9 particles, but 5 in frame 0"):
         convert(write(tmp_path / "a.msgpack.zst", frames() + frames(1, 9)), tmp_path / "out")
 
 
-def test_without_the_packages_it_says_how_to_get_them(tmp_path, monkeypatch):
+def test_missing_packages_give_the_install_command(tmp_path, monkeypatch):
     path = write(tmp_path / "a.msgpack.zst", frames())
     monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(ConfigError, match=r"pip install 'nmpm\[convert\]'"):
@@ -90,7 +90,7 @@ def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, place, 
 
 def test_recorded_canyon(recorded, tmp_path):
     convert(recorded / "dmcf-canyon-3d", tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     assert trajectory.position.shape == (13, 1280 + 185447, 3)
     assert trajectory.fields["vel"].shape == (13, 1280, 3)
     fluid = trajectory.position[:, trajectory.particle_type == 0]

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from nmpm.data.convert import GnsNpz, Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
-from tests.data.convert.test_pickles import Runs
+from tests.data.convert.test_rollout_pickle import Runs
 
 METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 7, "dim": 2, "dt": 0.0025}
 
@@ -32,7 +32,7 @@ def write(folder: Path, save=np.savez, **members: np.ndarray) -> Path:
     return folder
 
 
-def test_trajectories_come_in_the_order_of_their_numbers(tmp_path):
+def test_trajectories_are_ordered_by_number(tmp_path):
     made = {f"simulation_trajectory_{i}": pair(positions(i, 3 + i), 6) for i in (10, 2, 0)}
     convert(write(tmp_path / "sand", **made), tmp_path / "out")
     split = Split(tmp_path / "out" / "train.h5")
@@ -44,12 +44,12 @@ def test_trajectories_come_in_the_order_of_their_numbers(tmp_path):
 def test_types_per_particle_and_material_properties_are_kept(tmp_path):
     types, angle = np.array([6, 6, 3, 3], dtype=object), np.array([20.0, 20.0, 0.0, 0.0])
     convert(write(tmp_path / "a", simulation_0=pair(positions(0), types, angle)), tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "train.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
     assert trajectory.particle_type.tolist() == [6, 6, 3, 3]
     np.testing.assert_array_equal(trajectory.fields["material_property"], angle)
 
 
-def test_one_member_for_all_is_read_too(tmp_path):
+def test_reads_one_member_with_all_trajectories(tmp_path):
     rows = np.empty((2, 2), object)
     for index in range(2):
         rows[index] = [positions(index), 5]
@@ -66,11 +66,11 @@ def test_one_member_for_all_is_read_too(tmp_path):
         (pair(positions(0)[0], 5), r"shape \(T, N, D\)"),
         (pair(positions(0), np.arange(3)), "one for each of 4 particles"),
         (pair(positions(0) * np.nan, 5), r"simulation_0: .*finite"),
-        (pair(positions(0), Runs(eval, "1")), r"asks for builtins\.eval"),
+        (pair(positions(0), Runs(eval, "1")), r"requests builtins\.eval"),
         (positions(0), "found 7 parts"),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path, content, message):
+def test_inconsistent_content_is_refused_by_name(tmp_path, content, message):
     with pytest.raises(DataError, match=message) as caught:
         convert(write(tmp_path / "a", simulation_0=content), tmp_path / "out")
     assert "train.npz: simulation_0" in str(caught.value)

@@ -8,7 +8,7 @@ import pytest
 
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.origins import Folder
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import DataError
 
 
@@ -35,7 +35,7 @@ def test_a_published_dataset_is_known_by_its_name(tmp_path):
     metadata = read_metadata(tmp_path / "out")
     assert (metadata.dt, metadata.gravity, metadata.sequence_length) == (0.0025, (0.0, -9.81), 7)
     assert any("published WaterRamps" in note for note in notes)
-    scene = Folder(tmp_path / "out").scene
+    scene = FolderSource(tmp_path / "out").scene
     assert scene.materials == ("water",)
     assert scene.obstacles
 
@@ -46,33 +46,33 @@ def test_several_materials_and_gravity_per_trajectory(tmp_path, with_boundary):
     gravity, heat = np.array([3.0, -4.0]), np.random.default_rng(0).random((8, 5))
     write(tmp_path / "MultiMaterial" / "test" / "sim_0.h5", types=types, grav=gravity, heat=heat)
     convert(tmp_path / "MultiMaterial", tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     assert trajectory.particle_type.tolist() == [5, 6, 7, 5, 6, 3, 3, 3]
     np.testing.assert_array_equal(trajectory.attributes["gravity"], gravity)
     np.testing.assert_array_equal(trajectory.fields["grav"], gravity)
     np.testing.assert_array_equal(trajectory.fields["heat"], heat)
 
 
-def test_an_unknown_name_needs_to_be_told(tmp_path):
+def test_an_unknown_dataset_needs_the_time_step_and_material(tmp_path):
     write(tmp_path / "mine" / "train" / "sim_0.h5")
     with pytest.raises(DataError, match=r"no published dataset is called 'mine'.*--dt"):
         convert(tmp_path / "mine", tmp_path / "out")
-    with pytest.raises(DataError, match=r"do not say what their particles are.*--types 5=water"):
+    with pytest.raises(DataError, match=r"do not state the particles' material.*--types 5=water"):
         convert(tmp_path / "mine", tmp_path / "out", options=Options(dt=0.01))
     convert(tmp_path / "mine", tmp_path / "out", options=Options(dt=0.01, types={5: "milk"}))
-    assert Folder(tmp_path / "out").scene.materials == ("milk",)
+    assert FolderSource(tmp_path / "out").scene.materials == ("milk",)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda f: f.__delitem__("particles"), "'particles' is missing"),
-        (lambda f: (f.__delitem__("boundary"), f.__setitem__("boundary", np.zeros((3, 3, 2)))), "do not fit together"),
-        (lambda f: f.__setitem__("types", np.zeros(4, int)), r"types \(4,\) fit neither 5 particles"),
+        (lambda f: (f.__delitem__("boundary"), f.__setitem__("boundary", np.zeros((3, 3, 2)))), "do not match"),
+        (lambda f: f.__setitem__("types", np.zeros(4, int)), r"types \(4,\) match neither 5 particles"),
         (lambda f: f["particles"].__setitem__((2, 1, 0), np.nan), "particle 1 in frame 2"),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path, change, message):
+def test_inconsistent_content_is_refused_by_name(tmp_path, change, message):
     write(tmp_path / "Goop" / "train" / "sim_0.h5")
     with h5py.File(tmp_path / "Goop" / "train" / "sim_0.h5", "a") as file:
         change(file)
@@ -89,7 +89,7 @@ def test_truncated_files_are_named(tmp_path):
         convert(tmp_path / "Goop", tmp_path / "out")
 
 
-def test_a_boundary_that_moves_is_said_and_kept(tmp_path):
+def test_a_moving_boundary_is_noted_and_kept(tmp_path):
     path = tmp_path / "Goop" / "train" / "sim_0.h5"
     write(path)
     with h5py.File(path, "a") as file:
@@ -98,6 +98,6 @@ def test_a_boundary_that_moves_is_said_and_kept(tmp_path):
     assert any("static type move in 1 of 1" in note for note in notes)
     position = Split(tmp_path / "out" / "train.h5").read(0).position
     assert position[7, 5, 0] - position[0, 5, 0] == pytest.approx(0.1, abs=1e-6)
-    origin = Folder(tmp_path / "out")
+    origin = FolderSource(tmp_path / "out")
     with pytest.raises(DataError, match=r"particle 5 is of the static type 3 \(boundary\) but moves"):
         origin.recordings("train")[0]

@@ -11,7 +11,7 @@ from nmpm.errors import DataError
 from tests.data.convert import records
 
 
-def test_checksum_of_the_nine_digits():
+def test_crc32c_of_the_standard_check_string():
     assert crc32c(b"123456789") == 0xE3069283  # RFC 3720, appendix B.4 and the catalogue of CRCs
 
 
@@ -46,7 +46,7 @@ def three(path: Path) -> Path:
     return records.write_records(path / "train.tfrecord", *made)
 
 
-def test_finds_every_record(tmp_path):
+def test_offsets_of_every_record(tmp_path):
     path = three(tmp_path)
     offsets = record_offsets(path)
     assert len(offsets) == 3
@@ -70,7 +70,7 @@ def test_a_file_cut_short_is_refused_by_name(tmp_path_factory, cut):
 
 @given(place=st.integers(0, 10_000), bit=st.integers(0, 7))
 @settings(max_examples=100, deadline=None)
-def test_every_flipped_bit_is_found(tmp_path_factory, place, bit):
+def test_every_flipped_bit_is_detected(tmp_path_factory, place, bit):
     path = three(tmp_path_factory.mktemp("flip"))
     data = bytearray(path.read_bytes())
     data[place % len(data)] ^= 1 << bit
@@ -81,7 +81,7 @@ def test_every_flipped_bit_is_found(tmp_path_factory, place, bit):
 
 @given(payload=st.binary(max_size=200))
 @settings(max_examples=200, deadline=None)
-def test_payloads_of_noise_are_refused_or_read_never_worse(tmp_path_factory, payload):
+def test_random_payloads_never_crash(tmp_path_factory, payload):
     path = records.write_records(tmp_path_factory.mktemp("noise") / "train.tfrecord", records.record(payload))
     message, names = "", None
     try:

@@ -1,4 +1,4 @@
-"""What is learnt of trajectories while they are converted, and what is odd about them."""
+"""Facts that are collected about trajectories while they are converted, and notes on inconsistencies."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nmpm.data.convert.base import UNSTATED
+from nmpm.data.convert.base import UNKNOWN_LENGTH
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import KEYS, Statistics, disagreements, first_that_moves
+from nmpm.data.statistics import STATISTICS_KEYS, MotionStatistics, find_disagreements, first_moving_particle
 from nmpm.errors import DataError
 
 STATED = "stated_statistics"
@@ -16,16 +16,22 @@ MOVING_BOUNDARIES = "moving_boundaries"
 
 
 @dataclass
-class Seen:
-    """What the trajectories that pass by show.
+class ConversionLog:
+    """Collects facts about the trajectories of a conversion.
 
     Args:
-        metadata: What the files state.
-        statistics: Of those trajectories that were added before `statistics_done`.
+        metadata: As the files state it.
+        statistics: Of the trajectories that were added before `statistics_done` was set.
+        statistics_done: Set after the first split.
+        moving_boundaries: Trajectories in which a static particle moves.
+        number: Trajectories.
+        lower, upper: Extent of all positions, (D,).
+        frames: Different numbers of frames.
+        particles: Largest number of particles.
     """
 
     metadata: Metadata
-    statistics: Statistics
+    statistics: MotionStatistics
     statistics_done: bool = False
     moving_boundaries: int = 0
     number: int = 0
@@ -35,20 +41,22 @@ class Seen:
     particles: int = 0
 
     def add(self, trajectory: Trajectory, where: str) -> None:
-        """Takes a trajectory into account.
+        """Adds a trajectory.
 
         Raises:
-            DataError: if it has another number of axes than the metadata say, or a type that nobody knows.
+            DataError: if its number of axes differs from the metadata, or a type is unknown.
         """
         types, position = trajectory.particle_type, trajectory.position
         if position.shape[2] != self.metadata.dim:
-            raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata say {self.metadata.dim}.")
+            raise DataError(
+                f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {self.metadata.dim}."
+            )
         self.metadata.check_types(types, where)
         if not self.statistics_done:
             self.statistics.add(trajectory)
         self.number += 1
         static = np.isin(types, list(self.metadata.static_types))
-        self.moving_boundaries += first_that_moves(position, static, self.metadata.bounds) is not None
+        self.moving_boundaries += first_moving_particle(position, static, self.metadata.bounds) is not None
         present = np.isin(types, [*self.metadata.moving_types, *self.metadata.static_types])
         if present.any():
             low, high = position[:, present].min(axis=(0, 1)), position[:, present].max(axis=(0, 1))
@@ -57,13 +65,13 @@ class Seen:
         self.frames |= {len(position)}
         self.particles = max(self.particles, position.shape[1])
 
-    def concluded(self) -> tuple[Metadata, list[str]]:
-        """The metadata with what was measured, and notes on what is odd."""
+    def final_metadata(self) -> tuple[Metadata, list[str]]:
+        """The metadata with the measured statistics, and notes on inconsistencies."""
         extra, measured = dict(self.metadata.extra), self.statistics.result()
-        stated = {key: extra[key] for key in KEYS if key in extra}
-        notes = disagreements(measured, stated)
+        stated = {key: extra[key] for key in STATISTICS_KEYS if key in extra}
+        notes = find_disagreements(measured, stated)
         if notes:
-            notes.append(f"Those stated are kept as {STATED!r}.")
+            notes.append(f"The stated values are kept as {STATED!r}.")
         if stated:
             extra[STATED] = stated
         extra |= measured | {"num_particles_max": self.particles}
@@ -71,13 +79,13 @@ class Seen:
             extra[MOVING_BOUNDARIES] = True
             notes.append(
                 f"Particles of a static type move in {self.moving_boundaries} of {self.number} trajectories. Their"
-                " positions are kept; to train on them, declare which types are static (--static)."
+                " positions are kept; to train on them, state which types are static (--static)."
             )
         length = self.metadata.sequence_length or max(self.frames, default=2) - 1
         return replace(self.metadata, extra=extra, sequence_length=length), notes + self._lengths()
 
-    def outside(self) -> list[str]:
-        """Where positions leave the stated bounds."""
+    def out_of_bounds_notes(self) -> list[str]:
+        """Notes on positions outside of the stated bounds."""
         if self.lower is None or self.upper is None:
             return []
         stated_low, stated_high = np.asarray(self.metadata.bounds).T
@@ -91,8 +99,8 @@ class Seen:
 
     def _lengths(self) -> list[str]:
         stated = self.metadata.sequence_length
-        if stated == UNSTATED or self.frames <= {stated, stated + 1}:
+        if stated == UNKNOWN_LENGTH or self.frames <= {stated, stated + 1}:
             return []
         few, many = min(self.frames), max(self.frames)
-        held = f"{few}" if few == many else f"{few} to {many}"
-        return [f"The metadata state sequence_length {stated}; trajectories have {held} frames."]
+        lengths = f"{few}" if few == many else f"{few} to {many}"
+        return [f"The metadata state sequence_length {stated}; trajectories have {lengths} frames."]

@@ -43,7 +43,7 @@ def stream(folder, buffer_size: int) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the memory of a process as Linux does")
-def test_a_buffer_needs_memory_for_its_trajectories_only(dataset):
+def test_memory_is_bounded_by_the_buffer(dataset):
     assert TRAJECTORIES * FRAMES * PARTICLES * 8 > 1.9 * ALLOWED
     run = stream(dataset, buffer_size=2)
     assert run.stdout.strip() == "240", run.stderr[-2000:]

@@ -1,7 +1,7 @@
-"""Trajectories as tensors.
+"""Trajectories as tensors, validated against their scene.
 
-A recording holds what a scene's model needs of a trajectory: the particles that move, their materials, the static
-particles once, and gravity in length per frame squared. Everything a file may hold wrongly is found here.
+A recording holds what a model needs of a trajectory: the moving particles, their materials, the static particles once,
+and gravity in length per frame squared.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.data.background import carry_on
 from nmpm.data.format import Metadata, Split, Trajectory
-from nmpm.data.statistics import first_that_moves
+from nmpm.data.loading.background import raise_if_abandoned
+from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -25,9 +25,9 @@ class Recording:
     """One trajectory of a known scene.
 
     Args:
-        frames: (T, N, D) float32 positions of the particles that move, in domain length.
+        frames: (T, N, D) float32 positions of the moving particles, in domain length.
         material: (N,) int64 index into `Scene.materials`.
-        obstacle: (M, D) float32 positions of the particles that do not move.
+        obstacle: (M, D) float32 positions of the static particles.
         gravity: (D,) float32 in length per frame squared, zero where unknown.
     """
 
@@ -38,26 +38,26 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Reader:
-    """Makes recordings of trajectories, and checks what a file may hold wrongly.
+class RecordingReader:
+    """Converts trajectories to recordings and validates them.
 
     Args:
-        metadata: What the type ids mean.
-        scene: What the trajectories are recordings of.
+        metadata: Names the type ids.
+        scene: The trajectories' scene.
     """
 
     metadata: Metadata
     scene: Scene
 
     def recording(self, trajectory: Trajectory, where: str) -> Recording:
-        """The trajectory as tensors.
+        """Converts a trajectory to tensors.
 
         Args:
             trajectory: A trajectory of the scene.
-            where: Where it comes from, for messages.
+            where: File and trajectory, for error messages.
 
         Raises:
-            DataError: if it leaves the scene's domain, is of a material that the scene lacks, or has an obstacle that
+            DataError: if a particle leaves the scene's domain, its material is not in the scene, or a static particle
                 moves.
         """
         types = trajectory.particle_type
@@ -65,9 +65,9 @@ class Reader:
         moving = np.isin(types, self.metadata.moving_types)
         static = np.isin(types, list(self.metadata.static_types))
         self._check_inside(trajectory, moving | static, where)
-        self._check_still(trajectory, static, where)
+        self._check_static(trajectory, static, where)
         if not moving.any():
-            raise DataError(f"{where}: none of its particles moves; check static_types in the metadata.")
+            raise DataError(f"{where}: no particle has a moving type; check static_types in the metadata.")
         return Recording(
             frames=torch.from_numpy(np.ascontiguousarray(trajectory.position[:, moving])),
             material=torch.from_numpy(self._materials(types[moving], where)),
@@ -81,16 +81,15 @@ class Reader:
             name = self.metadata.particle_types[type_id]
             if name not in self.scene.materials:
                 raise DataError(
-                    f"{where}: its material {name!r} (type {type_id}) is unknown to the scene, which has"
-                    f" {', '.join(self.scene.materials)}. Leave the trajectory out, or train on data that has both."
+                    f"{where}: the material {name!r} (type {type_id}) is not in the scene, which has"
+                    f" {', '.join(self.scene.materials)}. Remove the trajectory, or train on data that has both."
                 )
             index[types == type_id] = self.scene.material_index(name)
         return index
 
     def _check_inside(self, trajectory: Trajectory, present: np.ndarray, where: str) -> None:
         lower, upper = np.asarray(self.scene.domain, dtype=np.float32).T
-        # A periodic axis has no outside.
-        walls = ~np.asarray(self.scene.periodic)
+        walls = ~np.asarray(self.scene.periodic)  # on a periodic axis no position is outside
         position = trajectory.position
         outside = (((position < lower) | (position > upper)) & walls).any(axis=-1) & present
         if outside.any():
@@ -98,17 +97,17 @@ class Reader:
             raise DataError(
                 f"{where}: particle {particle} in frame {frame} is at {position[frame, particle].tolist()}, outside"
                 f" the domain {list(map(list, self.scene.domain))} ({int(outside.any(axis=0).sum())} particles leave"
-                " it). Give the metadata a `domain` that holds all positions, or leave the trajectory out."
+                " it). Set a `domain` in the metadata that contains all positions, or remove the trajectory."
             )
 
-    def _check_still(self, trajectory: Trajectory, static: np.ndarray, where: str) -> None:
-        particle = first_that_moves(trajectory.position, static, self.scene.domain)
+    def _check_static(self, trajectory: Trajectory, static: np.ndarray, where: str) -> None:
+        particle = first_moving_particle(trajectory.position, static, self.scene.domain)
         if particle is not None:
             type_id = int(trajectory.particle_type[particle])
             raise DataError(
                 f"{where}: particle {particle} is of the static type {type_id}"
-                f" ({self.metadata.particle_types[type_id]}) but moves. Obstacles must be at rest; if it should be"
-                " predicted like a material, take its type out of static_types in the metadata."
+                f" ({self.metadata.particle_types[type_id]}) but moves. Obstacles must be at rest; to predict it like a"
+                " material, remove its type from static_types in the metadata."
             )
 
     def _gravity(self, trajectory: Trajectory, where: str) -> Tensor:
@@ -121,20 +120,23 @@ class Reader:
         return (gravity * self.scene.dt**2).float()
 
 
-class Recordings(Sequence[Recording]):
-    """The trajectories of a split as recordings, read and checked when asked for.
+class SplitRecordings(Sequence[Recording]):
+    """The trajectories of a split as recordings, read and validated on access.
 
     Args:
         split: The file.
-        metadata: What its type ids mean.
-        scene: What they are recordings of.
+        metadata: Names its type ids.
+        scene: The trajectories' scene.
+
+    Raises:
+        DataError: if file and scene differ in the number of axes.
     """
 
     def __init__(self, split: Split, metadata: Metadata, scene: Scene) -> None:
         if split.dim != scene.dim:
             raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
         self.split, self.scene = split, scene
-        self.reader = Reader(metadata, scene)
+        self.reader = RecordingReader(metadata, scene)
 
     def __len__(self) -> int:
         return len(self.split)
@@ -143,33 +145,40 @@ class Recordings(Sequence[Recording]):
         """Reads one trajectory.
 
         Raises:
-            DataError: if it cannot be read, leaves the scene's domain or is of a material that the scene lacks.
+            DataError: if it cannot be read, leaves the scene's domain or has a material that is not in the scene.
         """
         return self.reader.recording(self.split.read(index), self.split.where(index))
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         """Size of the positions of the largest trajectory."""
         split = self.split
         return max(4 * split.frames(index) * split.particles(index) * split.dim for index in range(len(self)))
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
-        """Reads several trajectories."""
-        return list(map(self._next, indices))
-
-    def _next(self, index: int) -> Recording:
-        carry_on()
-        return self[index]
-
-    def require_frames(self, frames: int, purpose: str) -> None:
-        """Makes sure that every trajectory is long enough.
+        """Reads several trajectories.
 
         Raises:
-            DataError: naming the first that is shorter.
+            DataError: as for a single one.
+        """
+        recordings = []
+        for index in indices:
+            raise_if_abandoned()
+            recordings.append(self[index])
+        return recordings
+
+    def require_frames(self, frames: int, purpose: str) -> None:
+        """Raises an error if a trajectory is too short.
+
+        Raises:
+            DataError: names the first that has fewer frames.
         """
         for index in range(len(self)):
             if self.split.frames(index) < frames:
                 raise DataError(
                     f"{self.split.where(index)}: it has {self.split.frames(index)} frames, {purpose} needs {frames}."
-                    " Shorten the horizon (frames per bundle x bundles unrolled) or leave the trajectory out."
+                    " Shorten the horizon (frames per bundle x bundles unrolled) or remove the trajectory."
                 )
+
+    def close(self) -> None:
+        """Does nothing: a split keeps no file open and no thread running."""

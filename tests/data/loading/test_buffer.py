@@ -1,4 +1,5 @@
 import dataclasses
+import threading
 from collections import Counter
 from itertools import islice
 
@@ -9,12 +10,13 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.buffer import Motion, TrajectoryBuffer
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.plan import WindowPlan
-from nmpm.data.recording import Recording, Recordings
-from nmpm.data.scenes import infer_scene
+from nmpm.data.loading.background import raise_if_abandoned
+from nmpm.data.loading.buffer import MotionSampler, TrajectoryBuffer
+from nmpm.data.loading.recording import Recording, SplitRecordings
+from nmpm.data.loading.window_plan import WindowPlan
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 
 PLANS = st.builds(
@@ -28,8 +30,8 @@ PLANS = st.builds(
 )
 
 
-def recordings_of(folder) -> Recordings:
-    return Recordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
+def recordings_of(folder) -> SplitRecordings:
+    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
 
 
 def buffer_of(folder, length: int = 5, **options) -> TrajectoryBuffer:
@@ -53,14 +55,14 @@ class TestPlan:
 
     @given(plan=PLANS, order=st.permutations(range(12)))
     @settings(max_examples=30, deadline=None)
-    def test_a_batch_depends_on_nothing_but_its_number(self, plan, order):
+    def test_a_batch_depends_on_its_index_only(self, plan, order):
         alone = {index: plan.batch(index, 1, 2) for index in order}
         again = WindowPlan(plan.frames, plan.length, plan.batch_size, plan.buffer_size, plan.passes, plan.seed)
         assert [alone[index] for index in range(12)] == [again.batch(index, 1, 2) for index in range(12)]
 
     @given(plan=PLANS)
     @settings(max_examples=30, deadline=None)
-    def test_buffers_go_through_all_trajectories(self, plan):
+    def test_buffers_cover_all_trajectories(self, plan):
         total = len(plan.frames)
         for buffer in range(5):
             members = plan.members(buffer)
@@ -68,7 +70,7 @@ class TestPlan:
         seen = set().union(*(plan.members(buffer) for buffer in range(-(-total // plan.buffer_size))))
         assert seen == set(range(total))
 
-    def test_ranks_share_out_every_window_once(self):
+    def test_ranks_draw_every_window_once_per_pass(self):
         plan = WindowPlan(frames=(13, 9), length=4, batch_size=2, buffer_size=2, passes=2, seed=0)
         assert plan.batches_per_buffer(world=4) == 4
         one_pass = Counter(w for index in range(2) for rank in range(4) for w in plan.batch(index, rank, 4))
@@ -78,14 +80,14 @@ class TestPlan:
     @given(plan=PLANS, legs=st.lists(st.tuples(*[st.integers(1, 7)] * 3), min_size=2, max_size=4))
     @example(plan=WindowPlan((6,), 2, 1, 1, 1, 0), legs=[(1, 1, 4), (1, 1, 1)])  # one window left of five
     @settings(max_examples=60, deadline=None)
-    def test_batches_of_another_size_go_on_in_the_same_row(self, plan, legs):
+    def test_batches_of_another_size_continue_the_sequence(self, plan, legs):
         """Legs of some batches, of some size, for some ranks: no place is drawn twice or left out."""
         index, before, expected = 0, None, (0, 0)
         for batches, batch_size, world in legs:
             plan = dataclasses.replace(plan, batch_size=batch_size)
-            plan = plan.after(index, *before, world) if before else plan
+            plan = plan.resume_after(index, *before, world) if before else plan
             for number in range(index, index + batches):
-                buffer, drawn = plan.place(number, world)
+                buffer, drawn = plan.locate(number, world)
                 assert (buffer, drawn) in (expected, (expected[0] + 1, 0))
                 if buffer > expected[0]:
                     assert expected[1] > (plan.batches_per_buffer(world) - 1) * batch_size * world
@@ -94,41 +96,41 @@ class TestPlan:
 
     @given(plan=PLANS, index=st.integers(0, 99))
     @settings(max_examples=30, deadline=None)
-    def test_ranks_have_the_batch_of_one_with_as_large_a_batch(self, plan, index):
+    def test_ranks_together_have_the_batch_of_one_process(self, plan, index):
         whole = dataclasses.replace(plan, batch_size=3 * plan.batch_size)
         parts = [plan.batch(index, rank, 3) for rank in range(3)]
         assert parts[0] + parts[1] + parts[2] == whole.batch(index, 0, 1)
-        assert plan.after(index, whole.batch_size, 1, 3) == plan
+        assert plan.resume_after(index, whole.batch_size, 1, 3) == plan
 
-    def test_every_window_is_as_likely(self):
+    def test_windows_are_equally_likely(self):
         plan = WindowPlan(frames=(8,) * 6, length=3, batch_size=4, buffer_size=2, passes=1, seed=3)
         drawn = Counter(w for index in range(300) for w in plan.batch(index, 0, 1))
         assert len(drawn) == 36
         assert max(drawn.values()) - min(drawn.values()) <= 2
 
-    def test_another_seed_another_order(self):
+    def test_order_depends_on_the_seed(self):
         plans = [WindowPlan((30, 30), 4, 8, 2, 1, seed) for seed in (0, 1)]
         assert plans[0].batch(0, 0, 1) != plans[1].batch(0, 0, 1)
 
     @pytest.mark.parametrize("wrong", [{"batch_size": 0}, {"buffer_size": -1}, {"passes": 0}, {"seed": -1}])
-    def test_numbers_that_make_no_sense(self, wrong):
+    def test_invalid_numbers_are_refused(self, wrong):
         known = {"frames": (9,), "length": 3, "batch_size": 2, "buffer_size": 2, "passes": 1, "seed": 0}
         with pytest.raises(ConfigError, match=f"{next(iter(wrong))} = "):
             WindowPlan(**(known | wrong))
 
 
 class TestBuffer:
-    def test_windows_are_the_files_frames(self, make_dataset):
+    def test_windows_equal_the_frames_of_the_file(self, make_dataset):
         buffer = buffer_of(make_dataset(statics=1))
         for index, window in enumerate(islice(buffer.batches(), 20)):
             for row, (trajectory, start) in enumerate(buffer.plan.batch(index, 0, 1)):
                 count = int(window.mask[row].sum())
-                truth = torch.from_numpy(buffer.source.split.read(trajectory, start, start + 5).position)
+                truth = torch.from_numpy(buffer.provider.split.read(trajectory, start, start + 5).position)
                 assert torch.equal(window.frames[row, :, :count], truth[:, :count])
                 assert torch.equal(window.obstacle[row], truth[0, count:])
 
     @pytest.mark.parametrize("start", [0, 1, 5, 6, 7, 40])
-    def test_goes_on_anywhere(self, make_dataset, start):
+    def test_resumes_at_any_batch(self, make_dataset, start):
         buffer = buffer_of(make_dataset(train=((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))))
         straight = list(islice(buffer.batches(), start + 8))
         resumed = list(islice(buffer.batches(start), 8))
@@ -142,7 +144,7 @@ class TestBuffer:
             assert first.frames.shape[0] == second.frames.shape[0]
             assert first.frames.shape != second.frames.shape or not torch.equal(first.frames, second.frames)
 
-    def test_reads_each_trajectory_of_a_held_buffer_once(self, make_dataset, monkeypatch):
+    def test_reads_each_trajectory_of_a_constant_buffer_once(self, make_dataset, monkeypatch):
         buffer = buffer_of(make_dataset(), buffer_size=16)
         read = Counter()
         original = Split.read
@@ -150,7 +152,25 @@ class TestBuffer:
         list(islice(buffer.batches(), 50))
         assert read == {0: 1, 1: 1, 2: 1}
 
-    def test_a_bad_trajectory_read_ahead_is_reported(self, make_dataset):
+    def test_closing_the_iterator_ends_its_thread(self, make_dataset, monkeypatch):
+        buffer = buffer_of(make_dataset(train=((12, 5),) * 8), buffer_size=2)
+        before, read_ahead, original = set(threading.enumerate()), threading.Event(), SplitRecordings.load
+
+        def slow(recordings, indices):
+            if threading.current_thread() is threading.main_thread():
+                return original(recordings, indices)
+            read_ahead.set()
+            while True:
+                raise_if_abandoned()
+
+        monkeypatch.setattr(SplitRecordings, "load", slow)
+        batches = buffer.batches()
+        next(batches)
+        assert read_ahead.wait(60)
+        batches.close()
+        assert set(threading.enumerate()) <= before
+
+    def test_an_error_of_the_reading_thread_is_raised(self, make_dataset):
         folder = make_dataset(train=((12, 5),) * 8)
         buffer = buffer_of(folder, buffer_size=1)
         later = buffer.plan.members(1)[0]
@@ -162,7 +182,7 @@ class TestBuffer:
         with pytest.raises(DataError, match=f"trajectory {later:05d}: position of particle 2 in frame 3"):
             next(batches)
 
-    def test_too_short_a_trajectory(self, make_dataset):
+    def test_a_trajectory_shorter_than_a_window_is_refused(self, make_dataset):
         with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* 8 frames to predict needs 10"):
             buffer_of(make_dataset(train=((12, 5), (9, 5))), length=10)
 
@@ -171,7 +191,7 @@ def test_waterdrop(recorded):
     folder = recorded / "deepmind-waterdrop"
     scene = infer_scene(folder, family="deepmind", gravity=(0, -9.81))
     split = Split(folder / "train.h5")
-    recordings = Recordings(split, read_metadata(folder, "deepmind"), scene)
+    recordings = SplitRecordings(split, read_metadata(folder, "deepmind"), scene)
     plan = WindowPlan(tuple(map(split.frames, range(9))), length=18, batch_size=16, buffer_size=4, passes=4, seed=0)
     window = next(TrajectoryBuffer(recordings, plan).batches(7))
     for row, (trajectory, start) in enumerate(plan.batch(7, 0, 1)):
@@ -185,27 +205,27 @@ def test_emphasis_draws_windows_in_proportion_to_their_motion():
     frames[:10] = torch.arange(10).view(-1, 1, 1) * 0.01  # moves for 10 frames, then rests
     frames[10:] = frames[9]
     recording = Recording(frames, torch.zeros(3, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
-    motion = Motion({7: recording}, length=4)
+    motion = MotionSampler({7: recording}, length=4)
     rng = np.random.default_rng(0)
-    drawn = [motion.at(share) for share in rng.random(4000)]
+    drawn = [motion.window_at(share) for share in rng.random(4000)]
     assert {trajectory for trajectory, _ in drawn} == {7}
     starts = np.bincount([start for _, start in drawn], minlength=37) / 4000
     expected = np.array([min(3, max(0, 9 - start)) for start in range(37)]) / 24
     np.testing.assert_allclose(starts, expected, atol=0.03)
 
 
-def test_emphasis_keeps_batches_a_function_of_their_number(make_dataset):
+def test_with_emphasis_a_batch_depends_on_its_index_only(make_dataset):
     data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, batch_size=4, emphasis=0.5)
     buffer = data.train_dataloader().buffer
     run = list(islice(buffer.batches(), 6))
     resumed = list(islice(buffer.batches(start=3), 3))
     for one, other in zip(run[3:], resumed, strict=True):
         assert torch.equal(one.frames, other.frames)
-    plain = TrajectoryDataModule(path=str(data.origin.path), horizon=4, batch_size=4).train_dataloader().buffer
+    plain = TrajectoryDataModule(path=str(data.data_source.path), horizon=4, batch_size=4).train_dataloader().buffer
     assert any(not torch.equal(a.frames, b.frames) for a, b in zip(run, plain.batches(), strict=False))
 
 
-def test_emphasis_is_the_same_for_ranks_and_for_one_with_as_large_a_batch(make_dataset):
+def test_with_emphasis_ranks_together_have_the_batch_of_one_process(make_dataset):
     folder = make_dataset()
     of = {size: TrajectoryDataModule(path=str(folder), horizon=4, batch_size=size, emphasis=0.5) for size in (2, 6)}
     parts = [of[2].train_dataloader().buffer.batches(rank=rank, world=3) for rank in range(3)]
@@ -214,7 +234,7 @@ def test_emphasis_is_the_same_for_ranks_and_for_one_with_as_large_a_batch(make_d
 
 
 @pytest.mark.parametrize("emphasis", [-0.1, 1.5])
-def test_emphasis_is_a_share(make_dataset, emphasis):
+def test_emphasis_outside_of_0_to_1_is_refused(make_dataset, emphasis):
     data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, emphasis=emphasis)
     with pytest.raises(ConfigError, match="emphasis"):
         data.train_dataloader()

@@ -6,17 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import Split, Trajectory, read_metadata, write_split
-from nmpm.data.recording import Recordings
-from nmpm.data.scenes import infer_scene
-from nmpm.data.shelf import Shelf, collate, unwrap
+from nmpm.data.loading.padded_batch import PaddedRecordings, collate, unwrap
+from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
 
-def recordings_of(folder, name="train", **arguments) -> Recordings:
+def recordings_of(folder, name="train", **arguments) -> SplitRecordings:
     family = arguments.get("family")
     scene = infer_scene(folder, **arguments)
-    return Recordings(Split(folder / f"{name}.h5"), read_metadata(folder, family), scene)
+    return SplitRecordings(Split(folder / f"{name}.h5"), read_metadata(folder, family), scene)
 
 
 def test_separates_static_particles(make_dataset):
@@ -56,7 +56,7 @@ def test_padding_particles_of_a_file_are_dropped(make_dataset):
     np.testing.assert_array_equal(recordings[0].frames, recordings.split.read(0).position[:, [0, 1, 3, 4]])
 
 
-def test_positions_outside_the_domain_are_named(make_dataset):
+def test_positions_outside_the_domain_are_refused(make_dataset):
     folder = make_dataset()
     recordings = recordings_of(folder)
     with h5py.File(folder / "train.h5", "a") as file:
@@ -66,12 +66,12 @@ def test_positions_outside_the_domain_are_named(make_dataset):
     recordings[1]
 
 
-def test_unknown_material_is_named(make_dataset):
+def test_unknown_material_is_refused(make_dataset):
     folder = make_dataset(particle_types={3: "boundary", 5: "water", 7: "goop"})
     recordings = recordings_of(folder)
     with h5py.File(folder / "train.h5", "a") as file:
         file["00001/particle_type"][0] = 5
-    with pytest.raises(DataError, match=r"trajectory 00001: its material 'water' \(type 5\) is unknown.*goop"):
+    with pytest.raises(DataError, match=r"trajectory 00001: the material 'water' \(type 5\) is not in the scene.*goop"):
         recordings[1]
     with h5py.File(folder / "train.h5", "a") as file:
         file["00001/particle_type"][0] = 8
@@ -82,7 +82,7 @@ def test_unknown_material_is_named(make_dataset):
 def test_padding_of_a_batch(make_dataset):
     recordings = recordings_of(make_dataset(statics=2))
     chosen = [recordings[i] for i in range(3)]
-    window = Shelf.of(chosen, recordings.scene).window([0, 1, 2], [0, 3, 6], 5)
+    window = PaddedRecordings.stack(chosen, recordings.scene).gather([0, 1, 2], [0, 3, 6], 5)
     assert window.frames.shape == (3, 5, 7, 2)
     assert window.mask.sum(dim=1).tolist() == [5, 7, 6]
     assert window.obstacle_mask.all()
@@ -104,7 +104,7 @@ PERIODIC = Scene(
 
 @given(seed=st.integers(0, 1000), frames=st.integers(2, 40))
 @settings(max_examples=50, deadline=None)
-def test_unwrapping_undoes_wrapping(seed, frames):
+def test_unwrap_inverts_wrapping(seed, frames):
     generator = torch.Generator().manual_seed(seed)
     steps = (torch.rand(2, frames, 5, 2, generator=generator) - 0.5) * 0.9
     path = steps.cumsum(dim=1)
@@ -142,4 +142,4 @@ def test_dimensions_contradict_the_scene(make_dataset):
     path = recordings.split.path.with_name("deep.h5")
     write_split(path, [Trajectory(np.zeros((3, 2, 3)), np.full(2, 7))])
     with pytest.raises(DataError, match="positions have 3 dimensions, the scene has 2"):
-        Recordings(Split(path), recordings.reader.metadata, recordings.scene)
+        SplitRecordings(Split(path), recordings.reader.metadata, recordings.scene)

@@ -1,4 +1,4 @@
-"""What is suspicious about a trajectory, as sentences that name trajectory, frame and particle."""
+"""Finds anomalies of a trajectory, as sentences that name trajectory, frame and particle."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from collections.abc import Iterator
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import first_that_moves
+from nmpm.data.statistics import first_moving_particle
 
-_JUMP = 5.0  # spacings by which a particle's step may differ from the one before
+_JUMP = 5.0  # in spacings; a larger change between successive displacements of a particle is an anomaly
 
 
-def oddities(trajectory: Trajectory, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
-    """What is suspicious about one trajectory.
+def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
+    """Yields the anomalies of one trajectory.
 
     Args:
         trajectory: Read from the dataset.
         metadata: Of the dataset.
         spacing: Typical distance between neighbours, in domain length.
-        where: Split and trajectory, for the sentences.
+        where: Split and trajectory, to name in the sentences.
     """
     types, position = trajectory.particle_type, trajectory.position
     unknown = sorted(set(np.unique(types).tolist()) - set(metadata.particle_types))
     if unknown:
-        yield f"{where}: type {', '.join(map(str, unknown))} is unknown to the metadata."
+        yield f"{where}: type {', '.join(map(str, unknown))} is not in the metadata."
     moving = np.flatnonzero(np.isin(types, metadata.moving_types))
     if metadata.domain is not None:
         yield from _outside(position, metadata, where)
@@ -33,9 +33,9 @@ def oddities(trajectory: Trajectory, metadata: Metadata, spacing: float, where: 
     if (number > 1).any():
         twin = int(moving[first[int(np.argmax(number))]])
         twins = int((number - 1).sum())
-        yield f"{where}, frame 0: {twins} particles are where another is, e.g. where particle {twin} is."
+        yield f"{where}, frame 0: {twins} particles have the position of another, e.g. of particle {twin}."
     static = np.isin(types, list(metadata.static_types))
-    particle = first_that_moves(position, static, metadata.bounds)
+    particle = first_moving_particle(position, static, metadata.bounds)
     if particle is not None:
         yield f"{where}: particle {particle}, of the static type {types[particle]}, moves."
 
@@ -52,7 +52,7 @@ def _outside(position: np.ndarray, metadata: Metadata, where: str) -> Iterator[s
 
 
 def _jumps(position: np.ndarray, moving: np.ndarray, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
-    change = np.diff(steps(position[:, moving], metadata), axis=0)
+    change = np.diff(displacements(position[:, moving], metadata), axis=0)
     far = np.linalg.norm(change, axis=-1) > _JUMP * spacing
     if far.any():
         frame, index = map(int, np.argwhere(far)[0])
@@ -63,8 +63,8 @@ def _jumps(position: np.ndarray, moving: np.ndarray, metadata: Metadata, spacing
         )
 
 
-def steps(position: np.ndarray, metadata: Metadata) -> np.ndarray:
-    """(T - 1, N, D) ways from frame to frame, across a period the short way."""
+def displacements(position: np.ndarray, metadata: Metadata) -> np.ndarray:
+    """(T - 1, N, D) displacements between successive frames, by minimum image on periodic axes."""
     lower, upper = np.asarray(metadata.bounds).T
     step: np.ndarray = np.diff(position.astype(np.float64), axis=0)
     for axis in np.flatnonzero(metadata.periodic):

@@ -1,4 +1,4 @@
-"""Datasets published on the Hugging Face hub, fetched into the cache; nothing in them is run."""
+"""Downloads datasets from the Hugging Face hub into the cache; no code in them is executed."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from nmpm.data.archives import DAMAGED_ZIP
+from nmpm.data.archive_errors import ZIP_ERRORS
 from nmpm.data.catalog import dataset_home
-from nmpm.data.folder_lock import locked
+from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import SPLITS
 from nmpm.errors import ConfigError, DataError
 
 REPOSITORY = "iSach/NeuralMPM"
-"""Where names without an owner are looked up: the datasets of the paper's authors."""
+"""Repository of names without an owner: the datasets of the paper's authors."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _DATA = (".h5", ".json", ".npz", ".tfrecord", ".zst")
 
 
 def hub_folder(name: str) -> Path:
-    """The folder of a published dataset, fetched now if it is not in the cache.
+    """The folder of a published dataset, downloaded now if it is not in the cache.
 
-    Archives in it are unpacked, of which only data files with plain names are taken.
+    Archives are unpacked; only data files with plain names are extracted.
 
     Args:
         name: "WaterRamps" of `iSach/NeuralMPM`, or "owner/repository" with or without "/folder".
 
     Raises:
-        ConfigError: if the name cannot be one.
-        DataError: if it cannot be fetched, for lack of a connection or because there is none of that name.
+        ConfigError: if the name is malformed.
+        DataError: if it cannot be downloaded: no connection, or no dataset of that name.
     """
-    repository, folder = _parsed(name)
-    fetched = _fetched(repository, folder)
-    archives = sorted(fetched.rglob("*.zip"))
+    repository, folder = _parse_name(name)
+    downloaded = _fetch(repository, folder)
+    archives = sorted(downloaded.rglob("*.zip"))
     if not archives:
-        return fetched
+        return downloaded
     unpacked = dataset_home() / "hub" / repository.replace("/", "--") / (folder or "all")
-    with locked(unpacked.parent):
+    with lock_folder(unpacked.parent):
         if not unpacked.is_dir():
-            _unpack(fetched, archives, unpacked)
+            _unpack(downloaded, archives, unpacked)
     return _root(unpacked)
 
 
-def _parsed(name: str) -> tuple[str, str]:
+def _parse_name(name: str) -> tuple[str, str]:
     parts = name.strip("/").split("/")
     if len(parts) > 3 or not all(_NAME.fullmatch(part) for part in parts):
         raise ConfigError(
@@ -56,7 +56,7 @@ def _parsed(name: str) -> tuple[str, str]:
     return "/".join(parts[:2]), parts[2] if len(parts) == 3 else ""
 
 
-def _fetched(repository: str, folder: str) -> Path:
+def _fetch(repository: str, folder: str) -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
@@ -69,10 +69,10 @@ def _fetched(repository: str, folder: str) -> Path:
         raise DataError(f"{wanted}: the hub has no dataset {repository}.") from error
     except (LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
         raise DataError(
-            f"{wanted}: not in the cache, and it cannot be fetched from the Hugging Face hub ({_first_line(error)})."
-            f" Where there is a connection, `hf download --repo-type dataset {repository}"
-            f"{f' --include {folder}/*' if folder else ''} --local-dir data` fetches it; unpack what is packed, copy"
-            " it here, and give its folder as the path."
+            f"{wanted}: not in the cache, and cannot be downloaded from the Hugging Face hub ({_first_line(error)})."
+            f" On a machine with a connection, run `hf download --repo-type dataset {repository}"
+            f"{f' --include {folder}/*' if folder else ''} --local-dir data`, unpack archives, copy"
+            " the folder here, and give it as the path."
         ) from error
     if not (found / folder).is_dir():
         raise DataError(f"{wanted}: the dataset {repository} has no folder {folder}.")
@@ -83,20 +83,20 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
 
 
-def _unpack(fetched: Path, archives: list[Path], target: Path) -> None:
-    """All data files of the archives, and those beside them, into a folder that appears once it is whole."""
+def _unpack(downloaded: Path, archives: list[Path], target: Path) -> None:
+    """Copies the data files of the archives, and those beside them, into a folder that appears when it is complete."""
     part = target.with_name(f".{target.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
         for archive in archives:
-            _unpack_one(archive, part / archive.parent.relative_to(fetched))
-        for file in fetched.rglob("*"):
+            _unpack_one(archive, part / archive.parent.relative_to(downloaded))
+        for file in downloaded.rglob("*"):
             if file.suffix in _DATA:
-                place = part / file.relative_to(fetched)
+                place = part / file.relative_to(downloaded)
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, place)
         part.rename(target)
-    except DAMAGED_ZIP as error:
+    except ZIP_ERRORS as error:
         raise DataError(f"{target}: cannot be unpacked ({_first_line(error)}).") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -109,7 +109,7 @@ def _unpack_one(archive: Path, target: Path) -> None:
             if item.is_dir() or path.suffix not in _DATA or "__MACOSX" in path.parts:
                 continue
             if path.is_absolute() or not all(_NAME.fullmatch(part) for part in path.parts):
-                raise DataError(f"{archive}: refuses to unpack {item.filename!r}, which may lead out of the folder.")
+                raise DataError(f"{archive}: does not unpack {item.filename!r}, as the path may leave the folder.")
             place = target.joinpath(*path.parts)
             place.parent.mkdir(parents=True, exist_ok=True)
             with file.open(item) as packed, place.open("wb") as out:
@@ -117,7 +117,7 @@ def _unpack_one(archive: Path, target: Path) -> None:
 
 
 def _root(folder: Path) -> Path:
-    """The folder that holds the splits, which archives may have put a level deeper."""
+    """The folder with the splits, which may be one level deeper in archives."""
     for candidate in (folder, *sorted(item for item in folder.iterdir() if item.is_dir())):
         if any((candidate / split).is_dir() or (candidate / f"{split}.h5").is_file() for split in SPLITS):
             return candidate

@@ -1,27 +1,29 @@
 import dataclasses
+import threading
 from itertools import islice
 
 import pytest
 import torch
 
-from nmpm.data.buffer import TrajectoryBuffer
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split
-from nmpm.data.live import LiveRecordings
-from nmpm.data.plan import EndlessPlan
+from nmpm.data.loading.background import AbandonedError, run_in_thread
+from nmpm.data.loading.buffer import TrajectoryBuffer
+from nmpm.data.loading.simulated import SimulatedRecordings
+from nmpm.data.loading.window_plan import EndlessWindowPlan
 from nmpm.errors import ConfigError
 from nmpm.sim import MpmPreset, load_preset
 
 GOOP = load_preset("goop")
 TINY = dataclasses.replace(GOOP, frames=8, blocks=dataclasses.replace(GOOP.blocks, particles=(40, 60)))
-PLAN = EndlessPlan(frames=(9, 9), length=5, batch_size=3, buffer_size=2, passes=1, seed=0)
+PLAN = EndlessWindowPlan(frames=(9, 9), length=5, batch_size=3, buffer_size=2, passes=1, seed=0)
 
 
-def live(**changes) -> LiveRecordings:
-    return LiveRecordings(TINY, **({"workers": 2} | changes))
+def live(**changes) -> SimulatedRecordings:
+    return SimulatedRecordings(TINY, **({"workers": 2} | changes))
 
 
-def test_a_number_is_always_the_same_trajectory():
+def test_an_index_is_always_the_same_trajectory():
     one, other, again = live(), live(seed=1), live()
     assert torch.equal(one[3].frames, again.load([5, 3])[1].frames)
     assert one[3].frames.shape != one[4].frames.shape or not torch.equal(one[3].frames, one[4].frames)
@@ -37,7 +39,7 @@ def test_simulates_no_trajectory_twice_for_the_same_request(monkeypatch):
     assert len(seeds) == len(set(seeds)) == 4
 
 
-def test_batches_go_on_anywhere():
+def test_resumes_at_any_batch():
     straight = list(islice(TrajectoryBuffer(live(), PLAN).batches(), 12))
     resumed = list(islice(TrajectoryBuffer(live(), PLAN).batches(start=5), 7))
     for expected, window in zip(straight[5:], resumed, strict=True):
@@ -49,7 +51,7 @@ def test_no_trajectory_is_in_two_buffers_or_ranks():
     assert sorted(index for buffer in members for index in buffer) == list(range(24))
 
 
-def test_a_buffers_windows_are_all_seen():
+def test_all_windows_of_a_buffer_are_drawn():
     per_buffer = PLAN.batches_per_buffer(world=2)
     drawn = {window for index in range(per_buffer) for window in PLAN.batch(index, rank=1, world=2)}
     assert per_buffer == 3
@@ -60,18 +62,38 @@ def test_a_buffers_windows_are_all_seen():
 @pytest.mark.parametrize(("earlier", "world"), [(1, 2), (2, 1), (3, 2), (2, 3)])
 def test_no_trajectory_is_seen_again_by_another_number_of_ranks(earlier, world):
     seen = {index for rank in range(earlier) for batch in range(7) for index, _ in PLAN.batch(batch, rank, earlier)}
-    after = PLAN.after(7, PLAN.batch_size, earlier, world)
+    after = PLAN.resume_after(7, PLAN.batch_size, earlier, world)
     more = {index for rank in range(world) for batch in range(7, 14) for index, _ in after.batch(batch, rank, world)}
     assert max(seen) < min(more) <= max(seen) + 2 * world
 
 
-def test_a_failed_simulation_is_reported():
+def test_errors_of_the_simulation_are_raised():
     fast = dataclasses.replace(TINY, blocks=dataclasses.replace(TINY.blocks, speed=1e200))
     with pytest.raises(ConfigError, match=r"Preset goop, seed .*finite"):
-        LiveRecordings(fast).load([0, 1])
+        SimulatedRecordings(fast).load([0, 1])
 
 
-def test_too_long_a_horizon():
+def test_closing_stops_simulations_and_a_later_request_starts_anew(monkeypatch):
+    simulate, begun, endless = MpmPreset.simulate, threading.Event(), [True]
+
+    def waits(preset, seed, progress):
+        begun.set()
+        while endless:
+            progress(0)
+        return simulate(preset, seed, progress=progress)
+
+    monkeypatch.setattr(MpmPreset, "simulate", waits)
+    recordings = live()
+    waiting = run_in_thread(recordings.load, [0, 1])
+    assert begun.wait(60)
+    recordings.close()
+    with pytest.raises(AbandonedError):
+        waiting.result()
+    endless.clear()
+    assert len(recordings.load([0, 1])) == 2
+
+
+def test_a_horizon_longer_than_the_trajectories_is_refused():
     with pytest.raises(ConfigError, match=r"goop: its trajectories have 9 frames, .* needs 10"):
         TrajectoryBuffer(live(), dataclasses.replace(PLAN, length=10))
 
@@ -85,11 +107,11 @@ class TestDataModule:
             name="goop", source="simulate", horizon=3, batch_size=2, buffer_size=2, generate=options
         )
 
-    def test_trains_on_what_is_never_written(self, module):
+    def test_training_trajectories_are_not_written(self, module):
         window = next(iter(module.train_dataloader()))
         assert window.frames.shape[:2] == (2, 5)
         assert len(next(iter(module.val_dataloader())).frames) == 1
-        assert sorted(path.name for path in module.origin.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
+        assert sorted(path.name for path in module.data_source.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
         assert "simulated by nmpm while training" in module.description
 
     def test_evaluates_on_the_trajectories_of_the_dataset(self, module):
@@ -97,7 +119,7 @@ class TestDataModule:
             name="goop", generate={"counts": {"train": 1, "valid": 1, "test": 1}, "frames": 6}
         )
         for split in ("valid", "test"):
-            live_file, stored_file = (Split(data.origin.folder / f"{split}.h5") for data in (module, stored))
+            live_file, stored_file = (Split(data.data_source.folder / f"{split}.h5") for data in (module, stored))
             assert (live_file.read(0).position == stored_file.read(0).position).all()
 
     def test_needs_the_name_of_a_preset(self):

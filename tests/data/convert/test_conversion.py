@@ -9,51 +9,51 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.data.convert import Options, Source, convert
-from nmpm.data.convert.base import Reread
-from nmpm.data.convert.run import write_source
+from nmpm.data.convert import ForeignDataset, Options, convert
+from nmpm.data.convert.base import Rereadable
+from nmpm.data.convert.conversion import write_native
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.conftest import made_up_metadata, made_up_trajectory
 
 
-def source_of(*trajectories: Trajectory, **changes) -> Source:
-    return Source(made_up_metadata(**changes), {"train": Reread(lambda: iter(trajectories))})
+def source_of(*trajectories: Trajectory, **changes) -> ForeignDataset:
+    return ForeignDataset(made_up_metadata(**changes), {"train": Rereadable(lambda: iter(trajectories))})
 
 
-def test_a_taken_destination_is_left_alone(tmp_path):
+def test_an_existing_destination_is_not_overwritten(tmp_path):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "precious.txt").write_text("mine")
-    with pytest.raises(DataError, match="taken: is there already"):
-        write_source(source_of(made_up_trajectory(5, 3)), tmp_path / "taken")
+    with pytest.raises(DataError, match="taken: exists already"):
+        write_native(source_of(made_up_trajectory(5, 3)), tmp_path / "taken")
     assert (tmp_path / "taken" / "precious.txt").read_text() == "mine"
 
 
-def test_an_error_half_way_leaves_nothing(tmp_path):
+def test_an_error_during_conversion_leaves_no_files(tmp_path):
     def broken():
         yield made_up_trajectory(5, 3)
         raise DataError("the second is damaged")
 
     with pytest.raises(DataError, match="second is damaged"):
-        write_source(Source(made_up_metadata(), {"train": Reread(broken)}), tmp_path / "out")
+        write_native(ForeignDataset(made_up_metadata(), {"train": Rereadable(broken)}), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
-def test_killed_half_way_it_leaves_no_dataset_and_the_next_call_sweeps(tmp_path):
+def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_removes_its_files(tmp_path):
     script = f"""
 import sys, time
 sys.path.insert(0, {str(Path.cwd())!r})
 from pathlib import Path
-from nmpm.data.convert import Source
-from nmpm.data.convert.base import Reread
-from nmpm.data.convert.run import write_source
+from nmpm.data.convert import ForeignDataset
+from nmpm.data.convert.base import Rereadable
+from nmpm.data.convert.conversion import write_native
 from tests.conftest import made_up_metadata, made_up_trajectory
 def slow():
     yield made_up_trajectory(5, 3)
     print("begun", flush=True)
     time.sleep(60)
-write_source(Source(made_up_metadata(), {{"train": Reread(slow)}}), Path({str(tmp_path / "out")!r}))
+write_native(ForeignDataset(made_up_metadata(), {{"train": Rereadable(slow)}}), Path({str(tmp_path / "out")!r}))
 """
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
@@ -62,15 +62,15 @@ write_source(Source(made_up_metadata(), {{"train": Reread(slow)}}), Path({str(tm
     process.wait()
     time.sleep(0.1)
     assert not (tmp_path / "out").exists()
-    write_source(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
+    write_native(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
     assert [item.name for item in tmp_path.iterdir()] == ["out"]
 
 
-def test_says_what_is_odd(tmp_path):
+def test_notes_on_inconsistencies(tmp_path):
     still, moving = made_up_trajectory(5, 3, statics=2), made_up_trajectory(5, 3, seed=1, statics=2)
     moving.position[:, -1, 0] += np.linspace(0, 0.1, 5, dtype=np.float32)
     moving.position[2, 0, 1] = 0.95
-    notes = write_source(source_of(still, moving, extra={"vel_std": [1.0, 1.0]}), tmp_path / "out")
+    notes = write_native(source_of(still, moving, extra={"vel_std": [1.0, 1.0]}), tmp_path / "out")
     said = " ".join(notes)
     assert "static type move in 1 of 2 trajectories" in said
     assert "state vel_std = (1, 1)" in said
@@ -83,21 +83,21 @@ def test_says_what_is_odd(tmp_path):
     assert infer_scene(tmp_path / "out").domain[1][1] >= 0.95
 
 
-def test_says_nothing_of_clean_data(tmp_path):
-    notes = write_source(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "out")
+def test_no_notes_on_consistent_data(tmp_path):
+    notes = write_native(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "out")
     assert notes == ()
 
 
-def test_unknown_types_are_refused_with_the_remedy(tmp_path):
+def test_unknown_types_are_refused_with_a_suggestion(tmp_path):
     trajectory = made_up_trajectory(5, 3)
     strange = Trajectory(trajectory.position, np.full(3, 42))
     with pytest.raises(DataError, match=r"train split, trajectory 0: unknown particle type 42"):
-        write_source(source_of(strange), tmp_path / "out")
+        write_native(source_of(strange), tmp_path / "out")
 
 
-def test_what_is_of_no_format_is_refused(tmp_path):
+def test_an_unknown_format_is_refused(tmp_path):
     (tmp_path / "a.txt").write_text("hello")
-    with pytest.raises(DataError, match=r"of no format that is known \(native, deepmind.*found a\.txt"):
+    with pytest.raises(DataError, match=r"no known format \(native, deepmind.*found a\.txt"):
         convert(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match="no such file or folder"):
         convert(tmp_path / "nowhere", tmp_path / "out")
@@ -106,7 +106,7 @@ def test_what_is_of_no_format_is_refused(tmp_path):
 
 
 class TestNative:
-    def test_takes_over_what_is_stated(self, make_dataset, tmp_path):
+    def test_stated_options_enter_the_metadata(self, make_dataset, tmp_path):
         folder = make_dataset(statics=1)
         convert(folder, tmp_path / "out", options=Options(types={7: "honey"}, gravity=(0.0, -1.0), dt=0.5))
         metadata = read_metadata(tmp_path / "out")
@@ -117,7 +117,7 @@ class TestNative:
             for index in range(len(old)):
                 np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
 
-    def test_types_are_renumbered_for_the_next_reader(self, make_dataset, tmp_path):
+    def test_types_are_renumbered(self, make_dataset, tmp_path):
         folder = make_dataset(statics=2)
         convert(folder, tmp_path / "out", ids={7: 0, 3: 1})
         metadata = read_metadata(tmp_path / "out")
@@ -127,7 +127,7 @@ class TestNative:
 
     @pytest.mark.parametrize(
         ("ids", "message"),
-        [({5: 0}, "no particle type 5"), ({7: 0, 3: 0}, "the same id"), ({7: 3}, "type 3 occurs, and its id")],
+        [({5: 0}, "no particle type 5"), ({7: 0, 3: 0}, "the same id"), ({7: 3}, "type 3 occurs, but its id")],
     )
     def test_renumbering_loses_no_type(self, make_dataset, tmp_path, ids, message):
         with pytest.raises(ConfigError, match=message):
@@ -142,7 +142,7 @@ class TestNative:
         for index in range(len(old)):
             with h5py.File(old.path) as file:
                 temperature = file[old.names[index]]["temperature"][()]
-            np.testing.assert_array_equal(new.whole(index).fields["temperature"], temperature)
+            np.testing.assert_array_equal(new.read_with_fields(index).fields["temperature"], temperature)
             np.testing.assert_array_equal(new.read(index).position, old.read(index).position)
         metadata = read_metadata(tmp_path / "channel")
         assert metadata.periodic == (True, False)
@@ -151,7 +151,7 @@ class TestNative:
         # Shortest ways across the period: the file's own figures for the fluid.
         assert metadata.extra["vel_std"] == pytest.approx(metadata.extra["stated_statistics"]["vel_std"], rel=0.05)
 
-    def test_our_data_open_with_plain_h5py_after_lagrangebench(self, tmp_path):
+    def test_converted_data_are_readable_the_way_lagrangebench_reads(self, tmp_path):
         """As LagrangeBench documents it: a group per trajectory, `position` (T, N, D), `particle_type` (N,)."""
         write_split(tmp_path / "train.h5", [made_up_trajectory(6, 4), made_up_trajectory(6, 4, seed=1)])
         write_metadata(tmp_path, made_up_metadata())

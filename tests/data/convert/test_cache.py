@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.convert import Options
-from nmpm.data.convert.inplace import native_folder
+from nmpm.data.convert.cache import native_folder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import read_metadata
 from tests.data.convert import records
@@ -22,7 +22,7 @@ def foreign(tmp_path, monkeypatch):
     return folder
 
 
-def test_is_converted_once_and_again_when_something_changes(foreign):
+def test_is_converted_once_and_again_after_a_change(foreign):
     first = native_folder(foreign)
     stamp = (first / "train.h5").stat().st_mtime_ns
     assert native_folder(foreign) == first
@@ -33,7 +33,7 @@ def test_is_converted_once_and_again_when_something_changes(foreign):
     assert read_metadata(first).particle_types[5] == "water"
 
 
-def test_foreign_data_can_be_trained_on_where_they_are(foreign):
+def test_other_formats_can_be_trained_on_directly(foreign):
     data = TrajectoryDataModule(path=str(foreign), gravity=[0.0, -9.81], horizon=4, batch_size=1)
     data.prepare_data()
     data.setup("fit")

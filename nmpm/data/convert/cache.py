@@ -1,4 +1,4 @@
-"""Foreign formats used where they are: converted once, into the cache, and found there from then on."""
+"""Converts datasets of other formats once, into the cache, so that they can be used like native ones."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from pathlib import Path
 
 from nmpm.data.catalog import dataset_home
 from nmpm.data.convert import Options, convert
-from nmpm.data.folder_lock import locked
+from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import METADATA_FILE
 
 _log = logging.getLogger(__name__)
 
 
 def native_folder(path: Path, options: Options | None = None) -> Path:
-    """A folder in the native layout with the same data: converted now, or by an earlier call.
+    """A folder in the native layout with the same data, converted now or by an earlier call.
 
-    The copy is made anew when a file of the source has changed (in size or time) or the options have.
+    The dataset is converted again when the size or time of a source file, or an option, has changed.
 
     Args:
         path: A file or folder of any format that `nmpm convert` reads.
-        options: What its files leave open.
+        options: Facts that its files do not state.
 
     Raises:
-        DataError: if the source cannot be read, or the cache not be written.
+        DataError: if the source cannot be read or the cache cannot be written.
     """
     path, options = Path(path).resolve(), options or Options()
     cache = dataset_home() / "converted"
     folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
-    with locked(cache):
+    with lock_folder(cache):
         if not (folder / METADATA_FILE).is_file():
             for note in convert(path, folder, options=options):
                 _log.info("%s: %s", path.name, note)
@@ -38,8 +38,8 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
 
 
 def _fingerprint(path: Path, options: Options) -> str:
-    told = repr((str(path), _plain(options), list(_stamps(path))))
-    return hashlib.sha256(told.encode()).hexdigest()[:10]
+    identity = repr((str(path), _plain(options), list(_file_stamps(path))))
+    return hashlib.sha256(identity.encode()).hexdigest()[:10]
 
 
 def _plain(options: Options) -> list[tuple[str, object]]:
@@ -49,7 +49,7 @@ def _plain(options: Options) -> list[tuple[str, object]]:
     return sorted(entries.items())
 
 
-def _stamps(path: Path) -> Iterator[tuple[str, int, int]]:
+def _file_stamps(path: Path) -> Iterator[tuple[str, int, int]]:
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
             status = file.stat()

@@ -1,12 +1,12 @@
 """Which training windows make up which batch.
 
-The trajectories of a dataset, shuffled again and again, form one endless row; buffer b is its b-th slice of
-`buffer_size`. The windows of a buffer, shuffled again and again, form another endless row; batch after batch is cut
-from it, dealt to the ranks in turn, until `passes` times as many windows as an average buffer holds have been drawn.
-So every window is as likely as any other, no rank sees what another sees within a pass, and batch i of a rank is a
-pure function of the seed and the data: training that stopped goes on with the batch it would have seen. All ranks'
-batches together are that of one process with as large a batch; where their size changes, training goes on in the same
-row of windows (`WindowPlan.after`).
+The trajectories of a dataset, reshuffled in each pass, form an endless sequence; buffer b is its b-th slice of
+`buffer_size`. The windows of a buffer, reshuffled in each pass, form another endless sequence; batches are consecutive
+slices of it, assigned to the ranks in turn, until `passes` times as many windows as an average buffer holds have been
+drawn. So all windows are equally likely, no two ranks see the same window within a pass, and batch i of a rank is a
+pure function of the seed and the data: a resumed training has the same batches as an uninterrupted one. The batches of
+all ranks together equal that of one process with a batch as large; where the batch size or the number of ranks
+changes, training continues in the same sequence of windows (`WindowPlan.resume_after`).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _TRAJECTORIES, _WINDOWS, MOTION = 0, 1, 2  # separate the streams of random numb
 
 
 @dataclass(frozen=True)
-class Start:
-    """Where batches of a size begin.
+class PlanStart:
+    """Where the batches of the current size start in the sequence of windows.
 
     Args:
-        batch: Number of the first of them.
-        buffer: The buffer that it is drawn from.
-        drawn: How many windows of that buffer were drawn before.
+        batch: Index of the first of them.
+        buffer: Index of the buffer that it is drawn from.
+        drawn: Windows of that buffer that were drawn before.
     """
 
     batch: int = 0
@@ -39,17 +39,17 @@ class Start:
 
 @dataclass(frozen=True)
 class WindowPlan:
-    """Says which windows make up which batch.
+    """Assigns windows to batches.
 
     Args:
         frames: Frames of each trajectory of the dataset.
         length: Frames of a window.
         batch_size: Windows in a batch of one rank.
-        buffer_size: Trajectories held at a time; all are held when there are no more than that.
-        passes: How often a buffer's windows are seen, on average, before the next buffer.
-        seed: Another seed gives another order.
-        emphasis: Share of the windows that is drawn in proportion to the motion in them, in [0, 1].
-        start: Where the batches of this size begin, if there were others before.
+        buffer_size: Trajectories in memory at a time; all of them where the dataset has no more.
+        passes: How often a buffer's windows are drawn, on average, before the next buffer.
+        seed: Seed of the order.
+        emphasis: Fraction of the windows that is drawn in proportion to the motion in them, in [0, 1].
+        start: Where the batches of this size start, if there were batches of another size before.
 
     Raises:
         ConfigError: if a number is out of its range.
@@ -62,7 +62,7 @@ class WindowPlan:
     passes: float
     seed: int
     emphasis: float = 0.0
-    start: Start = Start()
+    start: PlanStart = PlanStart()
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "buffer_size", "passes"):
@@ -71,20 +71,20 @@ class WindowPlan:
         if self.seed < 0:
             raise ConfigError(f"seed = {self.seed} must not be negative.")
         if not 0 <= self.emphasis <= 1:
-            raise ConfigError(f"emphasis = {self.emphasis} is a share, from 0 to 1.")
+            raise ConfigError(f"emphasis = {self.emphasis} must be between 0 and 1: a fraction of the windows.")
 
     def windows(self, trajectory: int) -> int:
-        """How many windows a trajectory has."""
+        """Number of windows in a trajectory."""
         return self.frames[trajectory] - self.length + 1
 
     def batches_per_buffer(self, world: int) -> int:
-        """How many batches each of `world` ranks draws from a buffer before the next."""
+        """Number of batches that each of `world` ranks draws from a buffer before the next one."""
         average = sum(map(self.windows, range(len(self.frames)))) / len(self.frames)
         drawn = self.passes * average * min(self.buffer_size, len(self.frames))
         return max(1, round(drawn / (self.batch_size * world)))
 
     def members(self, buffer: int, rank: int = 0, world: int = 1) -> tuple[int, ...]:  # noqa: ARG002
-        """The trajectories in a buffer of a rank, each once, in ascending order; the same ones for all ranks."""
+        """Indices of the trajectories in a rank's buffer, unique and ascending; the same for all ranks."""
         total = len(self.frames)
         if total <= self.buffer_size:
             return tuple(range(total))
@@ -92,8 +92,8 @@ class WindowPlan:
         chosen = {int(_shuffle(total, self.seed, _TRAJECTORIES, p // total)[p % total]) for p in places}
         return tuple(sorted(chosen))
 
-    def place(self, index: int, world: int) -> tuple[int, int]:
-        """The buffer that a batch is drawn from, and how many of its windows are drawn before."""
+    def locate(self, index: int, world: int) -> tuple[int, int]:
+        """Index of the buffer that a batch is drawn from, and the number of its windows drawn before."""
         stride, per_buffer = self._stride(world), self.batches_per_buffer(world)
         since = index - self.start.batch
         left = max(0, per_buffer - self.start.drawn // stride)
@@ -103,8 +103,8 @@ class WindowPlan:
         return self.start.buffer + 1 + buffers, turn * stride
 
     def batch(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
-        """The windows of a batch, each as (trajectory, first frame)."""
-        buffer, drawn = self.place(index, world)
+        """The windows of a batch, each as (trajectory index, first frame)."""
+        buffer, drawn = self.locate(index, world)
         members = self.members(buffer, rank, world)
         ends = np.cumsum([self.windows(trajectory) for trajectory in members])
         total = int(ends[-1])
@@ -117,35 +117,37 @@ class WindowPlan:
             for owner, window in zip(owners, chosen, strict=True)
         ]
 
-    def after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
-        """This plan, to be gone on with after batches of another size: with the first window that none of them had.
+    def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
+        """The plan that continues after batches of another size, at the first window that none of them used.
 
         Args:
-            batches: Batches that each rank has had, from the first on.
+            batches: Batches that each rank has used, since the beginning.
             batch_size: Windows in each of those since `start`.
-            earlier: Number of ranks that had them.
+            earlier: Number of ranks that used them.
             world: Number of ranks from now on.
         """
         if batch_size * earlier == self.batch_size * world:
             return self
         if batches == self.start.batch:
             return self
-        had = replace(self, batch_size=batch_size)
-        buffer, drawn = had.place(batches - 1, earlier)  # a buffer's rest, too small for those, may do for these
-        return replace(self, start=Start(batches, buffer, drawn + had._stride(earlier)))
+        before = replace(self, batch_size=batch_size)
+        buffer, drawn = before.locate(
+            batches - 1, earlier
+        )  # the rest of a buffer may be too small for the old batches, but not for the new
+        return replace(self, start=PlanStart(batches, buffer, drawn + before._stride(earlier)))
 
     def _stride(self, world: int) -> int:
-        """Windows of a buffer that one batch of every rank takes."""
+        """Windows of a buffer that one batch of all ranks uses."""
         return self.batch_size * world
 
     def _offset(self, rank: int) -> int:
-        """Batches are dealt to the ranks in turn."""
+        """First window of a rank's batch, within the stride."""
         return rank * self.batch_size
 
 
 @dataclass(frozen=True)
-class EndlessPlan(WindowPlan):
-    """Windows of trajectories without end, such as a simulator makes: every buffer of every rank has its own.
+class EndlessWindowPlan(WindowPlan):
+    """A plan for endless trajectories, such as a simulator gives: each buffer of each rank has trajectories of its own.
 
     Args:
         frames: Frames of each trajectory of a buffer, all equal.
@@ -161,13 +163,13 @@ class EndlessPlan(WindowPlan):
         first = (buffer * world + rank) * self.buffer_size
         return tuple(range(first, first + self.buffer_size))
 
-    def after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
-        """As for a plan with an end, but with the first buffer that no rank has begun."""
+    def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
+        """As for a finite dataset, but continues with the first buffer that no rank has started."""
         if (batch_size, earlier) == (self.batch_size, world):
             return self
-        buffer, drawn = replace(self, batch_size=batch_size).place(batches, earlier)
-        begun = (buffer + (drawn > 0)) * earlier
-        return replace(self, start=Start(batches, -(-begun // world)))
+        buffer, drawn = replace(self, batch_size=batch_size).locate(batches, earlier)
+        started = (buffer + (drawn > 0)) * earlier
+        return replace(self, start=PlanStart(batches, -(-started // world)))
 
     def _stride(self, world: int) -> int:  # noqa: ARG002
         return self.batch_size
@@ -178,7 +180,7 @@ class EndlessPlan(WindowPlan):
 
 @lru_cache(maxsize=8)
 def _shuffle(total: int, *stream: int) -> np.ndarray:
-    """The numbers below `total` in an order that depends on the stream alone."""
+    """A permutation of range(total) that depends on the stream alone."""
     order = np.random.default_rng(stream).permutation(total)
     order.flags.writeable = False
     return order

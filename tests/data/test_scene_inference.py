@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
-from nmpm.data.scenes import infer_scene
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 
 
@@ -52,7 +52,7 @@ class TestExtents:
 
     @given(shift=st.floats(-3, 3), scale=st.floats(0.1, 10))
     @settings(max_examples=25, deadline=None)
-    def test_contains_what_was_seen(self, scene_of, shift, scale):
+    def test_contains_the_observed_positions(self, scene_of, shift, scale):
         position = shift + scale * lattice(0.05)
         scene = scene_of(run(position.astype(np.float32)))
         for (low, high), (outer_low, outer_high) in zip(scene.bounds, scene.domain, strict=True):
@@ -116,12 +116,12 @@ class TestParticles:
     def test_stated_volume(self, scene_of):
         assert scene_of(run(lattice(0.02)), metadata=replace(BOX, particle_volume=0.5)).particle_volume == 0.5
 
-    def test_volume_that_cannot_be_known(self, scene_of):
+    def test_volume_that_cannot_be_estimated(self, scene_of):
         with pytest.raises(DataError, match="particle_volume"):
             scene_of(run(lattice(0.02, count=1)))
 
     def test_nothing_moves(self, scene_of):
-        with pytest.raises(DataError, match="none of its particles moves"):
+        with pytest.raises(DataError, match="no particle has a moving type"):
             scene_of(run(lattice(0.01), 3))
 
     def test_unknown_type(self, scene_of):
@@ -129,7 +129,7 @@ class TestParticles:
             scene_of(run(lattice(0.01)), run(lattice(0.01), 6))
 
     def test_dimensions_contradict(self, scene_of):
-        with pytest.raises(DataError, match=r"positions have 3 dimensions, metadata.json says 2"):
+        with pytest.raises(DataError, match=r"positions have 3 dimensions, metadata.json has dim = 2"):
             scene_of(run(lattice(0.01, dim=3)))
 
     def test_no_split(self, make_dataset):
@@ -137,7 +137,7 @@ class TestParticles:
         with pytest.raises(DataError, match=r"no train.h5, valid.h5 or test.h5"):
             infer_scene(folder)
 
-    def test_other_splits_serve_where_train_is_missing(self, scene_of):
+    def test_another_split_where_train_is_missing(self, scene_of):
         assert scene_of(run(lattice(0.01)), split="test").materials == ("goop",)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from nmpm.data.convert import Options, RolloutPickle, convert
-from nmpm.data.convert.pickles import load_pickled, numbers
+from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import Split, Trajectory
 from nmpm.errors import DataError
 
@@ -67,25 +67,25 @@ def test_arrays_come_back_as_they_were(array, protocol):
         (Runs(Path, "PLACE"), "pathlib"),
     ],
 )
-def test_nothing_is_run(evil, named, tmp_path, monkeypatch):
+def test_pickles_that_request_other_names_are_refused(evil, named, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for content in (evil, [1, {"deep": (evil,)}], np.array([evil, None])):
         for protocol in (0, 2, 4):
-            with pytest.raises(DataError, match=f"here: cannot be read as pickled arrays: it asks for .*{named}"):
+            with pytest.raises(DataError, match=f"here: cannot be read as pickled arrays: it requests .*{named}"):
                 load_pickled(pickle.dumps(content, protocol), "here")
     assert not list(tmp_path.iterdir())
 
 
-def test_memory_is_not_claimed_by_name_alone():
+def test_pickles_cannot_allocate_arrays_directly():
     with pytest.raises(DataError, match="cannot be read as pickled arrays"):
         load_pickled(pickle.dumps(Runs(np.ndarray, (2**40,))), "here")
-    with pytest.raises(DataError, match="outside of itself"):
+    with pytest.raises(DataError, match="external object"):
         load_pickled(b"\x80\x04K\x01Q.", "here")
 
 
 @given(data=st.binary(max_size=200))
 @settings(deadline=None, max_examples=300)
-def test_noise_is_refused_or_harmless(data):
+def test_random_bytes_never_crash_or_execute(data):
     try:
         load_pickled(data, "here")
     except DataError as error:
@@ -113,7 +113,7 @@ def test_a_rollout_becomes_a_trajectory_with_its_prediction(tmp_path):
     content = rollout()
     path = write(tmp_path / "rollout_test_0.pkl", content, 2)
     notes = convert(path, tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "test.h5").whole(0)
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     truth = np.concatenate([content["initial_positions"], content["ground_truth_rollout"]])
     predicted = np.concatenate([content["initial_positions"], content["predicted_rollout"]])
     np.testing.assert_array_equal(trajectory.position, truth)
@@ -122,7 +122,7 @@ def test_a_rollout_becomes_a_trajectory_with_its_prediction(tmp_path):
     assert any("predicted_rollout" in note for note in notes)
 
 
-def test_what_is_no_rollout_says_what_is_missing(tmp_path):
+def test_a_pickle_without_the_rollout_keys_names_the_missing_ones(tmp_path):
     path = write(tmp_path / "rollout_0.pkl", {"initial_positions": 1})
     with pytest.raises(DataError, match=r"a rollout has initial_positions, ground_truth.*found initial_positions"):
         convert(path, tmp_path / "out")
@@ -131,18 +131,18 @@ def test_what_is_no_rollout_says_what_is_missing(tmp_path):
         convert(path, tmp_path / "out")
 
 
-def test_numbers_may_be_objects_but_nothing_else():
-    np.testing.assert_array_equal(numbers(np.array([1, 2.5, np.int64(3)], object), "here"), [1, 2.5, 3])
-    with pytest.raises(DataError, match="here: numbers are due, found objects such as str"):
-        numbers(np.array(["a", 1], object), "here")
+def test_arrays_of_number_objects_are_converted_others_refused():
+    np.testing.assert_array_equal(number_array(np.array([1, 2.5, np.int64(3)], object), "here"), [1, 2.5, 3])
+    with pytest.raises(DataError, match="here: expected numbers, found objects such as str"):
+        number_array(np.array(["a", 1], object), "here")
 
 
 def test_recorded_rollout_equals_the_record_beside_it(recorded, tmp_path):
     folder = recorded / "deepmind-sand-subset"
     convert(folder / "rollout_test_s0.pkl", tmp_path / "rollout")
     convert(folder / "test_sub.tfrecord", tmp_path / "record")
-    rolled = Split(tmp_path / "rollout" / "test.h5").whole(0)
-    record = Split(tmp_path / "record" / "test.h5").whole(0)
+    rolled = Split(tmp_path / "rollout" / "test.h5").read_with_fields(0)
+    record = Split(tmp_path / "record" / "test.h5").read_with_fields(0)
     assert rolled.position.shape == (320, 256, 2)
     np.testing.assert_array_equal(rolled.position, record.position[:320])
     assert rolled.fields["predicted_rollout"].shape == (320, 256, 2)

@@ -1,4 +1,4 @@
-"""Where a datamodule's trajectories come from: a folder, an embedded dataset, the simulator itself, or a hub."""
+"""Where a datamodule's trajectories come from: a folder, the Hugging Face hub, an embedded dataset or a simulator."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nmpm.data import catalog
-from nmpm.data.buffer import Source
+from nmpm.data.convert import Options
+from nmpm.data.convert.cache import native_folder
 from nmpm.data.format import Metadata, Split, read_metadata, split_paths
-from nmpm.data.live import LiveRecordings
-from nmpm.data.plan import EndlessPlan, WindowPlan
-from nmpm.data.recording import Recordings
-from nmpm.data.scenes import infer_scene
+from nmpm.data.hub import hub_folder
+from nmpm.data.loading.buffer import RecordingProvider
+from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.loading.simulated import SimulatedRecordings
+from nmpm.data.loading.window_plan import EndlessWindowPlan, WindowPlan
+from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene
 
-if TYPE_CHECKING:
-    from nmpm.data.convert import Options
-
 
 @dataclass(frozen=True)
-class Stated:
-    """What a user says of recorded data where its files do not, or are wrong; as `infer_scene` takes it."""
+class StatedFacts:
+    """What a user states about recorded data where the files are silent or wrong; arguments of `infer_scene`."""
 
     family: str | None = None
     gravity: Sequence[float] | None = None
@@ -35,9 +35,7 @@ class Stated:
 
     @property
     def options(self) -> Options:
-        """The same for the converter of foreign formats."""
-        from nmpm.data.convert import Options
-
+        """The same as options for the conversion of a foreign format."""
         return Options(
             family=self.family,
             gravity=None if self.gravity is None else tuple(map(float, self.gravity)),
@@ -46,46 +44,46 @@ class Stated:
         )
 
 
-class Origin(abc.ABC):
-    """A source of trajectories; below it, one class per kind. Nothing is read or simulated before it is asked for."""
+class DataSource(abc.ABC):
+    """Abstract source of trajectories, one subclass per kind. Files are read and datasets simulated on first use."""
 
     @property
     @abc.abstractmethod
     def description(self) -> str:
-        """What the data are, in words; simulated data are named so."""
+        """The data in words; simulated data are called simulated."""
 
     @property
     @abc.abstractmethod
     def folder(self) -> Path:
-        """A folder in the native layout that holds at least what is evaluated on; made if it is not there yet."""
+        """Folder in the native layout with at least the splits for evaluation; created on first use."""
 
     @property
     @abc.abstractmethod
     def scene(self) -> Scene:
-        """The facts that the trajectories share."""
+        """The scene that the trajectories share."""
 
     @cached_property
     def metadata(self) -> Metadata:
         """The metadata of the folder."""
         return read_metadata(self.folder)
 
-    def recordings(self, name: str) -> Recordings:
-        """The trajectories of a split: "train", "valid" or "test".
+    def recordings(self, name: str) -> SplitRecordings:
+        """The trajectories of the split "train", "valid" or "test".
 
         Raises:
-            DataError: if there is no such split, or its file is damaged.
+            DataError: if the split is missing or its file is damaged.
         """
         paths = split_paths(self.folder)
         if name not in paths:
-            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split at all'}).")
-        return Recordings(Split(paths[name]), self.metadata, self.scene)
+            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split'}).")
+        return SplitRecordings(Split(paths[name]), self.metadata, self.scene)
 
-    def training(self, length: int, **plan: Any) -> tuple[Source, WindowPlan]:
-        """What to train on.
+    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        """The trajectories to train on, and which of their windows make up which batch.
 
         Args:
             length: Frames of a window.
-            plan: The other entries of `WindowPlan`, without `frames`.
+            plan: The other fields of `WindowPlan`, except `frames`.
         """
         recordings = self.recordings("train")
         frames = tuple(map(recordings.split.frames, range(len(recordings))))
@@ -93,16 +91,16 @@ class Origin(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Folder(Origin):
+class FolderSource(DataSource):
     """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads.
 
     Args:
         path: The dataset.
-        stated: What its files leave open.
+        stated: What its files do not state.
     """
 
     path: Path
-    stated: Stated = field(default_factory=Stated)
+    stated: StatedFacts = field(default_factory=StatedFacts)
 
     @property
     def description(self) -> str:
@@ -112,8 +110,6 @@ class Folder(Origin):
     def folder(self) -> Path:
         if not self.path.exists() or split_paths(self.path):
             return self.path
-        from nmpm.data.convert.inplace import native_folder
-
         return native_folder(self.path, self.stated.options)
 
     @cached_property
@@ -127,8 +123,8 @@ class Folder(Origin):
 
 
 @dataclass(frozen=True)
-class Hub(Folder):
-    """A dataset published on the Hugging Face hub, fetched on first use.
+class HubSource(FolderSource):
+    """A dataset on the Hugging Face hub, downloaded on first use.
 
     Args:
         path: Its name, e.g. "WaterRamps" of `iSach/NeuralMPM`.
@@ -140,19 +136,17 @@ class Hub(Folder):
 
     @cached_property
     def folder(self) -> Path:
-        from nmpm.data.convert.hub import hub_folder
-        from nmpm.data.convert.inplace import native_folder
 
         return native_folder(hub_folder(str(self.path)), self.stated.options)
 
 
 @dataclass(frozen=True)
-class Embedded(Origin):
+class EmbeddedSource(DataSource):
     """An embedded dataset, simulated on first use.
 
     Args:
         name: One of `nmpm.data.catalog.catalog()`.
-        generate: Options of `nmpm.data.catalog.ensure`.
+        generate: Keyword arguments of `nmpm.data.catalog.ensure`.
     """
 
     name: str
@@ -164,13 +158,13 @@ class Embedded(Origin):
 
     @cached_property
     def folder(self) -> Path:
-        return catalog.ensure(self.name, **self._checked())
+        return catalog.ensure(self.name, **self._check_options())
 
     @property
     def scene(self) -> Scene:
         return catalog.scene(self.name)
 
-    def _checked(self) -> dict[str, Any]:
+    def _check_options(self) -> dict[str, Any]:
         try:
             inspect.signature(catalog.ensure).bind(self.name, **self.generate)
         except TypeError as error:
@@ -179,8 +173,8 @@ class Embedded(Origin):
 
 
 @dataclass(frozen=True)
-class Live(Embedded):
-    """Training on trajectories fresh from the simulator, none seen twice; evaluation on those of the dataset."""
+class SimulatedSource(EmbeddedSource):
+    """Trains on new trajectories from the simulator, each in one buffer only; evaluates on the embedded dataset."""
 
     @property
     def description(self) -> str:
@@ -188,13 +182,13 @@ class Live(Embedded):
 
     @cached_property
     def folder(self) -> Path:
-        options = self._checked()
+        options = self._check_options()
         counts = dict(options.get("counts") or catalog.describe(self.name).counts)
         return catalog.ensure(self.name, **(options | {"counts": counts | {"train": 0}}))
 
-    def training(self, length: int, **plan: Any) -> tuple[Source, WindowPlan]:
-        options = {key: value for key, value in self._checked().items() if key not in ("counts", "workers")}
-        request = catalog.request_of(self.name, **options)
-        recordings = LiveRecordings(request.preset, request.seed, self.generate.get("workers"))
+    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        options = {key: value for key, value in self._check_options().items() if key not in ("counts", "workers")}
+        request = catalog.simulation_request(self.name, **options)
+        recordings = SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
         frames = (request.preset.frames + 1,) * plan["buffer_size"]
-        return recordings, EndlessPlan(frames=frames, length=length, **plan)
+        return recordings, EndlessWindowPlan(frames=frames, length=length, **plan)

@@ -1,4 +1,4 @@
-"""The scene that a folder of trajectories shows, from its metadata and from the trajectories themselves."""
+"""Infers the scene of a dataset from its metadata and its trajectories."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene
 
 _WALL_LAYER = 0.025  # of the extent; DeepMind's 0.1-0.9 becomes the paper's 0.08-0.92
-_SURVEY_BYTES = 2**27
+_SAMPLE_BYTES = 2**27
 _SPACING_TRAJECTORIES = 8
 
 
@@ -25,50 +25,54 @@ def infer_scene(
     boundary: Sequence[Boundary] | None = None,
     bounds: Sequence[Interval] | None = None,
 ) -> Scene:
-    """Works out the scene of a dataset.
+    """Infers the scene of a dataset.
 
-    Bounds are the metadata's, widened to hold every position of a moving particle that was seen. The domain is the
+    Bounds are the metadata's, widened to contain all sampled positions of moving particles. The domain is the
     metadata's, or else the metadata's bounds with a wall layer of 2.5% of their extent (further out where particles
     are), and the bounds themselves on a periodic axis. Materials are the types that move and occur, in order of id.
     The particle volume is the metadata's, or else (median distance to the nearest neighbour in first frames) ** dim.
 
-    What is seen: `train.h5` (or else `valid.h5`, `test.h5`), all of it up to 128 MiB of positions, and evenly spaced
-    trajectories of it beyond that; types and gravities of all its trajectories.
+    Sampled are the positions of `train.h5` (or else `valid.h5`, `test.h5`): all of them up to 128 MiB, evenly spaced
+    trajectories beyond that. Types and gravities are read from all its trajectories.
 
     Args:
         folder: The dataset's folder.
-        family: What type ids mean, where the metadata does not say.
+        family: Meaning of the type ids where the metadata does not state it.
         gravity: Acceleration in length/s², instead of the metadata's.
         boundary: "wall" or "periodic" per axis, instead of the metadata's.
         bounds: (lower, upper) per axis, instead of the metadata's.
 
     Raises:
         DataError: if files are missing or wrong, or a position lies outside the domain that the metadata states.
-        ConfigError: if an argument does not fit the data.
+        ConfigError: if an argument does not match the number of axes, or is invalid.
     """
     folder = Path(folder)
-    metadata = _overridden(read_metadata(folder, family), gravity, boundary, bounds)
+    metadata = _override(read_metadata(folder, family), gravity, boundary, bounds)
     split = _reference_split(folder)
     if split.dim != metadata.dim:
-        raise DataError(f"{split.path}: positions have {split.dim} dimensions, {METADATA_FILE} says {metadata.dim}.")
+        raise DataError(
+            f"{split.path}: positions have {split.dim} dimensions, {METADATA_FILE} has dim = {metadata.dim}."
+        )
     types = _types(split, metadata)
-    survey = _survey(split, metadata)
-    widened, domain = _extents(metadata, survey, folder)
+    observed = _observe(split, metadata)
+    widened, domain = _extents(metadata, observed, folder)
     gravities = _gravities(split, metadata)
+    materials = _materials(types, metadata, split)
     return Scene(
         bounds=widened,
         domain=domain,
         dt=metadata.dt,
-        materials=_materials(types, metadata, split),
-        particle_volume=metadata.particle_volume or _volume(survey, metadata, folder),
+        materials=materials,
+        particle_volume=metadata.particle_volume or _volume(observed, metadata, folder),
         boundary=tuple("periodic" if flag else "wall" for flag in metadata.periodic),
         gravity=metadata.gravity or (gravities[0] if len(gravities) == 1 else None),
         gravity_varies=len(gravities) > 1,
         obstacles=bool(types & metadata.static_types),
+        densities=_densities(materials, metadata),
     )
 
 
-def _overridden(
+def _override(
     metadata: Metadata,
     gravity: Sequence[float] | None,
     boundary: Sequence[Boundary] | None,
@@ -81,7 +85,7 @@ def _overridden(
         metadata = replace(metadata, gravity=tuple(map(float, gravity)))
     if boundary is not None:
         if not set(boundary) <= {"wall", "periodic"}:
-            raise ConfigError(f'boundary = {list(boundary)} may hold "wall" and "periodic" only.')
+            raise ConfigError(f'boundary = {list(boundary)} must be "wall" or "periodic" per axis.')
         metadata = replace(metadata, periodic=tuple(kind == "periodic" for kind in boundary))
     if bounds is not None:
         metadata = replace(metadata, bounds=tuple((float(low), float(high)) for low, high in bounds), domain=None)
@@ -96,7 +100,7 @@ def _reference_split(folder: Path) -> Split:
 
 
 def _types(split: Split, metadata: Metadata) -> frozenset[int]:
-    """The type ids that occur."""
+    """All type ids that occur."""
     found: set[int] = set()
     for index in range(len(split)):
         particle_type = split.particle_type(index)
@@ -108,29 +112,35 @@ def _types(split: Split, metadata: Metadata) -> frozenset[int]:
 def _materials(types: frozenset[int], metadata: Metadata, split: Split) -> tuple[str, ...]:
     names = [metadata.particle_types[i] for i in metadata.moving_types if i in types]
     if not names:
-        raise DataError(f"{split.path}: none of its particles moves; check static_types in {METADATA_FILE}.")
+        raise DataError(f"{split.path}: no particle has a moving type; check static_types in {METADATA_FILE}.")
     return tuple(dict.fromkeys(names))
 
 
+def _densities(materials: tuple[str, ...], metadata: Metadata) -> tuple[float, ...]:
+    """Density of each material; empty where one is unknown, or there is one material only."""
+    known = [metadata.densities[name] for name in materials if name in metadata.densities]
+    return tuple(known) if 1 < len(known) == len(materials) else ()
+
+
 def _gravities(split: Split, metadata: Metadata) -> tuple[tuple[float, ...], ...]:
-    """The different gravities that the trajectories state, where one does; unstated ones have the dataset's."""
+    """The distinct gravities of the trajectories; one without its own has the dataset's."""
     stated = [split.attributes(index).get("gravity") for index in range(len(split))]
     known = [tuple(np.atleast_1d(value).tolist()) if value is not None else metadata.gravity for value in stated]
     return tuple(dict.fromkeys(value for value in known if value is not None))
 
 
 @dataclass(frozen=True)
-class _Survey:
-    """What a look at the positions showed: extents (2, D) of moving and of all particles, and spacings."""
+class _ObservedExtents:
+    """Extents (2, D) of the sampled moving particles and of all, and distances to the nearest neighbour."""
 
     moving: np.ndarray
     everything: np.ndarray
     spacing: np.ndarray
 
 
-def _survey(split: Split, metadata: Metadata) -> _Survey:
+def _observe(split: Split, metadata: Metadata) -> _ObservedExtents:
     sizes = [4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split))]
-    sample = range(0, len(split), max(1, -(-sum(sizes) // _SURVEY_BYTES)))
+    sample = range(0, len(split), max(1, -(-sum(sizes) // _SAMPLE_BYTES)))
     measured = set(sample[:: -(-len(sample) // _SPACING_TRAJECTORIES)])
     moving: list[list[np.ndarray]] = []
     everything: list[list[np.ndarray]] = []
@@ -145,7 +155,7 @@ def _survey(split: Split, metadata: Metadata) -> _Survey:
                 extents.append([position.min(axis=(0, 1)), position.max(axis=(0, 1))])
         if index in measured:
             spacing.append(_spacing(trajectory.position[0, kind], metadata))
-    return _Survey(_union(moving, metadata), _union(everything, metadata), np.concatenate(spacing))
+    return _ObservedExtents(_union(moving, metadata), _union(everything, metadata), np.concatenate(spacing))
 
 
 def _union(extents: list[list[np.ndarray]], metadata: Metadata) -> np.ndarray:
@@ -156,11 +166,11 @@ def _union(extents: list[list[np.ndarray]], metadata: Metadata) -> np.ndarray:
 
 
 def _spacing(position: np.ndarray, metadata: Metadata) -> np.ndarray:
-    """Distance from each of (N, D) particles to its nearest neighbour."""
+    """Distance of each of (N, D) particles to its nearest neighbour, (N,)."""
     if len(position) < 2:
         return np.empty(0)
     lower, upper = np.asarray(metadata.bounds).T
-    # A tree takes a period of 0 for an axis that does not wrap.
+    # cKDTree takes a period of 0 for an axis that is not periodic.
     period = np.where(metadata.periodic, upper - lower, 0.0)
     shifted = position.astype(np.float64) - lower
     wrapped = np.where(metadata.periodic, np.mod(shifted, np.where(period > 0, period, 1.0)), shifted)
@@ -168,8 +178,8 @@ def _spacing(position: np.ndarray, metadata: Metadata) -> np.ndarray:
     return distance
 
 
-def _volume(survey: _Survey, metadata: Metadata, folder: Path) -> float:
-    distance = float(np.median(survey.spacing)) if len(survey.spacing) else 0.0
+def _volume(observed: _ObservedExtents, metadata: Metadata, folder: Path) -> float:
+    distance = float(np.median(observed.spacing)) if len(observed.spacing) else 0.0
     if distance <= 0:
         raise DataError(
             f"{folder / METADATA_FILE}: the volume of a particle cannot be estimated from the distances between them;"
@@ -178,13 +188,15 @@ def _volume(survey: _Survey, metadata: Metadata, folder: Path) -> float:
     return float(distance**metadata.dim)
 
 
-def _extents(metadata: Metadata, survey: _Survey, folder: Path) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
-    """Bounds and domain per axis."""
+def _extents(
+    metadata: Metadata, observed: _ObservedExtents, folder: Path
+) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
+    """Bounds and domain, (lower, upper) per axis."""
     stated = metadata.domain or (None,) * metadata.dim
     pairs = [
         _periodic_extent(metadata.bounds[axis], stated[axis])
         if metadata.periodic[axis]
-        else _walled_extent(metadata.bounds[axis], stated[axis], survey, axis, folder)
+        else _walled_extent(metadata.bounds[axis], stated[axis], observed, axis, folder)
         for axis in range(metadata.dim)
     ]
     return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
@@ -195,20 +207,20 @@ def _periodic_extent(bounds: Interval, stated: Interval | None) -> tuple[Interva
 
 
 def _walled_extent(
-    bounds: Interval, stated: Interval | None, survey: _Survey, axis: int, folder: Path
+    bounds: Interval, stated: Interval | None, observed: _ObservedExtents, axis: int, folder: Path
 ) -> tuple[Interval, Interval]:
     low, high = bounds
-    seen_low, seen_high = map(float, survey.everything[:, axis])
-    widened = (min(low, float(survey.moving[0, axis])), max(high, float(survey.moving[1, axis])))
+    seen_low, seen_high = map(float, observed.everything[:, axis])
+    widened = (min(low, float(observed.moving[0, axis])), max(high, float(observed.moving[1, axis])))
     if stated is not None:
         if seen_low < stated[0] or seen_high > stated[1]:
             raise DataError(
-                f"{folder / METADATA_FILE}: domain {list(stated)} on axis {axis} does not hold the positions, which"
+                f"{folder / METADATA_FILE}: domain {list(stated)} on axis {axis} does not contain the positions, which"
                 f" reach from {seen_low:.6g} to {seen_high:.6g}. Widen it."
             )
         return widened, stated
     layer = _WALL_LAYER * (high - low)
-    # Particles beyond the layer mean that the stated bounds are not the walls: put the layer around the particles.
+    # If particles are beyond the layer, the stated bounds are not the walls: put the layer around the particles.
     lower = low - layer if seen_low >= low - layer else seen_low - layer
     upper = high + layer if seen_high <= high + layer else seen_high + layer
     return widened, (lower, upper)

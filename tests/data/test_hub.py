@@ -8,8 +8,8 @@ import huggingface_hub
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
-from nmpm.data.convert.hub import REPOSITORY, hub_folder
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.hub import REPOSITORY, hub_folder
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert.test_neuralmpm import write
 
@@ -48,16 +48,16 @@ def test_archives_are_unpacked_and_trained_on(hub, tmp_path):
     assert next(iter(data.train_dataloader())).initial.position.shape[1] == 5
 
 
-def test_folders_that_are_not_packed_are_used_as_they_are(hub):
+def test_folders_without_archives_are_used_directly(hub):
     write(hub / "Goop" / "train" / "sim_0.h5")
     assert hub_folder("Goop") == hub / "Goop"
 
 
 @pytest.mark.parametrize("name", ["../../etc/x.h5", "/etc/x.h5", "a/../../x.h5"])
-def test_archives_that_lead_out_are_refused(hub, tmp_path, name):
+def test_archives_with_paths_outside_are_refused(hub, tmp_path, name):
     with zipfile.ZipFile(hub / "Goop" / "train.zip", "w") as file:
         file.writestr(name, b"x")
-    with pytest.raises(DataError, match="refuses to unpack"):
+    with pytest.raises(DataError, match="does not unpack"):
         hub_folder("Goop")
     assert not list(tmp_path.rglob("x.h5"))
 
@@ -74,12 +74,12 @@ def test_damaged_archives_are_named(hub, tmp_path, place):
 
 
 @pytest.mark.parametrize("name", ["", "..", "../up", "a/b/c/d", "a/../b", "Goop;rm"])
-def test_names_that_cannot_be_are_refused(name):
+def test_malformed_names_are_refused(name):
     with pytest.raises(ConfigError, match="is not the name of a dataset"):
         hub_folder(name)
 
 
-def test_offline_says_what_to_do(monkeypatch, tmp_path):
+def test_offline_error_gives_the_download_command(monkeypatch, tmp_path):
     def offline(*_, **__):
         raise LocalEntryNotFoundError("no connection")
 

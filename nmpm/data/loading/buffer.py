@@ -1,0 +1,163 @@
+"""Training windows drawn from a few trajectories at a time.
+
+A `WindowPlan` says in advance which windows make up which batch. A buffer holds the trajectories of the next batches
+in one padded tensor, so that a batch is one gather; a thread reads the trajectories after them in the meantime.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count, groupby
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from nmpm.data.loading.background import run_in_thread
+from nmpm.data.loading.padded_batch import PaddedRecordings
+from nmpm.data.loading.recording import Recording
+from nmpm.data.loading.window_plan import MOTION, WindowPlan
+from nmpm.particles import Window
+from nmpm.scene import Scene
+
+
+class RecordingProvider(Protocol):
+    """What a buffer needs of recorded or simulated trajectories."""
+
+    scene: Scene
+
+    @property
+    def max_bytes(self) -> int:
+        """Size of the positions of the largest trajectory."""
+
+    def load(self, indices: Sequence[int]) -> list[Recording]:
+        """Reads or simulates several trajectories."""
+
+    def require_frames(self, frames: int, purpose: str) -> None:
+        """Raises an error that names the first trajectory with fewer frames."""
+
+    def close(self) -> None:
+        """Stops unfinished work and waits for its threads; the provider can be used again afterwards."""
+
+
+class MotionSampler:
+    """Draws windows with a probability proportional to the mean distance that their particles travel.
+
+    Args:
+        recordings: By index of the trajectory.
+        length: Frames of a window.
+    """
+
+    def __init__(self, recordings: Mapping[int, Recording], length: int) -> None:
+        distances = {index: _window_distances(recording, length) for index, recording in recordings.items()}
+        self.windows = [(index, start) for index, distance in distances.items() for start in range(len(distance))]
+        self.cumulative = np.cumsum(np.concatenate(list(distances.values())))
+
+    def window_at(self, quantile: float) -> tuple[int, int]:
+        """The window (trajectory, first frame) at a quantile in [0, 1) of the summed distance.
+
+        Any window where nothing moves.
+        """
+        distance = quantile * self.cumulative[-1]
+        return self.windows[min(int(np.searchsorted(self.cumulative, distance, side="right")), len(self.windows) - 1)]
+
+
+def _window_distances(recording: Recording, length: int) -> np.ndarray:
+    """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
+    frames = recording.frames.numpy()
+    speed = np.linalg.norm(np.diff(frames, axis=0), axis=-1).mean(axis=-1, dtype=np.float64)
+    total = np.concatenate([[0.0], np.cumsum(speed)])
+    return np.asarray(total[length - 1 :] - total[: len(total) - length + 1])
+
+
+@dataclass(frozen=True)
+class _BufferContents:
+    """The trajectories of one buffer.
+
+    Args:
+        padded: All of them, one per row, in the order of `recordings`.
+        recordings: Views by index of the trajectory, without padding, in host memory.
+        motion: Draws windows in proportion to motion; None where the plan has no emphasis.
+    """
+
+    padded: PaddedRecordings
+    recordings: Mapping[int, Recording]
+    motion: MotionSampler | None
+
+    def gather(self, drawn: Sequence[tuple[int, int]], length: int) -> Window:
+        row = {trajectory: row for row, trajectory in enumerate(self.recordings)}
+        trajectories, starts = zip(*drawn, strict=True)
+        return self.padded.gather([row[trajectory] for trajectory in trajectories], starts, length)
+
+
+class TrajectoryBuffer:
+    """Endless batches of training windows, from trajectories in memory.
+
+    While one buffer is in use, a thread reads the next: up to three times `plan.buffer_size` trajectories are in
+    memory, however large the dataset is.
+
+    Args:
+        provider: The trajectories.
+        plan: Which windows make up which batch.
+        device: Where the buffer is stored and the windows are gathered.
+
+    Raises:
+        DataError: if a trajectory is shorter than a window.
+    """
+
+    def __init__(self, provider: RecordingProvider, plan: WindowPlan, device: torch.device | None = None) -> None:
+        provider.require_frames(plan.length, f"a training window of {plan.length - 2} frames to predict")
+        self.provider, self.plan, self.device = provider, plan, device or torch.device("cpu")
+
+    def batches(self, start: int = 0, rank: int = 0, world: int = 1) -> Iterator[Window]:
+        """Yields the batches of one of `world` ranks, from index `start` on.
+
+        Closing the iterator stops its reading thread and waits for it.
+
+        Raises:
+            DataError: if a trajectory cannot be read or does not fit the scene.
+        """
+        plan = self.plan
+        contents = self._load(plan.members(plan.locate(start, world)[0], rank, world), None)
+        for buffer, indices in groupby(count(start), key=lambda index: plan.locate(index, world)[0]):
+            upcoming = run_in_thread(self._load, plan.members(buffer + 1, rank, world), contents)
+            try:
+                for index in indices:
+                    drawn = plan.batch(index, rank, world)
+                    yield contents.gather(self._emphasise(drawn, contents.motion, index, rank, world), plan.length)
+                contents = upcoming.result()
+            finally:
+                upcoming.cancel()
+
+    def _load(self, members: Sequence[int], previous: _BufferContents | None) -> _BufferContents:
+        """Loads a buffer's trajectories, reusing those of the previous buffer."""
+        known = previous.recordings if previous is not None else {}
+        if previous is not None and list(members) == list(known):
+            return previous
+        missing = [index for index in members if index not in known]
+        found = dict(zip(missing, self.provider.load(missing), strict=True))
+        loaded = [known[index] if index in known else found[index] for index in members]
+        padded = PaddedRecordings.stack(loaded, self.provider.scene)
+        # Views of the padded tensor, so that the memory of the loaded recordings is freed.
+        recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}
+        motion = MotionSampler(recordings, self.plan.length) if self.plan.emphasis else None
+        return _BufferContents(padded.to(self.device), recordings, motion)
+
+    def _emphasise(
+        self, drawn: list[tuple[int, int]], motion: MotionSampler | None, index: int, rank: int, world: int
+    ) -> list[tuple[int, int]]:
+        """Replaces a share of the windows by others that are drawn in proportion to motion.
+
+        Random numbers are drawn for the batches of all ranks, as a single process with one large batch would, and each
+        rank uses its own slice of them.
+        """
+        if motion is None:
+            return drawn
+        rng = np.random.default_rng((self.plan.seed, MOTION, index, 0))
+        replaced = rng.random(len(drawn) * world) < self.plan.emphasis
+        first = rank * len(drawn)
+        own = replaced[first : first + len(drawn)]
+        before = int(replaced[:first].sum())
+        quantiles = iter(rng.random(before + int(own.sum()))[before:])
+        return [motion.window_at(next(quantiles)) if swap else w for swap, w in zip(own, drawn, strict=True)]

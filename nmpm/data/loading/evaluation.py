@@ -1,0 +1,64 @@
+"""Batches of whole trajectories for validation, test and prediction, distributed over the ranks."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.pinning import pin_for
+from nmpm.data.loading.recording import SplitRecordings
+from nmpm.errors import ConfigError
+from nmpm.particles import Window
+
+
+class EvaluationLoader:
+    """Whole trajectories in batches of equal length; each trajectory goes to exactly one rank.
+
+    Args:
+        recordings: The trajectories.
+        batch_size: Trajectories per batch, at most.
+        limit: Only the first `limit` trajectories; all when None.
+        rank: Index of this process.
+        world: Number of processes.
+        device: Where the batches are used; those for a GPU are in pinned memory.
+
+    Raises:
+        DataError: if a trajectory has fewer than 3 frames, so that there is nothing to predict.
+        ConfigError: if there are more processes than trajectories.
+    """
+
+    def __init__(
+        self,
+        recordings: SplitRecordings,
+        batch_size: int,
+        limit: int | None = None,
+        rank: int = 0,
+        world: int = 1,
+        device: torch.device | None = None,
+    ) -> None:
+        self.recordings, self.device = recordings, device or torch.device("cpu")
+        recordings.require_frames(3, "an evaluation")
+        frames = recordings.split.frames
+        order = sorted(range(len(recordings))[:limit], key=frames)
+        if len(order) < world:
+            # The other ranks would wait forever for a rank without a batch.
+            raise ConfigError(
+                f"{recordings.split.path}: {len(order)} trajectories cannot be shared by {world} processes. Evaluate"
+                " with fewer devices, or on more trajectories."
+            )
+        groups = (list(group) for _, group in itertools.groupby(order[rank::world], key=frames))
+        self.batches: tuple[tuple[int, ...], ...] = tuple(
+            tuple(group[first : first + batch_size]) for group in groups for first in range(0, len(group), batch_size)
+        )
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[Window]:
+        return pin_for(self.device, map(self._read, self.batches))
+
+    def _read(self, indices: Sequence[int]) -> Window:
+        return collate([self.recordings[index] for index in indices], self.recordings.scene)
