@@ -4,7 +4,7 @@ For frame i = 1 … m of a bundle the velocity is
 
     v_i = known_i + g2p(output_i)(x_{i-1})
 
-and a decoder says what is known before the network has spoken. What is known need not be learnt.
+and a decoder gives the part known without the network, which need not be learnt.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nmpm.errors import ConfigError
 
 
 class Decoder(ABC):
-    """What is known of the velocities of a bundle. Subclasses are stateless; all quantities in grid units."""
+    """The known part of a bundle's velocities. Subclasses are stateless; all quantities in grid units."""
 
     @abstractmethod
     def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:
@@ -42,8 +42,8 @@ class Decoder(ABC):
         """
 
 
-class _Held(Decoder):
-    """Decoders that hold what the bundle starts from, and let known gravity act on it."""
+class _Ballistic(Decoder):
+    """Decoders that keep the bundle's initial velocity, accelerated by known gravity."""
 
     def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
         return carried + gravity * frame
@@ -61,7 +61,7 @@ class Absolute(Decoder):
 
 
 @dataclass(frozen=True)
-class Residual(_Held):
+class Residual(_Ballistic):
     """The network gives increments to the grid's current velocity u: v_i = u + i g + g2p(output_i)."""
 
     def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
@@ -69,7 +69,7 @@ class Residual(_Held):
 
 
 @dataclass(frozen=True)
-class Flip(_Held):
+class Flip(_Ballistic):
     """The network gives increments to each particle's own velocity: v_i = v_0 + i g + g2p(output_i).
 
     Source: Brackbill & Ruppel, FLIP, J. Comput. Phys. 65 (1986): less smoothing than `Residual`, more noise.
@@ -80,7 +80,7 @@ class Flip(_Held):
 
 
 @dataclass(frozen=True)
-class Blend(_Held):
+class Blend(_Ballistic):
     """Between `Residual` and `Flip`: v_0 is mixed from each particle's own velocity and the grid's.
 
     Source: Zhu & Bridson, Animating sand as a fluid, SIGGRAPH 2005: a little smoothing takes FLIP's noise away.

@@ -19,7 +19,7 @@ from torch import Tensor
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
-_COARSEST = 1 / 16  # of a cell: positions known no better than that are useless
+_MAX_ROUNDING = 1 / 16  # of a cell: coarser positions are useless
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Grid:
             ConfigError: if `cells` is not positive or names another number of axes than the scene has.
         """
         extents = [high - low for low, high in scene.domain]
-        shape = _shape(cells, extents)
+        shape = _cells_along_axes(cells, extents)
         return cls(
             shape=shape,
             lower=tuple(low for low, _ in scene.domain),
@@ -74,9 +74,9 @@ class Grid:
         return math.prod(self.spacing)
 
     def to_cells(self, position: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Positions (..., D) in domain length → cells from the lower corner, of the type asked for.
+        """Positions (..., D) in domain length → cells from the lower corner, of type `dtype`.
 
-        The origin is taken off in the positions' own precision, so that float64 input far from 0 keeps its digits.
+        The origin is subtracted in the positions' own precision, so that float64 input far from 0 keeps its digits.
 
         Raises:
             DataError: if that precision is too coarse so far from 0.
@@ -86,11 +86,11 @@ class Grid:
         return per_axis(operator.truediv, offset, self.spacing).to(dtype)
 
     def _check_precision(self, dtype: torch.dtype) -> None:
-        """Refuse positions whose floating-point numbers lie further apart than a part of a cell."""
+        """Raise DataError if floating-point numbers at the domain's ends are further apart than 1/16 of a cell."""
         for axis, (low, n, h) in enumerate(zip(self.lower, self.shape, self.spacing, strict=True)):
             reach = max(abs(low), abs(low + n * h))
             step = torch.finfo(dtype).eps * 2.0 ** math.floor(math.log2(reach)) if reach > 0 else 0.0
-            if step > _COARSEST * h:
+            if step > _MAX_ROUNDING * h:
                 name = str(dtype).removeprefix("torch.")
                 raise DataError(
                     f"{name} numbers have a spacing of {step:g} near {reach:g}, where axis {axis} of the domain ends,"
@@ -98,7 +98,7 @@ class Grid:
                 )
 
     def to_cell_displacement(self, displacement: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Displacements (..., D) in domain length → cells, of the type asked for."""
+        """Displacements (..., D) in domain length → cells, of type `dtype`."""
         return per_axis(operator.truediv, displacement, self.spacing).to(dtype)
 
     def to_length(self, cells: Tensor) -> Tensor:
@@ -135,7 +135,7 @@ class Grid:
 def per_axis(operation: Callable[[Tensor, float], Tensor], values: Tensor, numbers: Sequence[float]) -> Tensor:
     """Apply an operation to (..., D) values with a number of its own for each axis.
 
-    As a tensor, the numbers would be sent to the device anew each time.
+    A tensor of the numbers would be copied to the device in each call.
     """
     first, *others = numbers
     if all(number == first for number in others):
@@ -144,7 +144,7 @@ def per_axis(operation: Callable[[Tensor, float], Tensor], values: Tensor, numbe
     return torch.stack([operation(column, number) for column, number in columns], dim=-1)
 
 
-def _shape(cells: int | Sequence[int], extents: Sequence[float]) -> tuple[int, ...]:
+def _cells_along_axes(cells: int | Sequence[int], extents: Sequence[float]) -> tuple[int, ...]:
     if isinstance(cells, int):
         width = max(extents) / max(cells, 1)
         shape = tuple(max(1, round(extent / width)) for extent in extents)

@@ -136,13 +136,15 @@ class Advection:
     def _within_energy(self, flight: Flight, budget: Tensor) -> Tensor:
         """(B, m, N, D) positions of which no frame exceeds an energy (B,).
 
-        On a CPU the free path is tried first: it rarely exceeds the energy, and is the same to the bit if it does not.
+        On a CPU the free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
         """
-        if can_branch(budget):
-            path = self._free(flight)
-            if not bool((self._energies(flight, path) > budget.unsqueeze(1)).any()):
-                return path
-        return self._limited(flight, budget)
+        if not can_branch(budget):
+            return self._limited(flight, budget, flight.cells.unsqueeze(1)[:, :0])
+        path = self._free(flight)
+        exceeds = (self._energies(flight, path) > budget.unsqueeze(1)).any(0)
+        if not bool(exceeds.any()):
+            return path
+        return self._limited(flight, budget, path[:, : int(exceeds.int().argmax())])
 
     def _energies(self, flight: Flight, path: Tensor) -> Tensor:
         """(B, m) energy of each frame of a path (B, m, N, D)."""
@@ -154,14 +156,23 @@ class Advection:
             parts.append(energy(own, steps, gravity, part.share))
         return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
 
-    def _limited(self, flight: Flight, budget: Tensor) -> Tensor:
+    def _limited(self, flight: Flight, budget: Tensor, begun: Tensor) -> Tensor:
         """(B, m, N, D) positions, each frame within an energy (B,): all particles advance together, as they share it.
 
         Chunks only bound the memory of interpolation.
+
+        Args:
+            flight: What to start from.
+            budget: (B,) energy.
+            begun: (B, f, N, D) the first frames, which are within it.
         """
-        cells, velocity, before, path = flight.cells, flight.carried, flight.velocity, []
-        parts = [(flight.part(chunk), chunk) for chunk in chunks(cells.shape[1], cells.device)]
-        for frame, field in enumerate(flight.fields.unbind(1), start=1):
+        path = [flight.cells, *begun.unbind(1)]
+        velocity, before = flight.carried, flight.velocity
+        if len(path) > 1:
+            velocity = before = path[-1] - path[-2]
+        parts = [(flight.part(chunk), chunk) for chunk in chunks(flight.cells.shape[1], flight.cells.device)]
+        for frame, field in enumerate(flight.fields.unbind(1)[len(path) - 1 :], start=len(path)):
+            cells = path[-1]
             moved = [self._moved(part, field, cells[:, own], velocity[:, own], frame) for part, own in parts]
             proposed = torch.cat(moved, dim=1) if len(moved) > 1 else moved[0]
             step = proposed - cells
@@ -169,9 +180,8 @@ class Advection:
             factor = affordable(place, way, last, gravity, flight.share, budget)
             arrived = torch.where(factor < 1, self._confined(cells + factor * step), proposed)
             velocity = before = arrived - cells
-            cells = arrived
-            path.append(cells)
-        return torch.stack(path, dim=1)
+            path.append(arrived)
+        return torch.stack(path[1:], dim=1)
 
     def _clear_of_obstacles(self, flight: Flight, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), clear of obstacles."""

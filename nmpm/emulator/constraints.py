@@ -175,49 +175,48 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
     Returns:
         (B, N, 1).
     """
-    kinetic = step.square().sum(-1, keepdim=True) / 2
-    work = (step * gravity).sum(-1, keepdim=True)
-    height = -(cells * gravity).sum(-1, keepdim=True)
-    terms = torch.cat([kinetic, -work, height], dim=-1) * share
+    mass = share.squeeze(-1)
+    work = step * gravity
+    kinetic = _over_axes(step.square()) / 2 * mass
+    fall = -_over_axes(work) * mass
+    excess = (-_over_axes(cells * gravity) * mass).sum(1) - budget  # of the scene if nobody moved
+    excess = excess.clamp(min=-_UNLIMITED)
     gains = _gains(cells, step, before, work)
-    square, slope, rest = terms.sum(1).unbind(-1)
-    excess = (rest - budget).clamp(min=-_UNLIMITED)  # of the scene if nobody moved
-    fixed = torch.where(gains, 0.0, terms)[..., :2].sum((1, 2))
-    own_square, own_slope, _ = torch.where(gains, terms, 0.0).sum(1).unbind(-1)
-    own = _largest_root(own_square, own_slope, excess + fixed)
-    every = _largest_root(square, slope, excess)
-    lowest = _lowest(square, slope)
-    exceeds = square + slope + excess > 0
-    suffices = (own >= 0) & (own <= 1)
-    everybody = torch.where(every.isnan(), lowest, every).clamp(0, 1)
-    factor = torch.where(suffices, own, everybody)[:, None, None]
-    applies = exceeds[:, None, None] & (gains | ~suffices[:, None, None])
-    return torch.where(applies, factor, 1.0)
+    own = gains.to(step.dtype)
+    square = torch.stack([(kinetic * own).sum(1), kinetic.sum(1)], dim=1)  # of those that gain; of all
+    slope = torch.stack([(fall * own).sum(1), fall.sum(1)], dim=1)
+    both = square + slope
+    constant = excess.unsqueeze(1) + (both[:, 1:] - both)
+    factor, exact = _largest_root(square, slope, constant)
+    suffices = exact[:, 0] & (factor[:, 0] >= 0) & (factor[:, 0] <= 1)
+    chosen = torch.where(suffices, factor[:, 0], factor[:, 1].clamp(0, 1))
+    exceeds = both[:, 1] + excess > 0
+    applies = exceeds.unsqueeze(1) & (gains | ~suffices.unsqueeze(1))
+    return torch.where(applies, chosen.unsqueeze(1), 1.0).unsqueeze(-1)
 
 
 def _gains(cells: Tensor, step: Tensor, before: Tensor, work: Tensor) -> Tensor:
-    """(B, N, 1): whether a particle gains energy by a step, beyond the rounding of positions that steps come from.
+    """(B, N): whether a particle gains energy by a step, beyond the rounding of positions that steps come from.
 
     Without the large terms that cancel: v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
     """
-    gain = ((step - before) * (step + before)).sum(-1, keepdim=True) / 2 - work
-    rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs().sum(-1, keepdim=True)
-    return gain > rounding
+    rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs()
+    return _over_axes((step - before) * (step + before) / 2 - work - rounding) > 0
 
 
-def _largest_root(square: Tensor, slope: Tensor, constant: Tensor) -> Tensor:
-    """(B,) largest s with square · s² + slope · s + constant = 0; NaN where there is none or `square` vanishes."""
+def _over_axes(values: Tensor) -> Tensor:
+    """(...) sum of (..., D) over D: ten times as fast on a CPU as torch's sum over so short an axis."""
+    first, *others = values.unbind(-1)
+    return sum(others, start=first)
+
+
+def _largest_root(square: Tensor, slope: Tensor, constant: Tensor) -> tuple[Tensor, Tensor]:
+    """Largest s with square · s² + slope · s + constant = 0, and whether there is one; else where that is lowest."""
     tiny = torch.finfo(square.dtype).tiny
     inner = slope.square() - 4 * square * constant
     moves = square > tiny**0.5  # so that neither the quotient nor its gradient overflows
     root = (inner.clamp(min=tiny).sqrt() - slope) / torch.where(moves, 2 * square, 1.0)
-    return torch.where(moves & (inner >= 0), root, torch.nan)
-
-
-def _lowest(square: Tensor, slope: Tensor) -> Tensor:
-    """(B,) the s at which square · s² + slope · s is lowest, 0 where `square` vanishes."""
-    moves = square > torch.finfo(square.dtype).tiny ** 0.5
-    return torch.where(moves, -slope / torch.where(moves, 2 * square, 1.0), 0.0)
+    return root, moves & (inner >= 0)
 
 
 def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tensor:

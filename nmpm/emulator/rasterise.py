@@ -1,5 +1,5 @@
-"""From particles to the grid state that the processor sees: per material the mean velocity and the volume fraction,
-then whatever else the scene requires (`Scene.input_channels`).
+"""Rasterising particles to the grid state that the processor sees: per material the mean velocity and the volume
+fraction, then the other channels of the scene (`Scene.input_channels`).
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convnext import ChannelNorm
 from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution
-from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
+from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
 
 _SLOWEST = 100.0  # patches in which the slowest rotary angle turns by one radian
 
@@ -73,7 +73,7 @@ class AxialNetwork(GridProcessor):
         for layer in self.layers:
             hidden = layer(hidden)
         joined = functional.silu(self.join(torch.cat([cells, self.back(hidden)], dim=1)))
-        out: Tensor = cropped(self.last(joined), shape).unflatten(1, (self.frames, -1))
+        out: Tensor = crop(self.last(joined), shape).unflatten(1, (self.frames, -1))
         return out
 
 

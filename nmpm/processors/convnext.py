@@ -15,8 +15,8 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
-from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
-from nmpm.processors.ushape import UShape, doubled
+from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.ushape import UShape, upsample_nearest
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,13 @@ class ConvNeXtNetwork(GridProcessor):
             down=[level() for _ in range(depth + 1)],
             coarsen=[Convolution(width, width, 4, periodic, stride=2) for _ in range(depth)],
             up=[level() for _ in range(depth)],
-            refine=[nn.Sequential(kind(width, width, 1), doubled()) for _ in range(depth)],
+            refine=[nn.Sequential(kind(width, width, 1), upsample_nearest()) for _ in range(depth)],
         )
         self.last = kind(width, layout.frames * layout.out_channels, 1)
 
     def forward(self, grid: Tensor) -> Tensor:
         hidden = self.levels(self.first(pad_to_multiple(grid, self.multiple)))
-        out: Tensor = cropped(self.last(hidden), grid.shape[2:]).unflatten(1, (self.frames, -1))
+        out: Tensor = crop(self.last(hidden), grid.shape[2:]).unflatten(1, (self.frames, -1))
         return out
 
 

@@ -16,7 +16,7 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import CONVOLUTIONS
-from nmpm.processors.padding import cropped
+from nmpm.processors.padding import crop
 from nmpm.processors.places import places
 
 
@@ -73,7 +73,7 @@ class FFNONetwork(GridProcessor):
         hidden = functional.pad(hidden, [side for extra in reversed(extended) for side in (0, extra)])
         for layer in self.layers:
             hidden = layer(hidden)
-        out: Tensor = self.last(cropped(hidden, shape)).unflatten(1, (self.frames, -1))
+        out: Tensor = self.last(crop(hidden, shape)).unflatten(1, (self.frames, -1))
         return out
 
 

@@ -1,4 +1,4 @@
-"""Grids brought to sizes that a network can take, and cut back."""
+"""Padding grids to sizes that a network can take, and cropping them back."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def pad_to_multiple(grid: Tensor, multiple: int) -> Tensor:
     return grid
 
 
-def cropped(fields: Tensor, shape: Sequence[int], first: int = 2) -> Tensor:
-    """The first cells of each space axis, which begin at axis `first` of the tensor."""
+def crop(fields: Tensor, shape: Sequence[int], first: int = 2) -> Tensor:
+    """Keep the first cells of each space axis; these begin at axis `first` of the tensor."""
     for axis, cells in enumerate(shape, start=first):
         fields = fields.narrow(axis, 0, cells) if fields.shape[axis] > cells else fields
     return fields
 
 
 def check_multiple(grid: Grid, multiple: int, what: str) -> None:
-    """Refuse grids that a network which coarsens by `multiple` cannot take.
+    """Raise ConfigError for grids that a network which coarsens by `multiple` cannot take.
 
     Args:
         grid: The grid.

@@ -1,4 +1,4 @@
-"""Where each cell is, as channels: spectral layers alone do not know walls from the middle."""
+"""Positions of cells as channels: spectral layers alone cannot tell walls from the middle."""
 
 from __future__ import annotations
 

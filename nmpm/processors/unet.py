@@ -18,7 +18,7 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import Convolution, Upsampling, pointwise
-from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
+from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class UNetNetwork(GridProcessor):
             if level > 0:
                 hidden = _activate(self.refine[level - 1](hidden))
         fields = torch.stack([decoder(hidden) for decoder in self.decoders], dim=2)
-        return cropped(fields, shape, first=3)
+        return crop(fields, shape, first=3)
 
 
 def _activate(hidden: Tensor) -> Tensor:

@@ -17,8 +17,8 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
-from nmpm.processors.padding import check_multiple, cropped, pad_to_multiple
-from nmpm.processors.ushape import UShape, doubled
+from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.ushape import UShape, upsample_nearest
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class UNetModernNetwork(GridProcessor):
             coarsen=[Convolution(fine, coarse, 4, periodic, stride=2) for fine, coarse in pairwise(widths)],
             up=map(level, widths[:-1]),
             refine=[
-                nn.Sequential(doubled(), Convolution(coarse, fine, kernel, periodic))
+                nn.Sequential(upsample_nearest(), Convolution(coarse, fine, kernel, periodic))
                 for fine, coarse in pairwise(widths)
             ],
         )
@@ -82,7 +82,7 @@ class UNetModernNetwork(GridProcessor):
 
     def forward(self, grid: Tensor) -> Tensor:
         hidden = self.levels(self.first(pad_to_multiple(grid, self.multiple)))
-        out: Tensor = cropped(self.last(functional.silu(hidden)), grid.shape[2:]).unflatten(1, (self.frames, -1))
+        out: Tensor = crop(self.last(functional.silu(hidden)), grid.shape[2:]).unflatten(1, (self.frames, -1))
         return out
 
 

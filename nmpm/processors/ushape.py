@@ -1,4 +1,4 @@
-"""The course of a U-Net: level by level down to coarser grids and up again, each level's result added on the way up."""
+"""The U shape: level by level down to coarser grids and up again, each level's result added on the way up."""
 
 from __future__ import annotations
 
@@ -40,6 +40,6 @@ class UShape(nn.Module):
         return hidden
 
 
-def doubled() -> nn.Module:
-    """Each cell repeated twice along each axis."""
+def upsample_nearest() -> nn.Module:
+    """Upsampling that repeats each cell twice along each axis."""
     return nn.Upsample(scale_factor=2.0, mode="nearest")

@@ -1,7 +1,7 @@
-"""Ways to sum many values into few places: the one operation of p2g that hardware disagrees on how to do fast.
+"""Scatter-add backends, for the one operation of p2g whose fastest form depends on the hardware.
 
-All give the same sums to rounding. Which one runs is decided for each call: what `using` says, else `sorted` where
-torch is to be deterministic on a device whose own sum is not, else `native`. A backend is a function
+All give the same sums to rounding. Which one runs is decided in each call: the one chosen with `using`, else `sorted`
+if torch is to be deterministic and the device's own sum is not, else `native`. A backend is a function
 
     add(source (B, L, C), index (B, L), size) -> (B, size, C)
 """
@@ -22,26 +22,28 @@ Add = Callable[[Tensor, Tensor, int], Tensor]
 
 
 def native(source: Tensor, index: Tensor, size: int) -> Tensor:
-    """Torch's own. On a CPU the same bits in every run and for any number of threads; on a GPU not."""
+    """Torch's own `scatter_add`: bit-reproducible on a CPU for any number of threads, not on a GPU."""
     batch, _, channels = source.shape
     everywhere = index.unsqueeze(-1).expand(-1, -1, channels)
     return source.new_zeros(batch, size, channels).scatter_add(1, everywhere, source)
 
 
 def in_order(source: Tensor, index: Tensor, size: int) -> Tensor:
-    """Sorted by place, then summed one after the other: slower, and the same bits in every run on every device."""
+    """Sort by place, then sum each place's values in order: slower, and bit-reproducible on every device."""
     batch, length, channels = source.shape
     flat = (index + size * torch.arange(batch, device=index.device).unsqueeze(1)).flatten()
-    order = torch.sort(flat, stable=True).indices
-    counts = torch.bincount(flat, minlength=batch * size)
-    values = source.reshape(batch * length, channels)[order]
     if not len(flat):
         return source.new_zeros(batch, size, channels)
-    return torch.segment_reduce(values, "sum", lengths=counts, axis=0, initial=0.0).reshape(batch, size, channels)
+    places, order = torch.sort(flat, stable=True)
+    values = source.reshape(batch * length, channels)[order]
+    # Neither `bincount` nor checked lengths: on a GPU both read values back.
+    lengths = torch.searchsorted(places, torch.arange(batch * size + 1, device=index.device)).diff()
+    summed = torch.segment_reduce(values, "sum", lengths=lengths, axis=0, unsafe=True, initial=0.0)
+    return summed.reshape(batch, size, channels)
 
 
 def by_torch_scatter(source: Tensor, index: Tensor, size: int) -> Tensor:
-    """The package torch-scatter's.
+    """The sum of the package torch-scatter.
 
     Raises:
         ConfigError: if it is not installed, or made for another torch.
@@ -66,7 +68,7 @@ _chosen: ContextVar[Add | None] = ContextVar("nmpm_transfer_backend", default=No
 
 @contextmanager
 def using(name: str) -> Iterator[None]:
-    """Sums by one backend within a `with` block.
+    """Choose the backend within a `with` block.
 
     Args:
         name: "native", "sorted" or "torch-scatter".

@@ -25,7 +25,7 @@ from nmpm.transfer.chunks import chunks
 
 @dataclass(frozen=True)
 class Stencil:
-    """Where each particle touches the grid.
+    """The nodes that each particle touches, with weights.
 
     Args:
         node: (B, N, J) int64, flat index of the J nodes of each particle (last axis fastest).
@@ -37,7 +37,7 @@ class Stencil:
 
 
 class Transfer(ABC):
-    """How particles and grid see each other. Subclasses are stateless and give the two stencils."""
+    """A pair of kernels between particles and grid. Subclasses are stateless and give the two stencils."""
 
     @abstractmethod
     def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
@@ -138,7 +138,7 @@ def tensor_product(base: Tensor, weights: list[Tensor], grid: Grid) -> Stencil:
 
 
 def inside(cells: Tensor, grid: Grid) -> Tensor:
-    """Positions (B, N, D) brought into the domain: wrapped on periodic axes, held at the faces of wall axes."""
+    """Positions (B, N, D) moved into the domain: wrapped on periodic axes, clamped to the faces of wall axes."""
     columns = [
         column.remainder(extent) if wraps else column.clamp(0, extent)
         for column, extent, wraps in zip(cells.unbind(-1), grid.shape, grid.periodic, strict=True)

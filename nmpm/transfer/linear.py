@@ -32,7 +32,7 @@ def linear_g2p(field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         return gather(linear_stencil(cells, grid), field.flatten(2).transpose(1, 2))
     unit = (per_axis(operator.truediv, 2 * cells, grid.shape) - 1).flip(-1)  # the sampler wants the last axis first
     if not cells.is_cuda:
-        unit = unit.nan_to_num()  # its gradient on a CPU takes what is no number for an address, and crashes
+        unit = unit.nan_to_num()  # torch's CPU backward segfaults on NaN coordinates
     points = unit.reshape(unit.shape[0], *(1,) * (grid.dim - 1), *unit.shape[1:])
     sampled = functional.grid_sample(field, points, mode="bilinear", padding_mode="border", align_corners=False)
     return sampled.flatten(2).transpose(1, 2)

@@ -20,7 +20,7 @@ from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.processors import FFNO, FNO, TFNO, Axial, ConvNeXt, Identity, Pointwise, UNet, UNetModern
 from nmpm.training.losses import position_error
-from nmpm.transfer import Affine, Linear, Nearest, Quadratic
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic, using
 
 TRANSFERS = (Nearest(), Linear(), Quadratic(), Affine())
 DECODERS = (Absolute(), Residual(), Flip(), Blend(), Acceleration())
@@ -103,6 +103,14 @@ def test_each_kind_of_scene_trains_and_rolls_out(transfer, name):
         emulator = emulator_of(SCENES[name], transfer, processor, energy=True, rest_speed=0.01)
         train(emulator, window(SCENES[name]), bundles=2)
         roll(emulator, window(SCENES[name]))
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS, ids=named)
+def test_reproducible_sums(transfer):
+    emulator = emulator_of(SCENES["walls"], transfer)
+    with using("sorted"):
+        train(emulator, window(SCENES["walls"]))
+        roll(emulator, window(SCENES["walls"]))
 
 
 @pytest.mark.parametrize("name", SCENES)
