@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import torch
@@ -237,13 +238,14 @@ class Results:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self._lock = path, Lock()
         self.rows: dict[str, dict[str, float]] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
     def update(self, rows: Mapping[str, Mapping[str, float]]) -> None:
-        """Add figures to variants."""
-        self.rows |= {name: self.rows.get(name, {}) | dict(row) for name, row in rows.items()}
-        write_json(self.path, self.rows)
+        """Add figures to variants; safe to call from several threads."""
+        with self._lock:
+            self.rows |= {name: self.rows.get(name, {}) | dict(row) for name, row in rows.items()}
+            write_json(self.path, self.rows)
 
 
 def run_sweep(sweep: Sweep, results: Results, chosen: argparse.Namespace) -> None:
