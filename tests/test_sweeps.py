@@ -59,7 +59,6 @@ def test_a_replaced_part_does_not_inherit_the_old_arguments():
 
 
 def test_the_table_lists_the_best_first():
-    lines = ABLATION.format_table(
-        {"worse": {"mse": 2.0}, "unfinished": {}, "better": {"mse": 1.0, "steps": 10}}
-    ).splitlines()
+    results = {"worse": {"mse": 2.0}, "unfinished": {}, "better": {"mse": 1.0, "steps": 10}}
+    lines = ABLATION.format_table(results).splitlines()
     assert [line.split()[0] for line in lines[1:]] == ["better", "worse", "unfinished"]
