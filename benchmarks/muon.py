@@ -12,7 +12,7 @@ from pytorch_optimizer import Muon
 from torch import Tensor
 
 
-class ConvolutionMuon(Muon):  # type: ignore[misc]  # (a package that is not installed)
+class ConvolutionMuon(Muon):
     """Muon for weights with three and more axes, AdamW for the others.
 
     Args:

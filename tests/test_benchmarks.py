@@ -14,6 +14,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from nmpm.sim import load_preset
+from nmpm.zoo import Zoo
+
 ROOT = Path(__file__).parent.parent / "benchmarks"
 if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
@@ -122,6 +125,55 @@ def test_a_failing_process_ends_the_measurement():
 
     with pytest.raises(EOFError):
         timing.time_in_processes({"broken": partial(int, "x")}, rounds=1, threads=1)
+
+
+# ---- what is timed
+
+CPU = torch.device("cpu")
+TINY = {"preset": "waterramps", "particles": 30, "batch": 2, "width": 4, "device": CPU}
+
+
+def test_training_steps_of_all_setups_change_the_weights():
+    import workloads
+
+    for name, setup in workloads.SETUPS.items():
+        step = workloads.TrainingStep(setup, **TINY, unroll=2, cells=16)
+        particles = step.window.frames.shape[2]
+        assert step.predict().shape == (2, 2 * workloads.FRAMES, particles, 2), name
+        before = [weight.clone() for weight in step.emulator.parameters()]
+        step()
+        assert any(not torch.equal(old, new) for old, new in zip(before, step.emulator.parameters(), strict=True)), name
+
+
+def test_recomputed_activations_give_the_same_step():
+    import workloads
+
+    steps = [
+        workloads.TrainingStep(workloads.SETUPS["ours"], **TINY, unroll=2, cells=16, recompute=recompute)
+        for recompute in (False, True)
+    ]
+    for step in steps:
+        step()
+    for one, other in zip(*(step.emulator.parameters() for step in steps), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_repeated_rollout_calls_start_from_the_same_state():
+    import workloads
+
+    calls = workloads.RolloutCalls(workloads.SETUPS["the paper's form"], **TINY, calls=2)
+    before = calls.state.position.clone()
+    calls()
+    assert torch.equal(calls.state.position, before)
+
+
+@pytest.mark.skipif("goop" not in Zoo.list(), reason="the zoo holds no goop model")
+def test_a_zoo_model_agrees_with_itself_on_the_same_device():
+    import zoo_on_device
+
+    figures = zoo_on_device.compare_devices("goop", load_preset("goop").with_frames(12), 1, CPU)
+    assert figures["cells_after_8"] == figures["cells_at_end"] == 0
+    assert 0 < figures["cpu"]["errors"]["mse"] < figures["cpu"]["errors"]["still/mse"]
 
 
 # ---- the script that runs everything on a machine with a GPU

@@ -62,3 +62,24 @@ def test_the_table_lists_the_best_first():
     results = {"worse": {"mse": 2.0}, "unfinished": {}, "better": {"mse": 1.0, "steps": 10}}
     lines = ABLATION.format_table(results).splitlines()
     assert [line.split()[0] for line in lines[1:]] == ["better", "worse", "unfinished"]
+
+
+def test_results_are_saved_at_every_change(tmp_path):
+    results = ABLATION.Results(tmp_path / "new" / "results.json")
+    results.update({"unet": {"gflop": 1.0}, "fno": {"gflop": 2.0}})
+    results.update({"unet": {"mse": 0.5}})
+    rows = ABLATION.Results(tmp_path / "new" / "results.json").rows
+    assert rows == {"unet": {"gflop": 1.0, "mse": 0.5}, "fno": {"gflop": 2.0}}
+
+
+def test_muon_orthogonalises_convolutions_only(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    muon = importlib.import_module("muon")
+    network = torch.nn.Sequential(torch.nn.Conv2d(2, 3, 3), torch.nn.Conv2d(3, 1, 1))
+    optimizer = muon.ConvolutionMuon(network.parameters(), lr=0.01)
+    orthogonalised = {id(p) for group in optimizer.param_groups if group["use_muon"] for p in group["params"]}
+    assert orthogonalised == {id(network[0].weight), id(network[1].weight)}
+    before = [p.clone() for p in network.parameters()]
+    network(torch.ones(1, 2, 5, 5)).sum().backward()
+    optimizer.step()
+    assert all(not torch.equal(old, new) for old, new in zip(before, network.parameters(), strict=True))
