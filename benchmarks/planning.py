@@ -25,8 +25,8 @@ from timing import (
 )
 from workloads import DEFAULT_SETUP, PRESETS, SETUPS, TrainingStep
 
-SIZES = (("64x64", 2_000), ("64x64", 20_000), ("64x64", 200_000), ("128x128", 2_000), ("128x128", 20_000),
-         ("256x256", 20_000), ("32x32x32", 10_000), ("64x64x64", 100_000))  # fmt: skip
+SIZES = ("64x64:2000", "64x64:20000", "64x64:200000", "128x128:2000", "128x128:20000", "256x256:20000",
+         "32x32x32:10000", "64x64x64:100000")  # fmt: skip
 STEPS, SCENES = 100_000, 16
 DEVICES = (2, 4, 8)
 
@@ -64,6 +64,7 @@ def format_row(row: dict[str, Any], batch: int) -> str:
 def main() -> None:
     """Measure, print a table, and write JSON if asked to."""
     parser = make_timing_parser(__doc__)
+    parser.add_argument("--sizes", nargs="+", default=SIZES, metavar="GRID:PARTICLES", help="e.g. 64x64:2000")
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--width", type=int, default=32)
     parser.add_argument("--unroll", type=int, default=4)
@@ -77,8 +78,9 @@ def main() -> None:
         f"   hours for {STEPS:,} steps of {SCENES} scenes, on 1, {', '.join(map(str, DEVICES))} devices\n"
     )
     rows = []
-    for grid, particles in SIZES:
-        rows.append(measure_size(grid, particles, options, chosen.threads, chosen.rounds))
+    for size in chosen.sizes:
+        grid, _, particles = size.partition(":")
+        rows.append(measure_size(grid, int(particles), options, chosen.threads, chosen.rounds))
         sys.stdout.write(format_row(rows[-1], chosen.batch))
         sys.stdout.flush()
     write_json(chosen.json, {"machine": machine, "options": options, "sizes": rows})
