@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -36,10 +36,11 @@ from nmpm.zoo import Zoo
 HORIZONS = (32, 100)
 
 
-def simulate_windows(preset: Preset, seeds: Sequence[int], workers: int) -> Iterator[Window]:
+def simulate_windows(preset: Preset, seed: int, scenes: int, workers: int) -> Iterator[Window]:
     """Whole trajectories of a preset, one scene each."""
     reader = Reader(metadata_of(preset), preset.scene)
-    with ThreadPoolExecutor(workers) as pool, shown(f"{preset.name} box", len(seeds)) as advance:
+    seeds = [derived_seed(seed, index) for index in range(scenes)]
+    with ThreadPoolExecutor(workers) as pool, shown(f"{preset.name} box", scenes) as advance:
         for made in pool.map(preset.simulate, seeds):
             recording = reader.recording(Trajectory(made.position, made.particle_type), preset.name)
             yield collate([recording], preset.scene)
@@ -47,13 +48,12 @@ def simulate_windows(preset: Preset, seeds: Sequence[int], workers: int) -> Iter
 
 
 @torch.no_grad()
-def measure_errors(emulator: Emulator, preset: Preset, seeds: Sequence[int], workers: int) -> dict[str, float]:
-    """Errors × 10⁻³ of the emulator on scenes of a preset, in that preset's box."""
-    device = emulator.device
-    emulator = emulator.over(preset.scene).eval().to(device)
+def measure_errors(emulator: Emulator, preset: Preset, windows: Iterable[Window]) -> dict[str, float]:
+    """Errors × 10⁻³ of the emulator on trajectories of a preset, in that preset's box."""
+    emulator = emulator.over(preset.scene).eval()
     comparison = Comparison(preset.scene, [MSE(HORIZONS)])
-    for window in simulate_windows(preset, seeds, workers):
-        predicted = rollout(emulator, window.initial.to(device), window.target.shape[1])
+    for window in windows:
+        predicted = rollout(emulator, window.initial.to(emulator.device), window.target.shape[1])
         comparison.update(window, predicted.cpu())
     return {name: 1e3 * float(value) for name, value in comparison.compute().items()}
 
@@ -78,12 +78,12 @@ def main() -> None:
     chosen = parser.parse_args()
     preset = load_preset(chosen.preset)
     preset = preset.with_frames(chosen.frames or preset.frames)
-    seeds = [derived_seed(chosen.seed, index) for index in range(chosen.scenes)]
     models = {run.name: load_best(run) for run in chosen.runs}
     models |= {name: Zoo.load(name).emulator for name in chosen.zoo}
     for name, emulator in models.items():
         for kind in (preset, dataclasses.replace(preset.widened(2), name="wide")):
-            errors = measure_errors(emulator.to(chosen.device), kind, seeds, chosen.workers)
+            windows = simulate_windows(kind, chosen.seed, chosen.scenes, chosen.workers)
+            errors = measure_errors(emulator.to(chosen.device), kind, windows)
             figures = "  ".join(f"{key} {value:.4g}" for key, value in errors.items())
             sys.stdout.write(f"{name:<20}{kind.name:<8}{figures}\n")
             sys.stdout.flush()

@@ -20,7 +20,6 @@ from timing import describe_machine, make_timing_parser, time_run, write_json
 from torch import Tensor
 from wider_box import simulate_windows
 
-from nmpm.data.generate import derived_seed
 from nmpm.emulator import rollout
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE
@@ -63,7 +62,7 @@ def roll_out(name: str, windows: Sequence[Window], device: torch.device) -> Roll
 
 def compare_devices(name: str, preset: Preset, scenes: int, device: torch.device) -> dict[str, object]:
     """Print and return a model's figures on the CPU and on a device."""
-    windows = list(simulate_windows(preset, [derived_seed(SEED, index) for index in range(scenes)], workers=1))
+    windows = list(simulate_windows(preset, SEED, scenes, workers=1))
     cell = min(Zoo.load(name).emulator.grid.spacing)
     places = {"cpu": torch.device("cpu"), str(device): device}
     found = {place: roll_out(name, windows, where) for place, where in places.items()}
