@@ -1,70 +1,75 @@
-"""What constraints and the monitor cost a rollout, each beside the free one, in turns within one run.
+"""What constraints and the monitor cost: rollouts of a zoo model with each, beside unconstrained ones, alternating.
 
 python benchmarks/constraints.py --zoo goop waterramps --frames 400 --repeats 9
+
+CPU time on the CPU, wall time on a GPU.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 
 import torch
-from turns import in_one_process, processor_time
+from timing import Clock, add_device_option, clock_for, make_parser, time_alternating, time_run
 
+from nmpm.emulator import Bundle, Emulator, rollout
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.model import Bundle, Emulator
 from nmpm.emulator.monitor import Monitor, Policy
-from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.stress.subject import Subject
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
 
-FREE = Constraints(solids=False)
+UNCONSTRAINED = Constraints(solids=False)
 
 
-class Timed(Monitor):
-    """A monitor that times itself: its share is far below what whole rollouts differ by."""
+class TimedMonitor(Monitor):
+    """A monitor that adds up its own time, which is too short to show in the difference of two rollouts.
 
-    spent = 0.0
+    Args:
+        clock: Reads the time.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(Policy.RECORD)
+        self.clock, self.seconds = clock, 0.0
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
-        start = time.process_time()
-        super().see(emulator, particles, bundle)
-        self.spent += time.process_time() - start
+        """Look at a bundle, and count the time."""
+        self.seconds += time_run(partial(super().see, emulator, particles, bundle), self.clock)
 
 
-def watched(emulator: Emulator, state: Particles, frames: int, repeats: int) -> list[float]:
-    """Shares of rollouts' time that go into watching them."""
-    shares = []
+def measure_monitor(emulator: Emulator, state: Particles, frames: int, repeats: int) -> list[float]:
+    """The monitor's time over that of the rest of a rollout, for each repeat."""
+    clock, shares = clock_for(emulator.device), []
     for _ in range(repeats + 1):
-        monitor = Timed(Policy.RECORD)
-        whole = processor_time(lambda monitor=monitor: rollout(emulator, state, frames, monitor))
-        shares.append(monitor.spent / (whole - monitor.spent))
+        monitor = TimedMonitor(clock)
+        seconds = time_run(partial(rollout, emulator, state, frames, monitor), clock)
+        shares.append(monitor.seconds / (seconds - monitor.seconds))
     return shares[1:]
 
 
-def measure(name: str, frames: int, repeats: int) -> None:
+def measure_model(name: str, frames: int, repeats: int, device: torch.device) -> None:
     """Print ratios for a zoo model, on one scene of its simulator."""
-    emulator = Zoo.load(name).emulator
+    emulator = Zoo.load(name, device=device).emulator
     state = Subject(name, emulator, 32, load_preset(name)).starts(1)
-    forms: dict[str, Callable[[], object]] = {}
 
-    def form(constraints: Constraints) -> Callable[[], object]:
-        return partial(rollout, emulator.with_constraints(constraints), state, frames)
+    def roll_out(**constraints: bool | float) -> Callable[[], object]:
+        constrained = emulator.with_constraints(dataclasses.replace(UNCONSTRAINED, **constraints))
+        return partial(rollout, constrained, state, frames)
 
-    held = dataclasses.replace(FREE, energy=True, rest_speed=0.01, solids=True)
-    forms["free"] = form(FREE)
-    forms["energy"] = form(dataclasses.replace(FREE, energy=True))
-    forms["rest"] = form(dataclasses.replace(FREE, rest_speed=0.01))
-    forms["solids"] = form(dataclasses.replace(FREE, solids=True))
-    forms["all"] = form(held)
-    seconds = in_one_process(forms, repeats, processor_time)
+    rollouts = {
+        "free": roll_out(),
+        "energy": roll_out(energy=True),
+        "rest": roll_out(rest_speed=0.01),
+        "solids": roll_out(solids=True),
+        "all": roll_out(energy=True, rest_speed=0.01, solids=True),
+    }
+    seconds = time_alternating(rollouts, repeats, clock_for(device))
     bundles = -(-frames // emulator.frames)
     for key, values in seconds.items():
         ratios = [value / free for value, free in zip(values, seconds["free"], strict=True)]
@@ -73,20 +78,21 @@ def measure(name: str, frames: int, repeats: int) -> None:
             f"{name:<12}{key:<16}{call:6.2f} ms/call   {statistics.median(ratios):.3f} of free"
             f" ({min(ratios):.3f}-{max(ratios):.3f})\n"
         )
-    shares = watched(emulator, state, frames, repeats)
-    sys.stdout.write(f"{name:<12}watching adds {statistics.median(shares):.2%} ({min(shares):.2%}-{max(shares):.2%})\n")
+    shares = measure_monitor(emulator, state, frames, repeats)
+    sys.stdout.write(f"{name:<12}monitor adds {statistics.median(shares):.2%} ({min(shares):.2%}-{max(shares):.2%})\n")
 
 
 def main() -> None:
     """Measure each model."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--zoo", nargs="+", default=["goop", "waterramps"])
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--repeats", type=int, default=9)
+    add_device_option(parser)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     for name in chosen.zoo:
-        measure(name, chosen.frames, chosen.repeats)
+        measure_model(name, chosen.frames, chosen.repeats, chosen.device)
 
 
 if __name__ == "__main__":

@@ -1,36 +1,38 @@
-"""One trajectory of every shipped scene, drawn: python benchmarks/gallery.py docs/scenes.png [--seed 3] [--frames 400]
+"""Simulate and draw one trajectory of every shipped scene, stacked into one picture.
 
-The pictures are stacked into one. The slowest scenes take a minute or more; --only names the scenes to draw.
+python benchmarks/gallery.py docs/scenes.png [--seed 3] [--frames 400]
+
+The slowest scenes take a minute or more; --only names the scenes to draw.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from PIL import Image
+from timing import make_parser
 
 from nmpm.sim import load_preset, preset_names
 
 
 def main() -> None:
     """Simulate and draw each scene, and stack the pictures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--frames", type=int, help="of each scene, at most")
     parser.add_argument("--only", nargs="+", default=list(preset_names()))
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        drawn = [_drawn(name, chosen.seed, chosen.frames, Path(folder)) for name in chosen.only]
-        _stacked(drawn).save(chosen.out, optimize=True)
+        drawn = [_draw(name, chosen.seed, chosen.frames, Path(folder)) for name in chosen.only]
+        _stack(drawn).save(chosen.out, optimize=True)
     sys.stdout.write(f"wrote {chosen.out}\n")
 
 
-def _drawn(name: str, seed: int, frames: int | None, folder: Path) -> Image.Image:
+def _draw(name: str, seed: int, frames: int | None, folder: Path) -> Image.Image:
     path = folder / f"{name}.png"
     length = min(load_preset(name).frames, frames or sys.maxsize)
     words = ["simulate", name, "--preview", str(path), "--seed", str(seed), "--frames", str(length)]
@@ -39,7 +41,7 @@ def _drawn(name: str, seed: int, frames: int | None, folder: Path) -> Image.Imag
         return picture.convert("RGB")
 
 
-def _stacked(pictures: list[Image.Image], width: int = 1200) -> Image.Image:
+def _stack(pictures: list[Image.Image], width: int = 1200) -> Image.Image:
     scaled = [picture.resize((width, round(picture.height * width / picture.width))) for picture in pictures]
     whole = Image.new("RGB", (width, sum(picture.height for picture in scaled)), "white")
     top = 0

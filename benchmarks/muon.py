@@ -1,7 +1,7 @@
-"""Muon as a configuration can name it: orthogonalised steps for the convolutions, AdamW for all else.
+"""Muon for configurations: orthogonalised steps for convolutions, AdamW for all other weights.
 
-Needs `pip install pytorch-optimizer`; run with this folder on PYTHONPATH. Source: K. Jordan et al., Muon, 2024, by way
-of that package, which flattens a convolution's weight to a matrix of its output channels.
+Run with this folder on PYTHONPATH. Source: K. Jordan et al., Muon, 2024, as implemented by `pytorch_optimizer`, which
+reshapes a convolution's weight to a matrix with a row per output channel.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from pytorch_optimizer import Muon
 from torch import Tensor
 
 
-class ConvolutionMuon(Muon):  # type: ignore[misc]  # (a package that is not installed)
-    """Muon for weights of three and more axes.
+class ConvolutionMuon(Muon):
+    """Muon for weights with three and more axes, AdamW for the others.
 
     Args:
-        params: Of a network.
-        lr: Of Muon.
-        adamw_lr: Of AdamW.
+        params: The network's parameters.
+        lr: Learning rate of Muon.
+        adamw_lr: Learning rate of AdamW.
     """
 
     def __init__(self, params: Iterable[Tensor], lr: float = 0.02, adamw_lr: float = 1.5e-3) -> None:

@@ -1,0 +1,127 @@
+"""Run all that needs a GPU with one command: a training, the tests, the benchmarks, the zoo's models.
+
+python benchmarks/gpu.py --out runs/gpu
+python benchmarks/gpu.py --out runs/gpu --dry-run       print the commands
+
+Each step writes its output to OUT/STEP.log, whose last line is the exit status. Run the same command again to continue:
+steps that ended with status 0 are skipped. Exits with 1 if a step fails; the others run nevertheless.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from timing import make_parser
+
+from nmpm._support.devices import DEVICES, find_device
+
+ROOT = Path(__file__).resolve().parent.parent
+STATUS = "exit status "
+LARGE_GRIDS = ("64x64", "256x256", "1024x1024", "64x64x64", "128x128x128")
+
+
+def list_steps(device: str, out: Path) -> dict[str, list[str]]:
+    """The command of each step, in order."""
+    sizes = ["--particles", "1e3", "1e4", "1e5", "1e6", "1e7", "--grids", *LARGE_GRIDS]
+    ablation = ["benchmarks/sweeps/parts.yaml", "--minutes", "3", "--out", str(out / "parts")]
+    return {
+        "fit": _python("-m", "nmpm", "fit", "--config", "goop.yaml"),
+        "tests": _python("-m", "pytest", "--device", device),
+        "training_step": _benchmark("training_step", device, "--batch", "128", "--rounds", "20"),
+        "rollout_call": _benchmark("rollout_call", device, "--batch", "128"),
+        "rollout_call_one_scene": _benchmark("rollout_call", device),
+        "scaling": _benchmark("scaling", device, *sizes),
+        "planning": _benchmark("planning", device, "--batch", "16"),
+        "call_costs": _benchmark("call_costs", device),
+        "constraints": _benchmark("constraints", device),
+        "first_frame": _benchmark("first_frame", device),
+        "wider_box": _benchmark("wider_box", device, "--zoo", "goop"),
+        "streaming": _python("benchmarks/streaming.py"),
+        "ablation": _benchmark("ablation", device, *ablation),
+        "zoo": _benchmark("zoo_on_device", device),
+    }
+
+
+def _python(*words: str) -> list[str]:
+    return [sys.executable, *words]
+
+
+def _benchmark(name: str, device: str, *words: str) -> list[str]:
+    return _python(f"benchmarks/{name}.py", *words, "--device", device)
+
+
+def run_steps(steps: Mapping[str, list[str]], out: Path) -> list[str]:
+    """Run the steps that have not succeeded yet.
+
+    Args:
+        steps: Commands by name, run in the repository's root.
+        out: Folder of the logs.
+
+    Returns:
+        Names of the steps that failed.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    failed = []
+    for name, command in steps.items():
+        log = out / f"{name}.log"
+        if has_succeeded(command, log):
+            sys.stdout.write(f"{name}: done before\n")
+            continue
+        sys.stdout.write(f"{name}: {shlex.join(command)}\n")
+        sys.stdout.flush()
+        start = time.monotonic()
+        status = _run_logged(command, log)
+        sys.stdout.write(f"{name}: {STATUS}{status} after {time.monotonic() - start:.0f} s, see {log}\n")
+        if status:
+            failed.append(name)
+    return failed
+
+
+def _run_logged(command: list[str], log: Path) -> int:
+    with log.open("wb") as file:
+        file.write(_first_line(command))
+        file.flush()
+        status = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT).returncode  # noqa: S603
+        file.write(_last_line(status))
+    return status
+
+
+def has_succeeded(command: list[str], log: Path) -> bool:
+    """Whether a log is of this command and ends with status 0; False if it is missing or the step was interrupted."""
+    text = log.read_bytes() if log.exists() else b""
+    return text.startswith(_first_line(command)) and text.endswith(_last_line(0))
+
+
+def _first_line(command: list[str]) -> bytes:
+    return f"$ {shlex.join(command)}\n".encode()
+
+
+def _last_line(status: int) -> bytes:
+    return f"\n{STATUS}{status}\n".encode()
+
+
+def main() -> None:
+    """Run or print the steps."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the logs (default: runs/gpu)")
+    parser.add_argument("--device", choices=DEVICES, default="cuda")
+    parser.add_argument("--dry-run", action="store_true", help="print the commands and run nothing")
+    chosen = parser.parse_args()
+    out = chosen.out.resolve()
+    steps = list_steps(chosen.device, out)
+    if chosen.dry_run:
+        sys.stdout.write("".join(f"{name}: {shlex.join(command)}\n" for name, command in steps.items()))
+        return
+    find_device(chosen.device)
+    failed = run_steps(steps, out)
+    if failed:
+        raise SystemExit(f"failed: {', '.join(failed)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""What the benchmarks time: training steps and rollout calls, of the paper's emulator and of this project's.
+
+The *paper's form*: nearest transfers, absolute decoder, float32, channels first, walls rasterised for each bundle,
+three hidden layers in the perceptrons (Rochman-Sharabi, Lewin & Louppe, arXiv 2408.15753). Width, depth, grid, batch,
+bundles and optimizer are the same for all setups, unless a setup's name says otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from timing import make_timing_parser
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from nmpm.data.initial_states import thrown_blocks
+from nmpm.decoders import Absolute, Decoder, Residual
+from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext
+from nmpm.emulator.calibration import calibrate
+from nmpm.emulator.constraints import Constraints
+from nmpm.particles import Particles, Window
+from nmpm.processors import UNet
+from nmpm.scene import Scene
+from nmpm.sim import load_preset
+from nmpm.training.losses import position_error
+from nmpm.transfer import Linear, Nearest, Transfer
+
+UNCONSTRAINED = Constraints(solids=False)
+CELLS, FRAMES, DEPTH = 64, 8, 3
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One way to build and run an emulator.
+
+    Args:
+        transfer, decoder: Its parts.
+        perceptron: Hidden layers of the network's perceptrons.
+        precision: Of the network.
+        paper: Channels first, and walls rasterised for each bundle.
+        width_factor: Width of the network over the width that the benchmark asks for.
+    """
+
+    transfer: Transfer
+    decoder: Decoder
+    perceptron: int
+    precision: torch.dtype
+    paper: bool = False
+    width_factor: float = 1.0
+
+
+SETUPS: Mapping[str, Setup] = MappingProxyType(
+    {
+        "the paper's form": Setup(Nearest(), Absolute(), 3, torch.float32, paper=True),
+        "ours in float32, the paper's network": Setup(Linear(), Residual(), 3, torch.float32),
+        "ours, the paper's network": Setup(Linear(), Residual(), 3, torch.bfloat16),
+        "ours": Setup(Linear(), Residual(), 1, torch.bfloat16),
+        "ours, half as wide (as shipped)": Setup(Linear(), Residual(), 1, torch.bfloat16, width_factor=0.5),
+    }
+)
+
+PRESETS: Mapping[int, str] = MappingProxyType({2: "waterramps", 3: "waterdrop3d"})
+"""The preset whose box is used, by number of dimensions, where sizes are compared."""
+DEFAULT_SETUP = "ours"
+"""The setup that is run where sizes are compared."""
+
+
+def make_setups_parser(description: str | None, batch: int) -> argparse.ArgumentParser:
+    """A parser for scripts that compare the setups, with their usual batch."""
+    parser = make_timing_parser(description)
+    parser.add_argument("--preset", default="waterramps")
+    parser.add_argument("--particles", type=int, default=2300)
+    parser.add_argument("--batch", type=int, default=batch)
+    parser.add_argument("--width", type=int, default=64)
+    return parser
+
+
+class ChannelsFirst(nn.Module):
+    """Runs a network on contiguous (channels-first) inputs and weights."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """The network's output."""
+        fields: Tensor = self.network(grid.contiguous())
+        return fields
+
+
+def build_emulator(setup: Setup, scene: Scene, width: int, cells: int | Sequence[int] = CELLS) -> Emulator:
+    """An untrained emulator without constraints."""
+    torch.manual_seed(0)
+    width = round(width * setup.width_factor)
+    processor = UNet(width=width, depth=DEPTH, perceptron=(width,) * setup.perceptron)
+    recipe = EmulatorRecipe(scene, cells, FRAMES, setup.transfer, processor, setup.decoder, constraints=UNCONSTRAINED)
+    emulator = recipe.build()
+    if setup.paper:
+        emulator.processor = ChannelsFirst(emulator.processor)  # type: ignore[assignment]
+    return emulator
+
+
+def make_scenes(preset: str, count: int, batch: int) -> tuple[Scene, Particles]:
+    """Thrown blocks in a preset's box, (batch, count) particles, refined if need be so that they fill a fifth of it."""
+    scene = load_preset(preset).scene
+    scene = dataclasses.replace(scene, particle_volume=min(scene.particle_volume, 0.2 * scene.volume / count))
+    states = [thrown_blocks(scene, count=count, blocks=2, seed=seed) for seed in range(batch)]
+    joined = {name: torch.cat([getattr(s, name) for s in states]) for name in vars(states[0])}
+    return scene, Particles(**joined)
+
+
+class TrainingStep:
+    """A training step, repeated on one batch.
+
+    Args:
+        setup: What to train.
+        options: `preset`, `particles`, `batch`, `width`, `unroll`, `device`; optionally `cells` and `recompute`.
+    """
+
+    def __init__(self, setup: Setup, **options: Any) -> None:
+        scene, state = make_scenes(options["preset"], options["particles"], options["batch"])
+        device = options["device"]
+        self.setup, self.unroll, self.recompute = setup, options["unroll"], options.get("recompute", False)
+        steps = torch.arange(2 + FRAMES * self.unroll).sub(1).view(1, -1, 1, 1)
+        frames = state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)
+        others = {name: value for name, value in vars(state).items() if name not in ("position", "velocity")}
+        window = Window(frames=frames, **others)
+        emulator = build_emulator(setup, scene, options["width"], options.get("cells", CELLS))
+        calibrate(emulator, [window])
+        self.window, self.emulator = window.to(device), emulator.to(device)
+        self.optimizer = torch.optim.Adam(self.emulator.parameters(), lr=1e-6, fused=device.type == "cuda")
+
+    def __call__(self) -> None:
+        """One step."""
+        mixed = self.setup.precision != torch.float32
+        with torch.autocast(self.window.frames.device.type, self.setup.precision, enabled=mixed):
+            loss = position_error(self.predict(), self.window.target, self.window.mask, self.emulator.grid)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.emulator.parameters(), 1.0)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+
+    def predict(self) -> Tensor:
+        """Positions of K bundles of m frames, (B, K m, N, D)."""
+        particles, bundles = self.window.initial, []
+        context = self.emulator.context(particles)
+        for _ in range(self.unroll):
+            if self.setup.paper:
+                context = self.emulator.context(particles)
+            bundle = self._predict_bundle(particles, context)
+            particles = particles.moved(bundle.position[:, -1], bundle.velocity)
+            bundles.append(bundle.position)
+        return torch.cat(bundles, dim=1)
+
+    def _predict_bundle(self, particles: Particles, context: RolloutContext) -> Bundle:
+        if not self.recompute:
+            return self.emulator(particles, context)
+        return checkpoint(self.emulator, particles, context, use_reentrant=False)
+
+
+class RolloutCalls:
+    """Consecutive calls of a rollout, from the same initial state each time.
+
+    Args:
+        setup: What to roll out.
+        options: `preset`, `particles`, `batch`, `width`, `device`; optionally `calls` per run.
+    """
+
+    def __init__(self, setup: Setup, **options: Any) -> None:
+        scene, state = make_scenes(options["preset"], options["particles"], options["batch"])
+        emulator = build_emulator(setup, scene, options["width"]).eval().requires_grad_(False)
+        if setup.precision != torch.float32:
+            emulator.processor.to(setup.precision)
+        self.setup, self.calls = setup, options.get("calls", 10)
+        self.emulator, self.state = emulator.to(options["device"]), state.to(options["device"])
+        self.context = self.emulator.context(self.state)
+
+    @torch.inference_mode()
+    def __call__(self) -> None:
+        """All calls."""
+        particles, context = self.state, self.context
+        for _ in range(self.calls):
+            if self.setup.paper:
+                context = self.emulator.context(particles)
+            bundle = self.emulator(particles, context)
+            particles = particles.moved(bundle.position[:, -1], bundle.velocity)

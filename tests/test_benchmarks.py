@@ -1,0 +1,240 @@
+"""The benchmark scripts start, share their options, and time and log as they say; no timing is asserted."""
+
+import argparse
+import contextlib
+import io
+import json
+import runpy
+import shlex
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from nmpm.sim import load_preset
+from nmpm.zoo import Zoo
+
+ROOT = Path(__file__).parent.parent / "benchmarks"
+if not ROOT.is_dir():
+    pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
+SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
+WITHOUT_DEVICE = {"exported", "gallery"} | {
+    "against_recordings", "calibration", "dam_break", "simulators", "stable_substeps",
+}  # fmt: skip
+"""These measure the CPU alone: export runtimes on one thread, and the simulators."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def folder_on_path():
+    """The scripts import one another by name, as they do when run from anywhere."""
+    sys.path.insert(0, str(ROOT))
+    yield
+    sys.path.remove(str(ROOT))
+
+
+def run_script(name, *words):
+    """Run a script as the main program of this process, and return what it writes."""
+    out, before = io.StringIO(), sys.argv
+    sys.argv = [f"{name}.py", *words]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            runpy.run_path(str(ROOT / f"{name}.py"), run_name="__main__")
+    finally:
+        sys.argv = before
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_help_of_every_script(name):
+    if name == "exported":
+        pytest.importorskip("onnxruntime")
+    source = (ROOT / f"{name}.py").read_text()
+    if "ArgumentParser" not in source and "_parser(" not in source:
+        pytest.skip(f"{name} takes no options")
+    text = run_script(name, "--help")
+    assert text.startswith(f"usage: {name}.py")
+    assert "--device" in text or name in WITHOUT_DEVICE | {"streaming"}
+
+
+def test_device_option_refuses_a_missing_device_by_name(capsys):
+    import timing
+
+    parser = timing.make_timing_parser(None)
+    assert parser.parse_args([]).device == timing.find_device("auto")
+    assert parser.parse_args(["--device", "cpu"]).device == torch.device("cpu")
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--device", "abacus"])
+    assert "device 'abacus' is not one of auto, cpu, cuda, mps" in capsys.readouterr().err
+
+
+def test_alternating_runs_are_warmed_up_and_interleaved():
+    import timing
+
+    ran = []
+    clock = iter(range(1000))
+    actions = {name: partial(ran.append, name) for name in "ab"}
+    seconds = timing.time_alternating(actions, 3, lambda: float(next(clock)), warm_up=2)
+    assert ran == ["a", "b"] * 5
+    assert seconds == {"a": [1.0] * 3, "b": [1.0] * 3}
+
+
+def test_wall_clock_waits_for_the_gpu_and_clocks_follow_the_device(monkeypatch):
+    import timing
+
+    waited = []
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(True))
+    timing.time_run(lambda: waited.append(False))
+    assert waited == [True, False, True]
+    assert timing.clock_for(torch.device("cpu")) is time.process_time
+    assert timing.clock_for(torch.device("cuda")) is timing.wall_clock
+
+
+def test_peak_on_cuda_is_what_tensors_held_beyond_those_before(monkeypatch):
+    import timing
+
+    held = {"now": 100, "peak": 900}
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: held["now"])
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda _: held.update(peak=held["now"]))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda _: held["peak"])
+    assert timing.peak_bytes(lambda: held.update(peak=350), torch.device("cuda")) == 250
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_peak_on_the_cpu_counts_an_allocation():
+    import timing
+
+    size = 2**25
+    assert timing.peak_bytes(lambda: torch.ones(size, dtype=torch.uint8).sum(), torch.device("cpu")) > 0.9 * size
+
+
+def test_json_has_devices_and_spreads_as_plain_values(tmp_path):
+    import timing
+
+    path = tmp_path / "figures.json"
+    timing.write_json(path, {"device": torch.device("cpu"), "seconds": timing.Spread.of([1.0, 3.0, 2.0])})
+    assert json.loads(path.read_text()) == {"device": "cpu", "seconds": {"median": 2.0, "least": 1.0, "most": 3.0}}
+
+
+def test_a_failing_process_ends_the_measurement():
+    import timing
+
+    with pytest.raises(EOFError):
+        timing.time_in_processes({"broken": partial(int, "x")}, rounds=1, threads=1)
+
+
+# ---- what is timed
+
+CPU = torch.device("cpu")
+TINY = {"preset": "waterramps", "particles": 30, "batch": 2, "width": 4, "device": CPU}
+
+
+def test_training_steps_of_all_setups_change_the_weights():
+    import workloads
+
+    for name, setup in workloads.SETUPS.items():
+        step = workloads.TrainingStep(setup, **TINY, unroll=2, cells=16)
+        particles = step.window.frames.shape[2]
+        assert step.predict().shape == (2, 2 * workloads.FRAMES, particles, 2), name
+        before = [weight.clone() for weight in step.emulator.parameters()]
+        step()
+        assert any(not torch.equal(old, new) for old, new in zip(before, step.emulator.parameters(), strict=True)), name
+
+
+def test_recomputed_activations_give_the_same_step():
+    import workloads
+
+    steps = [
+        workloads.TrainingStep(workloads.SETUPS["ours"], **TINY, unroll=2, cells=16, recompute=recompute)
+        for recompute in (False, True)
+    ]
+    for step in steps:
+        step()
+    for one, other in zip(*(step.emulator.parameters() for step in steps), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_repeated_rollout_calls_start_from_the_same_state():
+    import workloads
+
+    calls = workloads.RolloutCalls(workloads.SETUPS["the paper's form"], **TINY, calls=2)
+    before = calls.state.position.clone()
+    calls()
+    assert torch.equal(calls.state.position, before)
+
+
+@pytest.mark.skipif("goop" not in Zoo.list(), reason="the zoo holds no goop model")
+def test_a_zoo_model_agrees_with_itself_on_the_same_device():
+    import zoo_on_device
+
+    figures = zoo_on_device.compare_devices("goop", load_preset("goop").with_frames(12), 1, CPU)
+    assert figures["cells_after_8"] == figures["cells_at_end"] == 0
+    assert 0 < figures["cpu"]["errors"]["mse"] < figures["cpu"]["errors"]["still/mse"]
+
+
+# ---- the script that runs everything on a machine with a GPU
+
+
+def test_gpu_dry_run_prints_all_steps_in_order_and_runs_nothing(tmp_path):
+    lines = run_script("gpu", "--out", str(tmp_path / "logs"), "--dry-run").splitlines()
+    steps = dict(line.split(": ", 1) for line in lines)
+    assert list(steps)[:2] == ["fit", "tests"]
+    assert list(steps)[-1] == "zoo"
+    assert steps["fit"].endswith("nmpm fit --config goop.yaml")
+    assert steps["tests"].endswith("pytest --device cuda")
+    assert not (tmp_path / "logs").exists()
+    started = {word for step in steps.values() for word in shlex.split(step) if word.startswith("benchmarks/")}
+    assert {f"benchmarks/{name}.py" for name in set(SCRIPTS) - WITHOUT_DEVICE - {"gpu"}} <= started
+
+
+class ParsedError(Exception):
+    """Ends a script once its options are read."""
+
+
+def test_gpu_steps_are_understood_by_their_scripts(tmp_path, monkeypatch):
+    import gpu
+    import timing
+
+    read = argparse.ArgumentParser.parse_args
+
+    def stop_after_parsing(parser, *words):
+        raise ParsedError(read(parser, *words).device if "streaming" not in sys.argv[0] else None)
+
+    monkeypatch.setattr(timing, "find_device", torch.device)
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop_after_parsing)
+    for name, (_, script, *words) in gpu.list_steps("cuda", tmp_path).items():
+        if script.startswith("benchmarks/"):
+            with pytest.raises(ParsedError) as parsed:
+                run_script(Path(script).stem, *words)
+            assert parsed.value.args[0] in (torch.device("cuda"), None), name
+
+
+def test_gpu_steps_are_logged_continued_and_failures_named(tmp_path, capsys):
+    import gpu
+
+    python, marker = sys.executable, tmp_path / "marker"
+    good = [python, "-c", f"open({str(marker)!r}, 'a').write('x'); print('well')"]
+    bad = [python, "-c", "print('ill'); raise SystemExit(3)"]
+    assert gpu.run_steps({"good": good, "bad": bad, "last": good}, tmp_path / "logs") == ["bad"]
+    assert (tmp_path / "logs" / "good.log").read_text().splitlines()[1:] == ["well", "", "exit status 0"]
+    assert (tmp_path / "logs" / "bad.log").read_text().endswith("ill\n\nexit status 3\n")
+    assert gpu.run_steps({"good": good, "bad": good, "last": good}, tmp_path / "logs") == []
+    assert marker.read_text() == "xxx"  # good and last are not run again
+    assert gpu.run_steps({"good": [*good, "other"]}, tmp_path / "logs") == []
+    assert marker.read_text() == "xxxx"  # another command is
+    assert "good: done before" in capsys.readouterr().out
+
+
+def test_gpu_runs_an_interrupted_step_again(tmp_path):
+    import gpu
+
+    log = tmp_path / "step.log"
+    command = [sys.executable, "-c", "pass"]
+    log.write_bytes(gpu._first_line(command) + b"half of the output")
+    assert not gpu.has_succeeded(command, log)
+    gpu.run_steps({"step": command}, tmp_path)
+    assert gpu.has_succeeded(command, log)
