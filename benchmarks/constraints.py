@@ -7,7 +7,6 @@ CPU time on the CPU, wall time on a GPU.
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 import sys
 from collections.abc import Callable
@@ -23,8 +22,6 @@ from nmpm.evaluation.stress.subject import Subject
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
-
-UNCONSTRAINED = Constraints(solids=False)
 
 
 class TimedMonitor(Monitor):
@@ -58,16 +55,15 @@ def measure_model(name: str, frames: int, repeats: int, device: torch.device) ->
     emulator = Zoo.load(name, device=device).emulator
     state = Subject(name, emulator, 32, load_preset(name)).starts(1)
 
-    def roll_out(**constraints: bool | float) -> Callable[[], object]:
-        constrained = emulator.with_constraints(dataclasses.replace(UNCONSTRAINED, **constraints))
-        return partial(rollout, constrained, state, frames)
+    def roll_out(constraints: Constraints) -> Callable[[], object]:
+        return partial(rollout, emulator.with_constraints(constraints), state, frames)
 
     rollouts = {
-        "free": roll_out(),
-        "energy": roll_out(energy=True),
-        "rest": roll_out(rest_speed=0.01),
-        "solids": roll_out(solids=True),
-        "all": roll_out(energy=True, rest_speed=0.01, solids=True),
+        "free": roll_out(Constraints(solids=False)),
+        "energy": roll_out(Constraints(energy=True, solids=False)),
+        "rest": roll_out(Constraints(rest_speed=0.01, solids=False)),
+        "solids": roll_out(Constraints(solids=True)),
+        "all": roll_out(Constraints(energy=True, rest_speed=0.01, solids=True)),
     }
     seconds = time_alternating(rollouts, repeats, clock_for(device))
     bundles = -(-frames // emulator.frames)

@@ -34,7 +34,7 @@ DEVICES = (2, 4, 8)
 def measure_step(grid: str, particles: int, options: dict[str, Any], threads: int, rounds: int) -> dict[str, Any]:
     """Seconds of a training step, and the most memory that it holds, in bytes."""
     torch.set_num_threads(threads)
-    cells = [int(side) for side in grid.split("x")]
+    cells = tuple(int(side) for side in grid.split("x"))
     step = TrainingStep(SETUPS[DEFAULT_SETUP], preset=PRESETS[len(cells)], particles=particles, cells=cells, **options)
     peak = peak_bytes(step, options["device"])  # warms up, too
     return {"seconds": Spread.of(time_alternating({"": step}, rounds, warm_up=0)[""]), "bytes": peak}

@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     chosen = parser.parse_args()
     shapes = [tuple(int(side) for side in text.split("x")) for text in chosen.grids]
-    sizes = [(round(count), (64, 64)) for count in chosen.particles]
+    sizes: list[tuple[int, tuple[int, ...]]] = [(round(count), (64, 64)) for count in chosen.particles]
     sizes += [(10_000 if len(shape) == 2 else 100_000, shape) for shape in shapes]
     machine = describe_machine(chosen.device, chosen.threads)
     limits = measure_limits(chosen.device, chosen.threads)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -94,7 +94,7 @@ class ChannelsFirst(nn.Module):
         return fields
 
 
-def build_emulator(setup: Setup, scene: Scene, width: int, cells: int | Sequence[int] = CELLS) -> Emulator:
+def build_emulator(setup: Setup, scene: Scene, width: int, cells: int | tuple[int, ...] = CELLS) -> Emulator:
     """An untrained emulator without constraints."""
     torch.manual_seed(0)
     width = round(width * setup.width_factor)
@@ -159,9 +159,11 @@ class TrainingStep:
         return torch.cat(bundles, dim=1)
 
     def _predict_bundle(self, particles: Particles, context: RolloutContext) -> Bundle:
-        if not self.recompute:
-            return self.emulator(particles, context)
-        return checkpoint(self.emulator, particles, context, use_reentrant=False)
+        if self.recompute:
+            recomputed: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
+            return recomputed
+        bundle: Bundle = self.emulator(particles, context)
+        return bundle
 
 
 class RolloutCalls:
