@@ -148,7 +148,7 @@ def test_shipped_models_keep_particles_in_the_box_and_beat_the_trivial_predictor
     ("words", "complaint"),
     [
         (["rollout", "nothing"], "holds no model"),
-        (["rollout", "nothing", "--frames", "0"], "at least 1 frame"),
+        (["rollout", "nothing", "--frames", "0"], "--frames 0: it must be at least 1"),
         (["rollout", "nothing", "--out", "no/where.h5"], "does not exist"),
         (["render", "nothing.h5"], "nothing.h5"),
         (["zoo", "add", "nowhere", "mine"], "not a finished run"),
