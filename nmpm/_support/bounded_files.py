@@ -26,17 +26,19 @@ def read_bounded(path: Path, limit: int) -> bytes:
         DataError: if there is no such file, or it cannot be read, is not a regular file, or is larger.
     """
     try:
-        # A named pipe would block, and a device might act, when opened.
-        if not stat.S_ISREG(os.stat(path).st_mode):
+        # Before opening, as that would block on a named pipe.
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
             raise DataError(f"{path} cannot be read: it is not a regular file.")
+        if status.st_size > limit:
+            raise DataError(f"{path} cannot be read: it has more than {limit:,} bytes.")
         with path.open("rb") as file:
-            content = file.read(limit + 1)
+            return file.read(status.st_size)
+    except DataError:
+        raise
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(f"{path} cannot be read: {reason}.") from error
-    if len(content) > limit:
-        raise DataError(f"{path} cannot be read: it has more than {limit:,} bytes.")
-    return content
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -18,5 +18,5 @@ FRAMES = 2**12
 """Frames that one call of a model predicts."""
 PARAMETERS = 10**9
 """Parameters of a network."""
-MODULES = 10_000
-"""Modules of a network, its layers and their parts."""
+LAYERS = 5_000
+"""Modules of a network, and tensors of its parameters."""

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn.modules import module as hooks
 
-from nmpm._support.limits import CELLS, FRAMES, INTEGER, MODULES, PARAMETERS
+from nmpm._support.limits import CELLS, FRAMES, INTEGER, LAYERS, PARAMETERS
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.errors import ConfigError
 from nmpm.processors import GridLayout
@@ -65,13 +65,13 @@ def _check_network(recipe: EmulatorRecipe) -> None:
 
 @contextmanager
 def _bounded_network() -> Iterator[None]:
-    """Count parameters and modules as networks are built.
+    """Count parameters, their tensors and modules as networks are built.
 
     Raises:
         ConfigError: at the first that is too many.
     """
-    counts = {"parameters": 0, "modules": 0}
-    limits = {"parameters": PARAMETERS, "modules": MODULES}
+    counts = {"parameters": 0, "tensors": 0, "modules": 0}
+    limits = {"parameters": PARAMETERS, "tensors": LAYERS, "modules": LAYERS}
 
     def add(kind: str, number: int) -> None:
         counts[kind] += number
@@ -80,6 +80,7 @@ def _bounded_network() -> Iterator[None]:
 
     def add_parameter(_module: nn.Module, _name: str, parameter: nn.Parameter | None) -> None:
         add("parameters", 0 if parameter is None else parameter.numel())
+        add("tensors", 1)
 
     def add_module(_module: nn.Module, _name: str, _submodule: nn.Module | None) -> None:
         add("modules", 1)

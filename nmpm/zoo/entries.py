@@ -15,7 +15,7 @@ from torch import Tensor
 from nmpm._support.bounded_files import read_bounded, read_yaml
 from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
-from nmpm.errors import DataError, ZooError
+from nmpm.errors import DataError, NmpmError, ZooError
 from nmpm.zoo.building import build, read_recipe
 from nmpm.zoo.pretrained import Pretrained
 
@@ -50,9 +50,9 @@ def load_entry(folder: Path) -> Pretrained:
     except DataError as error:
         raise ZooError(str(error)) from error
     except Exception as error:  # whatever the values in a file from anywhere break
-        raise ZooError(
-            f"{folder / 'config.yaml'} does not describe a model ({type(error).__name__}): {one_line(error, 600)}"
-        ) from error
+        kind = "" if isinstance(error, NmpmError) else f" ({type(error).__name__})"
+        reason = one_line(error, 600)
+        raise ZooError(f"{folder / 'config.yaml'} does not describe a model{kind}: {reason}") from error
     _check_weights(folder / "model.safetensors", emulator.state_dict(), weights)
     emulator.load_state_dict(weights)
     return Pretrained(emulator.eval().requires_grad_(False), card)

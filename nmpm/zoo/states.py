@@ -204,7 +204,7 @@ def _numbers(name: str, values: Any) -> Tensor:
         DataError: if they are not real numbers.
     """
     try:
-        found = torch.as_tensor(values)
+        found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
     except (TypeError, ValueError, RuntimeError) as error:
         raise DataError(f"{name} cannot be read as an array of numbers: {one_line(error)}.") from error
     if found.is_complex() or found.dtype is torch.bool:
