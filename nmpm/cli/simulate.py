@@ -58,13 +58,15 @@ def run(words: list[str]) -> None:
 
 
 def _simulate(chosen: argparse.Namespace) -> None:
-    from nmpm.data.generate import generate
-    from nmpm.sim import load_preset
-
     for name, least in (("workers", 1), ("frames", 1), ("seed", 0), ("train", 0), ("valid", 0), ("test", 0)):
         check_at_least(f"--{name}", getattr(chosen, name), least)
     if chosen.preview is not None:
         check_picture("--preview", chosen.preview)
+    elif chosen.out is not None:
+        check_folder("--out", chosen.out)
+    from nmpm.data.generate import generate
+    from nmpm.sim import load_preset
+
     preset = load_preset(chosen.name)
     preset = preset if chosen.frames is None else preset.lasting(chosen.frames)
     if chosen.preview is not None:

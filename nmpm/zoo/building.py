@@ -35,7 +35,7 @@ def read_recipe(plain: Mapping[str, Any]) -> EmulatorRecipe:
 
 def build(recipe: EmulatorRecipe) -> Emulator:
     """The emulator of a recipe, while the size of its network is watched."""
-    with _bounded_network():
+    with bounded_network():
         return recipe.build()
 
 
@@ -56,7 +56,7 @@ def _check_network(recipe: EmulatorRecipe) -> None:
     """Build the network without memory for its parameters, to learn whether it is too large."""
     scene = recipe.scene
     inputs, outputs = len(scene.input_channels), len(scene.output_channels)
-    with torch.device("meta"), _bounded_network():
+    with torch.device("meta"), bounded_network():
         try:
             recipe.processor.build(GridLayout(inputs, outputs, recipe.frames, scene.periodic))
         except (RuntimeError, NotImplementedError):
@@ -64,7 +64,7 @@ def _check_network(recipe: EmulatorRecipe) -> None:
 
 
 @contextmanager
-def _bounded_network() -> Iterator[None]:
+def bounded_network() -> Iterator[None]:
     """Count parameters, their tensors and modules as networks are built.
 
     Raises:

@@ -16,7 +16,8 @@ from safetensors.torch import save
 
 from nmpm._support import limits
 from nmpm.errors import ConfigError, DataError, ZooError
-from nmpm.zoo import Zoo
+from nmpm.training.module import EmulatorModule
+from nmpm.zoo import Zoo, load_model
 from nmpm.zoo.building import build, read_recipe
 
 
@@ -249,3 +250,67 @@ def test_any_bytes_in_the_weights(root, small, write_entry):
         load(root)
 
     check()
+
+
+@pytest.fixture
+def checkpoint(tmp_path, small):
+    """Writes a checkpoint with changed hyperparameters."""
+    module = EmulatorModule.of(small, unroll=2)
+    hyperparameters = copy.deepcopy(dict(module.hparams))
+
+    def write(place=(), value=None):
+        changed = copy.deepcopy({"hyper_parameters": hyperparameters})
+        inner = changed
+        for key in place[:-1]:
+            inner = inner[key]
+        if place:
+            inner[place[-1]] = value
+        torch.save({"state_dict": module.state_dict(), "nmpm_format": 1} | changed, tmp_path / "a.ckpt")
+        return tmp_path / "a.ckpt"
+
+    write.places = sorted(places({"hyper_parameters": hyperparameters}), key=str)
+    return write
+
+
+def load_checkpoint(path) -> None:
+    try:
+        load_model(path)
+    except (DataError, ConfigError) as error:
+        message = str(error).replace(str(path), "")
+        assert "\n" not in message
+        assert len(message) < 900
+
+
+def test_any_value_anywhere_in_a_checkpoint(checkpoint):
+    @FUZZ
+    @given(st.sampled_from(checkpoint.places), VALUES)
+    def check(place, value):
+        load_checkpoint(checkpoint(place, value))
+
+    check()
+
+
+def test_any_bytes_in_a_checkpoint(checkpoint):
+    path = checkpoint()
+    content = path.read_bytes()
+
+    @FUZZ
+    @given(st.integers(0, len(content)), st.integers(0, 20), st.binary(max_size=12))
+    def check(start, removed, added):
+        path.write_bytes(content[:start] + added + content[start + removed :])
+        load_checkpoint(path)
+
+    check()
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (("cells",), [8192, 8192], "are more than 16,777,216"),
+        (("processor", "init_args", "depth"), 10**12, "an integer is larger"),
+        (("processor",), POINTWISE, "more than 5,000 tensors"),
+    ],
+)
+def test_checkpoints_of_impossible_models(checkpoint, place, value, message):
+    with pytest.raises(ConfigError, match=message):
+        load_model(checkpoint(("hyper_parameters", *place), value))
