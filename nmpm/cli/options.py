@@ -28,6 +28,19 @@ def add_device_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda or mps; cuda:1 for the second GPU")
 
 
+def check_device(name: str) -> None:
+    """Check a `--device` that a rollout can run on.
+
+    Raises:
+        ConfigError: if it is another, such as torch's "meta", or this machine does not have it.
+    """
+    from nmpm._support.devices import DEVICES, find_device
+
+    if name.partition(":")[0] not in DEVICES:
+        raise ConfigError(f"--device {name}: it is not one of {', '.join(DEVICES)}.")
+    find_device(name)
+
+
 def check_at_least(option: str, value: int | None, least: int) -> None:
     """Check an integer option; None is one that was left out.
 

@@ -7,7 +7,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import add_device_option, add_model_options, check_at_least, check_input, check_output
+from nmpm.cli.options import (
+    add_device_option,
+    add_model_options,
+    check_at_least,
+    check_device,
+    check_input,
+    check_output,
+)
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -72,6 +79,7 @@ def _check(chosen: argparse.Namespace) -> None:
     if chosen.data is not None:
         check_input("--data", chosen.data)
     check_output("--out", chosen.out)
+    check_device(chosen.device)
 
 
 def _thrown(model: Pretrained, chosen: argparse.Namespace) -> Particles:

@@ -49,7 +49,7 @@ def load_entry(folder: Path) -> Pretrained:
         emulator = build(read_recipe(read_yaml(folder / "config.yaml")))
     except DataError as error:
         raise ZooError(str(error)) from error
-    except Exception as error:  # whatever the values in a file from anywhere break
+    except Exception as error:  # values from anywhere may raise anything
         kind = "" if isinstance(error, NmpmError) else f" ({type(error).__name__})"
         reason = one_line(error, 600)
         raise ZooError(f"{folder / 'config.yaml'} does not describe a model{kind}: {reason}") from error

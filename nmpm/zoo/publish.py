@@ -1,4 +1,4 @@
-"""From a finished run to a zoo entry: recipe, weights and a card made of the run's own measurements."""
+"""Make a zoo entry of a finished run: recipe, weights, and a card of the run's own measurements."""
 
 from __future__ import annotations
 

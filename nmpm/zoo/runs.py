@@ -59,7 +59,7 @@ def _load_module(path: Path) -> EmulatorModule:
             return load_module(path)
     except (ConfigError, DataError) as error:
         raise type(error)(one_line(error, 600)) from error
-    except Exception as error:  # whatever the values in a file from anywhere break
+    except Exception as error:  # values from anywhere may raise anything
         reason = f"{type(error).__name__}: {one_line(error, 300)}"
         raise DataError(f"{path} is not a checkpoint of an emulator of this version ({reason}).") from error
 

@@ -107,7 +107,7 @@ def test_a_shipped_model_rolls_out_and_renders_from_the_shell(tmp_path, monkeypa
     assert main(["rollout", names[0], "--data", "out.h5", "--frames", "3", "--out", "again.h5"]) == 1
 
 
-@pytest.mark.parametrize("name", Zoo.list())
+@pytest.mark.parametrize("name", Zoo.list(shipped("zoo")))
 def test_shipped_models_keep_particles_in_the_box_and_beat_the_trivial_predictors(name):
     model = Zoo.load(name)
     positions = model.rollout(model.example(count=300), 100)

@@ -1,4 +1,4 @@
-"""Packages of AOTInductor (.pt2): machine code for the processor they were made on, run by torch from Python or C++.
+"""Packages of AOTInductor (.pt2): machine code for the CPU that compiled it, run by torch from Python or C++.
 
 They read inputs as contiguous tensors and do not check: call `contiguous()` on inputs.
 """

@@ -90,7 +90,7 @@ def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
         recipe = type(part.emulator.recipe.processor).__name__
         raise ConfigError(
             f"The model cannot be written as ONNX, which lacks an operation of {recipe} or of the transfer:"
-            f" {_reason(error)}. --format pt2 takes whatever torch.export does."
+            f" {_reason(error)}. --format pt2 supports all that torch.export does."
         ) from error
     model: ModelProto = written.model_proto
     return model

@@ -196,7 +196,7 @@ class Solid(Part):
         super().__init__(emulator)
         scene = emulator.scene
         if not scene.obstacles:
-            raise ConfigError("The model's scene has no obstacles: export its step, which needs nothing else.")
+            raise ConfigError("The model's scene has no obstacles: export its step alone.")
         description = f"particles that fill the obstacles, each of volume {scene.particle_volume:g}, in domain length"
         self.inputs = (Value("obstacle", ("B", "M", scene.dim), description),)
         share = "share of each cell that is wall or obstacle, from 0 to 1"
