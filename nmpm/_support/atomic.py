@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Gives a temporary path beside `path`, of the same suffix, and renames it to `path` once all went well.
+    """Yields a temporary path beside `path`, of the same suffix, and renames it to `path` on success.
 
-    The folder is made if need be. Whoever reads `path` sees the old file or the new one, never a part of one; after an
-    exception the temporary file is gone and `path` is as it was.
+    Creates the folder if it does not exist. Readers of `path` see the old file or the complete new one; after an
+    exception the temporary file is deleted and `path` is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")

@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import torch
 
+from nmpm._support.messages import one_line
 from nmpm.errors import ConfigError
 
 DEVICES = ("auto", "cpu", "cuda", "mps")
-"""Names that `--device` takes."""
+"""Names that `--device` takes; "cuda:1" means the second GPU."""
 
 
 def find_device(name: torch.device | str = "auto") -> torch.device:
-    """The device of a name; for "auto" a CUDA GPU where there is one, else an Apple GPU, else the CPU.
+    """The device of a name; for "auto" a CUDA GPU if there is one, else an Apple GPU, else the CPU.
 
     Raises:
-        ConfigError: if there is no such device here.
+        ConfigError: if this machine does not have the device.
     """
-    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True, "meta": True}
+    counts = {
+        "cuda": torch.cuda.device_count() if torch.cuda.is_available() else 0,
+        "mps": int(torch.backends.mps.is_available()),
+        "cpu": 1,
+        "meta": 1,
+    }
     if name == "auto":
-        return torch.device(next(kind for kind, there in available.items() if there))
+        return torch.device(next(kind for kind, count in counts.items() if count))
     try:
         device = torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f"device {name!r} is not one of {', '.join(DEVICES)}.") from error
-    if not available.get(device.type, False):
-        raise ConfigError(f"There is no device {name!r} here; there is {find_device('auto').type}.")
+    except (RuntimeError, TypeError) as error:
+        raise ConfigError(f"device {one_line(repr(name), 60)} is not one of {', '.join(DEVICES)}.") from error
+    if (device.index or 0) >= counts.get(device.type, 0):
+        here = [kind if count == 1 else f"{kind}:0 … {count - 1}" for kind, count in counts.items() if count]
+        raise ConfigError(
+            f"This machine has no device {str(device)!r}; it has {', '.join(h for h in here if h != 'meta')}."
+        )
     return device

@@ -1,12 +1,12 @@
-"""Processors, transfers and decoders of other packages.
+"""Plugins: processors, transfers and decoders of other packages.
 
-A package offers its own by an entry point that names the module they are in:
+A package offers its classes by an entry point that names their module:
 
     [project.entry-points."nmpm.plugins"]
     mine = "my_package.my_processor"
 
-Once it is installed, configurations and checkpoints may name its classes. What is imported is what was installed here;
-nothing that a file names ever is.
+Once it is installed, configurations and checkpoints may name its classes. Only modules of installed packages are
+imported, never one that a file names.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import entry_points
 
+from nmpm._support.messages import one_line
 from nmpm.errors import ConfigError
 
 GROUP = "nmpm.plugins"
@@ -21,10 +22,10 @@ GROUP = "nmpm.plugins"
 
 @cache
 def load_plugins() -> tuple[str, ...]:
-    """Imports the modules that installed packages offer, once; gives their names.
+    """Import the modules that installed packages offer, once, and return their names.
 
     Raises:
-        ConfigError: if one cannot be imported; names it and its package.
+        ConfigError: if one cannot be imported, naming it and its package.
     """
     names = []
     for entry in entry_points(group=GROUP):
@@ -32,6 +33,8 @@ def load_plugins() -> tuple[str, ...]:
             entry.load()
         except Exception as error:
             package = entry.dist.name if entry.dist is not None else "an unknown package"
-            raise ConfigError(f"The plugin {entry.value} of {package} cannot be imported: {error}.") from error
+            raise ConfigError(
+                f"The plugin {entry.value} of {package} cannot be imported: {one_line(error)}."
+            ) from error
         names.append(entry.value)
     return tuple(names)

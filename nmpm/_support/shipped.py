@@ -1,17 +1,26 @@
-"""What ships with the package: configurations and zoo, in the wheel and in a clone alike."""
+"""Files that ship with the package, configurations and zoo, and the user's own folder beside them."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from nmpm.errors import ConfigError
 
+PACKAGE = Path(__file__).parents[1]
+"""The folder of the package."""
+
 
 def shipped(folder: str) -> Path:
     """The shipped folder `configs` or `zoo`: inside the installed package, or beside it in a clone."""
-    package = Path(__file__).parents[1]
-    installed = package / "_shipped" / folder
-    return installed if installed.is_dir() else package.parent / folder
+    installed = PACKAGE / "_shipped" / folder
+    return installed if installed.is_dir() else PACKAGE.parent / folder
+
+
+def user_zoo() -> Path:
+    """The folder of the user's own models: `zoo` in the environment variable `NMPM_HOME`, else in `~/.cache/nmpm`."""
+    home = os.environ.get("NMPM_HOME") or Path.home() / ".cache" / "nmpm"
+    return Path(home).expanduser() / "zoo"
 
 
 def config_names() -> list[str]:

@@ -1,4 +1,4 @@
-"""Recipes as plain data, so that checkpoints and zoo entries can rebuild what they hold without unpickling anything.
+"""Recipes as plain data, from which checkpoints and zoo entries are rebuilt without unpickling.
 
 A spec is `{"class_path": ..., "init_args": {...}}`, as in the configuration files. The class path is the public one
 (`nmpm.processors.UNet`), which stays when modules move. Reading a spec never imports a module that the file names: a
@@ -11,10 +11,10 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterator, Mapping
-from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from nmpm._support.messages import one_line, suggestion
 from nmpm._support.plain_data import to_lists, to_tuples
 from nmpm._support.plugins import load_plugins
 from nmpm.errors import ConfigError
@@ -38,14 +38,14 @@ RENAMED: Mapping[str, str] = MappingProxyType(
         "nmpm.transfer.quadratic.Quadratic": "nmpm.transfer.Quadratic",
     }
 )
-"""Class paths that files of version 0.1.0 hold, and the public ones that they mean."""
+"""Class paths in files of version 0.1.0, and their public paths."""
 
 
 def to_spec(recipe: object) -> dict[str, Any]:
     """The class path and arguments of a frozen dataclass of plain values.
 
     Raises:
-        ConfigError: if the object is not a dataclass, whose arguments can be read back.
+        ConfigError: if the object is not a dataclass.
     """
     if not dataclasses.is_dataclass(recipe):
         raise ConfigError(f"{type(recipe).__name__} must be a dataclass, so that a checkpoint can store its arguments.")
@@ -54,11 +54,11 @@ def to_spec(recipe: object) -> dict[str, Any]:
 
 
 def from_spec(spec: object, base: type[T]) -> T:
-    """The recipe that a spec describes; a recipe itself is returned as it is.
+    """The recipe that a spec describes; a recipe itself is returned unchanged.
 
     Args:
         spec: An instance of `base`, or its spec.
-        base: What the class must be a subclass of.
+        base: The base class that the recipe must have.
 
     Raises:
         ConfigError: if the class is unknown or does not take the arguments.
@@ -66,13 +66,20 @@ def from_spec(spec: object, base: type[T]) -> T:
     if isinstance(spec, base):
         return spec
     if not isinstance(spec, Mapping) or "class_path" not in spec:
-        raise ConfigError(f"Expected a {base.__name__} or its class_path and init_args; got {spec!r}.")
+        raise ConfigError(
+            f"Expected a {base.__name__} or its class_path and init_args; got {one_line(repr(spec), 100)}."
+        )
     kind = _find_class(str(spec["class_path"]), base)
-    arguments = {key: to_tuples(value) for key, value in dict(spec.get("init_args") or {}).items()}
+    given = spec.get("init_args") or {}
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"init_args of {class_path(kind)} must be a mapping; got {one_line(repr(given), 100)}.")
+    arguments = {str(key): to_tuples(value) for key, value in given.items()}
     try:
         return kind(**arguments)
     except TypeError as error:
-        raise ConfigError(f"{class_path(kind)} does not take the arguments {arguments}: {error}.") from error
+        raise ConfigError(
+            f"{class_path(kind)} does not take the arguments {one_line(arguments)}: {one_line(error)}."
+        ) from error
 
 
 def class_path(kind: type) -> str:
@@ -94,16 +101,14 @@ def _find_class(name: str, base: type[T]) -> type[T]:
         if name in known:
             return known[name]
     public = sorted({class_path(kind) for kind in known.values()})
-    near = get_close_matches(name, public, n=1)
-    hint = f" Did you mean {near[0]}?" if near else ""
     raise ConfigError(
-        f"{base.__name__} {name!r} is not known.{hint} Known are {', '.join(public)}. If it is yours, import its module"
-        " first: modules that a file names are never imported."
+        f"{base.__name__} {one_line(repr(name), 100)} is not known.{suggestion(name[:100], public)} Known are"
+        f" {', '.join(public)}. If it is yours, import its module first: modules that a file names are never imported."
     )
 
 
 def _known_classes(base: type[T]) -> Iterator[tuple[str, type[T]]]:
-    """Every subclass by its public path and by that of its module."""
+    """Every subclass with its public path, then with its module's path."""
     for kind in base.__subclasses__():
         yield class_path(kind), kind
         yield f"{kind.__module__}.{kind.__qualname__}", kind

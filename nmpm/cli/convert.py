@@ -11,11 +11,11 @@ from nmpm.cli.options import add_data_options, data_options, new_ids
 _DESCRIPTION = """\
 Bring a dataset of another format into the native layout (LagrangeBench's HDF5 files with a metadata.json).
 
-The format is found out, or named by --format:
+The format is detected, or named by --format:
 {formats}
 
 Type ids keep their numbers. What they mean differs between families of datasets: 3 is a boundary for deepmind, a
-rigid body for lagrangebench, a heated wall for jax-sph. The command says which family it took.
+rigid body for lagrangebench, a heated wall for jax-sph. The command prints which family it assumed.
 """
 
 _EXAMPLES = """\
@@ -40,8 +40,8 @@ def run(words: list[str]) -> None:
     )
     parser.add_argument("source", type=Path, help="file or folder to read")
     parser.add_argument("destination", type=Path, help="folder to write; must not exist yet, or be empty")
-    parser.add_argument("--format", metavar="NAME", help="format of the source, where it is not recognised")
-    parser.add_argument("--ids", metavar="OLD=NEW,...", help="new type ids in what is written, e.g. 5=0,3=1")
+    parser.add_argument("--format", metavar="NAME", help="format of the source (default: detected)")
+    parser.add_argument("--ids", metavar="OLD=NEW,...", help="new type ids in the written files, e.g. 5=0,3=1")
     add_data_options(parser)
     chosen = parser.parse_args(words[1:])
     options, ids = data_options(chosen), new_ids(chosen.ids)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 import textwrap
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import add_data_options, data_options
+from nmpm.cli.options import add_data_options, check_at_least, check_picture, data_options
 from nmpm.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -34,31 +35,47 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["inspect", "ramps"]."""
     parser = argparse.ArgumentParser(
         prog="nmpm inspect",
-        description="Say on one screen what a dataset holds and what is odd about it, and draw a picture of it.",
+        description="Summarise a dataset on one screen, list suspicious values, and draw its first trajectory.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
+    parser.add_argument("--format", metavar="NAME", help="format of the dataset (default: detected)")
     parser.add_argument("--json", action="store_true", help="print everything as JSON, draw nothing")
-    parser.add_argument("--trajectories", type=int, metavar="N", help="look at N of each split (default: 256 MiB)")
-    parser.add_argument("--out", type=Path, help="the picture (default: inspect-NAME.png)")
-    parser.add_argument("--no-picture", action="store_true", help="draw none")
+    parser.add_argument("--trajectories", type=int, metavar="N", help="read N of each split (default: 256 MiB of it)")
+    parser.add_argument("--out", type=Path, help="picture to write (default: inspect-NAME.png)")
+    parser.add_argument("--no-picture", action="store_true", help="do not draw")
     add_data_options(parser)
     chosen = parser.parse_args(words[1:])
-    if chosen.trajectories is not None and chosen.trajectories < 1:
-        raise ConfigError(f"--trajectories {chosen.trajectories}: at least 1 is needed.")
+    check_at_least("--trajectories", chosen.trajectories, 1)
+    if chosen.out is not None:
+        check_picture("--out", chosen.out)
+    if not chosen.path.exists():
+        raise ConfigError(f"{chosen.path}: there is no such file or folder.")
+    options = data_options(chosen)
+    if chosen.format is None:
+        _inspect(_origin(chosen.path, options), chosen)
+        return
+    from nmpm.data.convert import Options, convert
+
+    with tempfile.TemporaryDirectory() as folder:
+        native = Path(folder) / chosen.path.resolve().stem
+        convert(chosen.path, native, chosen.format, options)
+        _inspect(_origin(native, Options()), chosen)
+
+
+def _inspect(origin: FolderSource, chosen: argparse.Namespace) -> None:
     from nmpm.data.inspection import inspect
 
-    origin = _origin(chosen.path, data_options(chosen))
-    found = replace(inspect(origin, chosen.trajectories), path=str(chosen.path))
+    inspection = replace(inspect(origin, chosen.trajectories), path=str(chosen.path))
     if chosen.json:
-        sys.stdout.write(json.dumps(found.to_dict(), indent=1) + "\n")
+        sys.stdout.write(json.dumps(inspection.to_dict(), indent=1) + "\n")
         return
-    sys.stdout.write("\n".join(lines(found)) + "\n")
+    sys.stdout.write("\n".join(lines(inspection)) + "\n")
     if chosen.no_picture:
         return
     try:
-        _draw(origin, found, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
+        _draw(origin, inspection, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
     except DataError as error:
         sys.stdout.write(f"\nno picture: {error}\n")
 
@@ -75,14 +92,14 @@ def _origin(path: Path, options: Options) -> FolderSource:
 
 
 def lines(found: Inspection) -> Iterator[str]:
-    """The screen, line by line, at most 100 characters wide."""
+    """The lines of the summary, at most 100 characters wide."""
     yield f"{found.path}: {found.dim}-D, {found.dt:g} s between frames"
     for name, split in found.splits.items():
         trajectories = "trajectory" if split.trajectories == 1 else "trajectories"
-        looked = "" if split.inspected == split.trajectories else f" ({split.inspected} looked at)"
+        read = "" if split.inspected == split.trajectories else f" ({split.inspected} read)"
         static = f" + {_span(split.static)} at rest" if split.static[1] else ""
         yield (
-            f"  {name:<6}{split.trajectories:>5} {trajectories}{looked} of {_span(split.frames)} frames,"
+            f"  {name:<6}{split.trajectories:>5} {trajectories}{read} of {_span(split.frames)} frames,"
             f" {_span(split.particles)} particles{static}"
         )
     yield _labelled("materials", ", ".join(f"{name} ({_span(n)})" for name, n in found.materials.items()))
@@ -124,12 +141,12 @@ def _box(box: Iterable[tuple[float, float]]) -> str:
 
 
 def _gravity(found: Inspection) -> str:
-    seen = ", ".join(f"{value:.3g}" for value in found.first_acceleration)
+    measured = ", ".join(f"{value:.3g}" for value in found.first_acceleration)
     if "gravity" in found.varies:
-        told = "differs between trajectories"
+        stated = "differs between trajectories"
     else:
-        told = "not stated" if found.gravity is None else ", ".join(f"{value:g}" for value in found.gravity)
-    return f"{told}; median acceleration in the first frames: {seen}"
+        stated = "not stated" if found.gravity is None else ", ".join(f"{value:g}" for value in found.gravity)
+    return f"{stated}; median acceleration in the first frames: {measured}"
 
 
 def _rest(found: Inspection) -> str:
@@ -159,7 +176,7 @@ def _draw(origin: FolderSource, found: Inspection, path: Path) -> None:
     trajectory = Split(next(iter(split_paths(origin.folder).values()))).read(0)
     moving = np.isin(trajectory.particle_type, metadata.moving_types)
     static = np.isin(trajectory.particle_type, list(metadata.static_types))
-    exhibit = LabelledTrajectories(
+    pictured = LabelledTrajectories(
         positions={"recorded": trajectory.position[:, moving]},
         material=material_names(trajectory.particle_type[moving], metadata.particle_types),
         bounds=origin.scene.bounds,
@@ -170,5 +187,5 @@ def _draw(origin: FolderSource, found: Inspection, path: Path) -> None:
         gravity=origin.scene.gravity,
         title=f"{Path(found.path).name}, first trajectory",
     )
-    write_snapshots(exhibit, path)
+    write_snapshots(pictured, path)
     sys.stdout.write(f"\nwrote {path}\n")

@@ -1,9 +1,11 @@
-"""Options about the data that several commands share."""
+"""Options and checks that several commands share."""
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmpm.errors import ConfigError
@@ -11,11 +13,98 @@ from nmpm.errors import ConfigError
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
 
+MODEL = "a model of the zoo (see nmpm zoo list), or a path: a run, a checkpoint, or an entry's folder"
+"""Help for arguments that `nmpm.zoo.load_model` takes."""
+
+
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """Add the positional argument `model` and the option `--root`."""
+    parser.add_argument("model", help=MODEL)
+    parser.add_argument("--root", type=Path, help="look the name up in this zoo's folder alone")
+
+
+def add_device_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--device`."""
+    parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda or mps; cuda:1 for the second GPU")
+
+
+def check_device(name: str) -> None:
+    """Check a `--device` that a rollout can run on.
+
+    Raises:
+        ConfigError: if it is another, such as torch's "meta", or this machine does not have it.
+    """
+    from nmpm._support.devices import DEVICES, find_device
+
+    if name.partition(":")[0] not in DEVICES:
+        raise ConfigError(f"--device {name}: it is not one of {', '.join(DEVICES)}.")
+    find_device(name)
+
+
+def check_at_least(option: str, value: int | None, least: int) -> None:
+    """Check an integer option; None is one that was left out.
+
+    Raises:
+        ConfigError: if the value is too small.
+    """
+    if value is not None and value < least:
+        raise ConfigError(f"{option} {value}: it must be at least {least}.")
+
+
+def check_output(option: str, path: Path) -> None:
+    """Check, before the work, that a file can be written.
+
+    Raises:
+        ConfigError: if the path is a folder, or its folder does not exist or is not writable.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: it is a folder; name a file.")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: the folder {path.parent} does not exist; create it first.")
+    _check_writable(option, path, path.parent)
+
+
+def check_picture(option: str, path: Path) -> None:
+    """Check, before the work, that a PNG can be written.
+
+    Raises:
+        ConfigError: as `check_output`, or if the name does not end in .png.
+    """
+    if path.suffix.lower() != ".png":
+        raise ConfigError(f"{option} {path}: pictures are PNG; end the name in .png.")
+    check_output(option, path)
+
+
+def check_folder(option: str, path: Path) -> None:
+    """Check, before the work, that a folder can be written, or made.
+
+    Raises:
+        ConfigError: if the path is a file, or the nearest folder that exists is not writable.
+    """
+    if path.exists() and not path.is_dir():
+        raise ConfigError(f"{option} {path}: it is a file; name a folder.")
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir():
+        raise ConfigError(f"{option} {path}: {existing} is a file, not a folder.")
+    _check_writable(option, path, existing)
+
+
+def check_input(option: str, path: Path) -> None:
+    """Check that a file exists.
+
+    Raises:
+        ConfigError: if it does not, or is a folder.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: it is a folder; name a file in it, such as {path / 'test.h5'}.")
+    if not path.is_file():
+        raise ConfigError(f"{option} {path}: there is no such file.")
+
 
 def add_data_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what a user may say of data whose files leave it open, or are wrong."""
-    group = parser.add_argument_group("what the files leave open, or get wrong")
-    group.add_argument("--family", help="what type ids mean: deepmind, lagrangebench or jax-sph")
+    """Add options for facts that data files lack or state wrongly."""
+    group = parser.add_argument_group("facts that the files lack or state wrongly")
+    group.add_argument("--family", help="meaning of type ids: deepmind, lagrangebench or jax-sph")
     group.add_argument("--types", metavar="ID=NAME,...", help="names of particle types, e.g. 5=water,1=debris")
     group.add_argument("--static", metavar="ID,...", help='types that never move, e.g. 1,3; "none" where all move')
     group.add_argument("--bounds", metavar="LOW:HIGH,...", help="where particles may be, per axis, e.g. 0:1,0:0.5")
@@ -25,7 +114,7 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
 
 
 def data_options(chosen: argparse.Namespace) -> Options:
-    """What the user said.
+    """The values of the options of `add_data_options`.
 
     Raises:
         ConfigError: naming the option that cannot be read.
@@ -56,22 +145,31 @@ def new_ids(text: str | None) -> dict[int, int] | None:
     return pairs
 
 
+def _check_writable(option: str, path: Path, folder: Path) -> None:
+    try:
+        # Unlike the permission bits, this also finds read-only and full file systems.
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{option} {path}: the folder {folder} is not writable ({error.strerror}).") from error
+
+
 def _pairs(text: str) -> dict[int, int]:
-    return {number: int(name) for number, name in _names(text).items()}
+    return {old: int(new) for old, new in _names(text).items()}
 
 
-def _parsed(flag: str, text: str | None, parse: Callable[[str], Any], wanted: str) -> Any:
+def _parsed(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
     if text is None:
         return None
     try:
         return parse(text)
     except ValueError as error:
-        raise ConfigError(f"{flag} {text}: give {wanted}.") from error
+        raise ConfigError(f"{option} {text}: give {expected}.") from error
 
 
 def _names(text: str) -> dict[int, str]:
     pairs = [pair.split("=") for pair in text.split(",")]
-    return {int(number): name.strip() for number, name in pairs}
+    return {int(index): name.strip() for index, name in pairs}
 
 
 def _ids(text: str) -> frozenset[int]:

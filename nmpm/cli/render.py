@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nmpm.cli.options import check_input
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def run(words: list[str]) -> None:
         prog="nmpm render", description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4."
     )
     parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
-    parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: the first)")
+    parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: 0, the first)")
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
     parser.add_argument("--mp4", action="store_true", help="write an MP4 instead of a GIF (pip install nmpm[video])")
     parser.add_argument("--out", type=Path, help="path of the pictures without suffix (default: that of the file)")
@@ -36,6 +37,7 @@ def run(words: list[str]) -> None:
     stem = arguments.out or arguments.file.with_suffix("")
     picture = stem.with_name(f"{stem.name}.png")
     video = stem.with_name(f"{stem.name}{'.mp4' if arguments.mp4 else '.gif'}")
+    check_input("FILE", arguments.file)
     split = Split(arguments.file)
     if not 0 <= arguments.trajectory < len(split):
         raise ConfigError(

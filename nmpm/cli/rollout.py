@@ -1,4 +1,4 @@
-"""`nmpm rollout NAME --frames 400 --out out.h5`."""
+"""`nmpm rollout MODEL --frames 400 --out out.h5`."""
 
 from __future__ import annotations
 
@@ -7,56 +7,86 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.options import (
+    add_device_option,
+    add_model_options,
+    check_at_least,
+    check_device,
+    check_input,
+    check_output,
+)
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.particles import Particles
-    from nmpm.zoo.registry import Pretrained
+    from nmpm.zoo import Pretrained
+
+_EXAMPLES = """\
+examples:
+  nmpm rollout goop --frames 400 --out out.h5            a model of the zoo, from thrown blocks of particles
+  nmpm rollout runs/goop --data test.h5 --trajectory 3   the best checkpoint of a run, from a recorded start
+  nmpm rollout runs/goop/checkpoints/last.ckpt --device auto
+"""
 
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
+    chosen = _parser().parse_args(words[1:])
+    _check(chosen)
+    from nmpm.zoo.registry import load_model
+
+    model = load_model(chosen.model, chosen.device, chosen.root).with_network(chosen.precision)
+    state = _thrown(model, chosen) if chosen.data is None else _recorded(model, chosen.data, chosen.trajectory)
+    _write(model, state, chosen)
+    sys.stdout.write(f"wrote {chosen.frames + 2} frames of {state.position.shape[1]} particles to {chosen.out}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nmpm rollout",
-        description="Roll a pretrained model out, from thrown blocks of particles or from a recorded trajectory.",
+        description="Roll a trained model out, from thrown blocks of particles or from a recorded trajectory.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("name", help="a model of the zoo, see nmpm zoo list")
+    add_model_options(parser)
+    add_device_option(parser)
     parser.add_argument("--frames", type=int, default=400, help="frames to predict (default: 400)")
     parser.add_argument("--out", type=Path, default=Path("out.h5"), help="file to write (default: out.h5)")
     parser.add_argument("--data", type=Path, help="start from a trajectory of this HDF5 file (native layout)")
-    parser.add_argument("--trajectory", type=int, default=0, help="which trajectory of --data (default: the first)")
+    parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
-    parser.add_argument("--particles", type=int, default=1000, help="about how many to throw (default: 1000)")
-    parser.add_argument("--blocks", type=int, default=1, help="into how many blocks (default: 1)")
+    parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
+    parser.add_argument("--blocks", type=int, default=1, help="number of blocks (default: 1)")
     parser.add_argument(
         "--precision",
         choices=["float32", "bfloat16"],
         default="float32",
-        help="of the network: float32 (default), or bfloat16, faster where the processor has it, and rougher",
+        help="of the network: float32 (default), or bfloat16, less accurate, faster if the processor supports it",
     )
     parser.add_argument(
         "--watch",
         choices=["warn", "stop", "record"],
         default="warn",
-        help="where speed, energy or crowding leave what the model is known for: warn (default), stop, or only record",
+        help="if speed, energy or crowding exceed the model's known range: warn (default), stop, or only record",
     )
-    chosen = parser.parse_args(words[1:])
-    if chosen.frames < 1:
-        raise ConfigError(f"--frames {chosen.frames}: ask for at least 1 frame.")
-    if not chosen.out.parent.is_dir():
-        raise ConfigError(f"--out {chosen.out}: the folder {chosen.out.parent} does not exist.")
-    from nmpm.zoo.registry import Zoo
+    return parser
 
-    model = Zoo.load(chosen.name).with_network(chosen.precision)
-    if chosen.data is None:
-        try:
-            state = model.example(chosen.seed, chosen.particles, chosen.blocks)
-        except ValueError as error:
-            raise ConfigError(f"{error} Use fewer --particles or more --blocks.") from error
-    else:
-        state = _recorded(model, chosen.data, chosen.trajectory)
-    _write(model, state, chosen)
-    sys.stdout.write(f"wrote {chosen.frames + 2} frames of {state.position.shape[1]} particles to {chosen.out}\n")
+
+def _check(chosen: argparse.Namespace) -> None:
+    """Check the numbers and paths before anything is loaded."""
+    for name, least in (("frames", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
+        check_at_least(f"--{name}", getattr(chosen, name), least)
+    if chosen.data is not None:
+        check_input("--data", chosen.data)
+    check_output("--out", chosen.out)
+    check_device(chosen.device)
+
+
+def _thrown(model: Pretrained, chosen: argparse.Namespace) -> Particles:
+    try:
+        return model.example(chosen.seed, chosen.particles, chosen.blocks)
+    except ConfigError as error:
+        raise ConfigError(f"--particles {chosen.particles} --blocks {chosen.blocks}: {error}") from error
 
 
 def _recorded(model: Pretrained, path: Path, index: int) -> Particles:
@@ -67,8 +97,8 @@ def _recorded(model: Pretrained, path: Path, index: int) -> Particles:
 
     metadata = read_metadata(path.parent, _family(model))
     recordings = SplitRecordings(Split(path), metadata, model.scene)
-    if not 0 <= index < len(recordings):
-        raise ConfigError(f"--trajectory {index}: {path} holds trajectories 0 … {len(recordings) - 1}.")
+    if index >= len(recordings):
+        raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(recordings) - 1}.")
     return collate([recordings[index]], model.scene, 2).initial
 
 
@@ -80,18 +110,20 @@ def _family(model: Pretrained) -> str | None:
 
 
 def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
-    """The two frames of the start, then the prediction, with what is needed to draw it."""
+    """Predict, and write the two frames of the start and the prediction, with what is needed to draw them."""
     import torch
     from rich.progress import track
 
     from nmpm.data.format import write_split
     from nmpm.data.predictions import predicted_trajectory
+    from nmpm.emulator import stream
     from nmpm.emulator.monitor import Monitor, Policy
-    from nmpm.emulator.rollouts import stream
 
-    bundles, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
-    made = stream(model.emulator, state, chosen.frames, monitor)
-    parts = list(track(made, "rollout", total=bundles, transient=True))
-    origin = f"the zoo model {chosen.name}"
-    write_split(chosen.out, [predicted_trajectory(model.scene, state, torch.cat(parts, dim=1), origin)])
+    count, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
+    bundles = stream(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
+    # On the CPU, as a device may have less memory than a long rollout needs.
+    positions = [bundle.cpu() for bundle in track(bundles, "rollout", total=count, transient=True)]
+    origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
+    predicted = predicted_trajectory(model.scene, state.to("cpu"), torch.cat(positions, dim=1), origin)
+    write_split(chosen.out, [predicted])
     sys.stdout.write(monitor.report() + "\n")

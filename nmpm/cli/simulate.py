@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.errors import ConfigError
+from nmpm.cli.options import check_at_least, check_folder, check_picture
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,11 +19,11 @@ examples:
   nmpm simulate --list                                   the shipped scenes
   nmpm simulate waterramps --preview ramps.png           draw one trajectory, write no data
   nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
-  nmpm simulate my-scene.yaml --out mine                 a scene of one's own: start from a copy of a shipped one
-  nmpm simulate goop --show > my-scene.yaml              such a copy, with its comments
+  nmpm simulate my-scene.yaml --out mine                 your own scene: start from a copy of a shipped one
+  nmpm simulate goop --show > my-scene.yaml              such a copy, with comments
 
-The same preset, seed and numbers give the same data. After an interruption the same call goes on. What comes out is
-simulated by nmpm: it is nobody's recording, and its metadata say so.
+The same preset, seed and numbers give the same data. After an interruption the same call resumes. The metadata state
+that the data are simulated by nmpm.
 """
 
 
@@ -31,7 +31,7 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["simulate", "waterramps", "--out", "ramps"]."""
     parser = argparse.ArgumentParser(
         prog="nmpm simulate",
-        description="Simulate a dataset, ready to train on, of a shipped scene or of one's own.",
+        description="Simulate a dataset of a shipped scene or your own, ready for training.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -43,7 +43,7 @@ def run(words: list[str]) -> None:
         parser.add_argument(f"--{split}", type=int, metavar="N", help=f"{split} trajectories (default: the paper's)")
     parser.add_argument("--frames", type=int, help="frames after the initial one (default: the scene's)")
     parser.add_argument("--seed", type=int, default=0, help="of the whole dataset (default: 0)")
-    parser.add_argument("--workers", type=int, help="trajectories at a time (default: one per processor core)")
+    parser.add_argument("--workers", type=int, help="processes (default: one per processor core)")
     parser.add_argument("--out", type=Path, help="folder to write (default: the scene's name)")
     chosen = parser.parse_args(words[1:])
     if chosen.list:
@@ -58,11 +58,15 @@ def run(words: list[str]) -> None:
 
 
 def _simulate(chosen: argparse.Namespace) -> None:
+    for name, least in (("workers", 1), ("frames", 1), ("seed", 0), ("train", 0), ("valid", 0), ("test", 0)):
+        check_at_least(f"--{name}", getattr(chosen, name), least)
+    if chosen.preview is not None:
+        check_picture("--preview", chosen.preview)
+    elif chosen.out is not None:
+        check_folder("--out", chosen.out)
     from nmpm.data.generate import generate
     from nmpm.sim import load_preset
 
-    if chosen.workers is not None and chosen.workers < 1:
-        raise ConfigError(f"--workers {chosen.workers}: at least 1 is needed.")
     preset = load_preset(chosen.name)
     preset = preset if chosen.frames is None else preset.with_frames(chosen.frames)
     if chosen.preview is not None:
@@ -71,6 +75,7 @@ def _simulate(chosen: argparse.Namespace) -> None:
     counts = dict(_paper_counts(chosen.name))
     counts |= {name: getattr(chosen, name) for name in counts if getattr(chosen, name) is not None}
     out = chosen.out or Path(preset.name)
+    check_folder("--out", out)
     generate(preset, out, counts, chosen.seed, chosen.workers)
     sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
     sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
@@ -99,8 +104,9 @@ def _list() -> None:
 
 def _varying(preset: Preset) -> str:
     scene = preset.scene
-    told = [word for word, holds in (("obstacles", scene.obstacles), ("gravity varies", scene.gravity_varies)) if holds]
-    return f"; {', '.join(told)}" if told else ""
+    facts = {"obstacles": scene.obstacles, "gravity varies": scene.gravity_varies}
+    present = [name for name, holds in facts.items() if holds]
+    return f"; {', '.join(present)}" if present else ""
 
 
 def _show(name: str) -> None:
@@ -119,18 +125,18 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
 
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
-        made = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
-    moving, scene = made.particle_type != BOUNDARY, preset.scene
-    exhibit = LabelledTrajectories(
-        positions={"simulated": made.position[:, moving]},
-        material=material_names(made.particle_type[moving], preset.type_names),
+        trajectory = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
+    moving, scene = trajectory.particle_type != BOUNDARY, preset.scene
+    pictured = LabelledTrajectories(
+        positions={"simulated": trajectory.position[:, moving]},
+        material=material_names(trajectory.particle_type[moving], preset.type_names),
         bounds=scene.bounds,
         dt=scene.dt,
         domain=scene.domain,
-        obstacle=made.position[0, ~moving],
+        obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
-        gravity=tuple(np.asarray(made.attributes.get("gravity", scene.gravity or ())).tolist()) or None,
+        gravity=tuple(np.asarray(trajectory.attributes.get("gravity", scene.gravity or ())).tolist()) or None,
         title=f"{preset.name}, simulated by nmpm ({preset.generator})",
     )
-    write_snapshots(exhibit, path)
+    write_snapshots(pictured, path)
     sys.stdout.write(f"wrote {path}\n")

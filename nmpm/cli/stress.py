@@ -8,80 +8,69 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.options import add_device_option, add_model_options, check_device
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.evaluation.stress import Line, Size, Subject
-    from nmpm.sim import Preset
 
-DESCRIPTION = """Put a trained model through the extremes: long rollouts, fast and slow, many and few particles, other
-boxes and grids, precision, sensitivity, obstacles it never saw, poisoned input. One line for each, pass or fail by a
-stated invariant, with what was measured; errors are against the simulator that made its data, where there is one. Exits
-with 1 if a line fails."""
+DESCRIPTION = """Test a trained model at the extremes: long rollouts, settling, fast and slow, many and few particles,
+other boxes and grids, precision, sensitivity, obstacles that training never showed, non-finite input. Prints one line
+per test: pass or fail by a stated invariant, with what was measured. Errors are against the simulator that made the
+training data, where there is one. Exits with 1 if a line fails."""
 
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["stress", "goop"]."""
-    parser = argparse.ArgumentParser(prog="nmpm stress", description=DESCRIPTION)
-    parser.add_argument("model", help="a model of the zoo, or a checkpoint: runs/goop/checkpoints/best.ckpt")
-    parser.add_argument("--full", action="store_true", help="all of it, as zoo cards quote (default: reduced, minutes)")
-    parser.add_argument("--preset", help="simulator of its scenes (default: of the zoo model's name; none if recorded)")
-    parser.add_argument("--free", action="store_true", help="without the model's constraints: the network's own doing")
-    parser.add_argument("--groups", nargs="+", metavar="GROUP", help="only these groups of tests")
-    parser.add_argument("--seed", type=int, default=0, help="of the scenes (default: 0)")
-    parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
-    parser.add_argument("--report", type=Path, metavar="DIR", help="write stress.json, stress.md and stress.png there")
-    chosen = parser.parse_args(words[1:])
+    chosen = _parser().parse_args(words[1:])
+    check_device(chosen.device)
+    if chosen.report is not None and chosen.report.exists() and not chosen.report.is_dir():
+        raise ConfigError(f"--report {chosen.report} is a file: give a folder.")
     from nmpm.evaluation.stress import FULL, GROUPS, QUICK
 
     unknown = sorted(set(chosen.groups or ()) - set(GROUPS))
     if unknown:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
-    subject = _subject(chosen.model, chosen.preset, chosen.seed)
-    if chosen.free:
-        subject = subject.with_emulator(subject.emulator.unconstrained())
+    subject = _subject(chosen)
     start = time.monotonic()
-    lines = _measured(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS), quiet=chosen.json)
-    _hand_out(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)
+    lines = _run_groups(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS), quiet=chosen.json)
+    _print_report(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)
     if any(line.passed is False for line in lines):
         raise SystemExit(1)
 
 
-def _subject(model: str, preset: str | None, seed: int) -> Subject:
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="nmpm stress", description=DESCRIPTION)
+    add_model_options(parser)
+    add_device_option(parser)
+    parser.add_argument("--full", action="store_true", help="longer and larger, as zoo cards quote (default: minutes)")
+    parser.add_argument("--preset", help="simulator of its scenes (default: of the training data; none if recorded)")
+    parser.add_argument("--free", action="store_true", help="without the model's constraints: the network alone")
+    parser.add_argument("--groups", nargs="+", metavar="GROUP", help="only these groups of tests")
+    parser.add_argument("--seed", type=int, default=0, help="of the scenes (default: 0)")
+    parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="DIR",
+        help="write stress.json, stress.md and stress.png there; stress_free.* with --free",
+    )
+    return parser
+
+
+def _subject(chosen: argparse.Namespace) -> Subject:
     from nmpm.evaluation.stress import Subject
+    from nmpm.sim import load_preset, preset_names
+    from nmpm.zoo import load_model
 
-    path = Path(model)
-    if path.suffix == ".ckpt" or path.is_file():
-        from nmpm.training.checkpoints import load_module
-
-        module = load_module(path)
-        emulator, horizon = module.emulator, module.emulator.frames * module.unroll
-        known = _preset(preset)
-    else:
-        from nmpm.zoo.registry import Zoo
-
-        pretrained = Zoo.load(model)
-        emulator = pretrained.emulator
-        horizon = int(pretrained.card["training"].get("horizon", 4 * emulator.frames))
-        known = _preset(preset or _name_of_preset(model))
-    return Subject(model, emulator.eval().requires_grad_(False), horizon, known, seed)
+    model = load_model(chosen.model, chosen.device, chosen.root)
+    known = model.preset if model.preset in preset_names() else None
+    preset = chosen.preset or known
+    emulator = model.emulator.unconstrained() if chosen.free else model.emulator
+    return Subject(chosen.model, emulator, model.horizon, load_preset(preset) if preset else None, chosen.seed)
 
 
-def _preset(name: str | None) -> Preset | None:
-    from nmpm.sim import load_preset
-
-    return None if name is None else load_preset(name)
-
-
-def _name_of_preset(model: str) -> str | None:
-    """The preset of a zoo model that was trained on one of ours: they share their name."""
-    from nmpm.sim import preset_names
-
-    dataset = model.partition("/")[0]
-    return dataset if dataset in preset_names() else None
-
-
-def _measured(subject: Subject, size: Size, groups: list[str], quiet: bool) -> list[Line]:
+def _run_groups(subject: Subject, size: Size, groups: list[str], quiet: bool) -> list[Line]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -104,7 +93,7 @@ def _measured(subject: Subject, size: Size, groups: list[str], quiet: bool) -> l
     return lines
 
 
-def _hand_out(subject: Subject, lines: list[Line], size: str, seconds: float, chosen: argparse.Namespace) -> None:
+def _print_report(subject: Subject, lines: list[Line], size: str, seconds: float, chosen: argparse.Namespace) -> None:
     from rich.console import Console
 
     from nmpm.evaluation.stress.report import as_json, summary, table, write
@@ -117,5 +106,5 @@ def _hand_out(subject: Subject, lines: list[Line], size: str, seconds: float, ch
         console.print(table(f"{subject.name}, {size}, {seconds:.0f} s", lines))
         console.print(summary(lines))
     if chosen.report is not None:
-        paths = write(chosen.report, text, lines)
+        paths = write(chosen.report, text, lines, "stress_free" if chosen.free else "stress")
         sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")

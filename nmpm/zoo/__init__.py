@@ -1,5 +1,6 @@
 """Pretrained models: loading them, making an entry of a run, and exporting them."""
 
-from nmpm.zoo.registry import Pretrained, Zoo
+from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.registry import Zoo, load_model
 
-__all__ = ["Pretrained", "Zoo"]
+__all__ = ["Pretrained", "Zoo", "load_model"]

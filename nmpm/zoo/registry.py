@@ -1,178 +1,158 @@
-"""The model zoo: pretrained emulators with cards that say how good they are and what they were trained on.
+"""The model zoo: pretrained emulators with cards that state their errors and their training.
 
-An entry is a folder `zoo/<name>` (or `zoo/<dataset>/<variant>`) of
+An entry is a folder `<name>` (or `<dataset>/<variant>`) of
 
-    card.yaml           what it is, how it was trained, its measured errors, the weights' SHA-256
+    card.yaml           training, measured errors, the weights' SHA-256
     config.yaml         the emulator's recipe: scene, grid, transfer, processor, decoder
     model.safetensors   weights and normalisation statistics
     README.md           the card for reading
 
-Loading reads text and tensors only: nothing is unpickled, imported or fetched.
+There are two zoos: the one that ships with the package, and the user's own (see `user_zoo`), which comes first.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
+import builtins
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
-import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load
-from torch import Tensor
 
 from nmpm._support.devices import find_device
-from nmpm._support.shipped import shipped
-from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, EmulatorRecipe, rollout
-from nmpm.errors import ConfigError, ZooError
-from nmpm.particles import Particles
-from nmpm.scene import Scene
+from nmpm._support.limits import NAME_LENGTH
+from nmpm._support.messages import one_line, suggestion
+from nmpm._support.shipped import shipped, user_zoo
+from nmpm.errors import ZooError
+from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.runs import BEST, load_checkpoint
 
-NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
-"""What a pretrained network can run in, by name."""
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]*(/[a-z0-9][a-z0-9_-]*)?")
 
-
-@dataclass(frozen=True)
-class Pretrained:
-    """A model from the zoo, ready to roll out or to fine-tune.
-
-    Args:
-        emulator: In evaluation mode.
-        card: What `card.yaml` says.
-    """
-
-    emulator: Emulator
-    card: Mapping[str, Any]
-
-    @property
-    def scene(self) -> Scene:
-        """The facts of the scenes that the model was trained for."""
-        return self.emulator.scene
-
-    def example(self, seed: int = 0, count: int = 1000, blocks: int = 1) -> Particles:
-        """A state to start from: blocks of particles thrown into the scene's box."""
-        return thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
-
-    def with_network(self, precision: str) -> Pretrained:
-        """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16".
-
-        Raises:
-            ConfigError: if there is no such precision, or the network cannot have it.
-        """
-        if precision not in NETWORK_PRECISIONS:
-            raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
-        return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
-
-    def to(self, device: torch.device | str) -> Pretrained:
-        """The model on another device: "cpu", "cuda", "mps", or "auto" for the best that there is.
-
-        Raises:
-            ConfigError: if the device is not there.
-        """
-        return dataclasses.replace(self, emulator=self.emulator.to(find_device(device)))
-
-    def rollout(self, state: Particles, frames: int) -> Tensor:
-        """Predict from a state, which is moved to the model's device.
-
-        Returns:
-            (B, frames, N, D) positions in domain length, the state's own frame not included, on the model's device.
-        """
-        return rollout(self.emulator, state.to(self.emulator.device), frames)
+Root = str | Path | None
+"""Folder of a zoo; None for the user's and the shipped one."""
 
 
 class Zoo:
-    """The pretrained models that came with the package, or those of another folder."""
+    """The pretrained models: the user's own and those that came with the package, or those of another folder."""
 
     @staticmethod
-    def list(root: Path | None = None) -> list[str]:  # (the word users expect)
-        """Names of the models."""
-        root = root or shipped("zoo")
-        return sorted(path.parent.relative_to(root).as_posix() for path in root.rglob("card.yaml"))
+    def list(root: Root = None) -> builtins.list[str]:
+        """Names of the models.
+
+        Raises:
+            ZooError: if `root` is given and is not a folder.
+        """
+        return sorted({name for folder in _roots(root) for name in _names(folder)})
 
     @staticmethod
-    def card(name: str, root: Path | None = None) -> dict[str, Any]:
-        """What a model is, how it was trained and how well it does.
+    def folder(name: str, root: Root = None) -> Path:
+        """The folder of a model's entry.
+
+        Raises:
+            ZooError: if there is no model of that name; names similar ones.
+        """
+        check_name(name)
+        for zoo in _roots(root):
+            if _exists(zoo / name / CARD):
+                return zoo / name
+        raise _unknown(name, root)
+
+    @staticmethod
+    def card(name: str, root: Root = None) -> dict[str, Any]:
+        """What a model is, how it was trained and what its errors are.
 
         Raises:
             ZooError: if there is no such model or its card is damaged.
         """
-        return _read_yaml(_folder(name, root) / "card.yaml")
+        return read_card(Zoo.folder(name, root))
 
     @staticmethod
-    def load(name: str, root: Path | None = None, device: torch.device | str = "cpu") -> Pretrained:
-        """A pretrained model.
+    def load(name: str | Path, root: Root = None, device: torch.device | str = "cpu") -> Pretrained:
+        """A pretrained model, or one of your own; see `load_model`."""
+        return load_model(name, device, root)
 
-        Args:
-            name: One of `Zoo.list()`.
-            root: Folder of a zoo; the shipped one when left out.
-            device: Where to compute: "cpu", "cuda", "mps", or "auto" for the best that there is.
 
-        Raises:
-            ZooError: if there is no such model, a file is missing or damaged, or the weights are not those of the card.
-        """
-        folder = _folder(name, root)
-        card = _read_yaml(folder / "card.yaml")
-        weights = _weights(folder / "model.safetensors", card)
-        try:
-            emulator = EmulatorRecipe.from_dict(_read_yaml(folder / "config.yaml")).build()
-            emulator.load_state_dict(weights)
-        except (ConfigError, RuntimeError, KeyError, TypeError) as error:
-            raise ZooError(f"{folder}: config.yaml and model.safetensors do not make a model: {error}") from error
-        return Pretrained(emulator.eval().requires_grad_(False), card).to(device)
+def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root = None) -> Pretrained:
+    """The model of a name or path.
+
+    Args:
+        model: One of `Zoo.list()`; or, if there is none of that name, the path of a zoo entry, of a run (of which the
+            best checkpoint is taken) or of a checkpoint. `./goop` is always a path.
+        device: Where to compute: "cpu", "cuda", "mps", or "auto" for the fastest.
+        root: Folder of a zoo, in which alone the name is looked up: with it, `model` cannot be a path.
+
+    Raises:
+        ZooError: if there is no such model; or an entry's file is missing or damaged, or its weights are not those of
+            its card.
+        DataError: if a checkpoint cannot be read.
+        ConfigError: if this machine does not have the device, or a newer nmpm wrote the model.
+    """
+    target = find_device(device)
+    name, path = str(model), Path(model)
+    if root is not None:
+        found = load_entry(Zoo.folder(name, root))
+    elif isinstance(model, str) and _is_name(name) and any(_exists(zoo / name / CARD) for zoo in _roots(None)):
+        found = load_entry(Zoo.folder(name))
+    elif path.suffix == ".ckpt" or _exists(path):
+        found = _load_path(path)
+    else:
+        raise _unknown(name)
+    return found.to(target)
 
 
 def check_name(name: str) -> str:
-    """The name, if it can be one.
+    """The name, if it is one that an entry can have.
 
     Raises:
-        ZooError: if it cannot, such as one that would lead out of the zoo.
+        ZooError: if it is not, such as one that would lead out of the zoo.
     """
-    if not NAME.fullmatch(name):
+    if not _is_name(name):
         raise ZooError(
-            f"{name!r} cannot name a model: use lower-case letters, digits, - and _, with at most one / between "
-            "dataset and variant."
+            f"{one_line(repr(name), NAME_LENGTH)} cannot name a model: use at most {NAME_LENGTH} lower-case letters,"
+            " digits, - and _, with at most one / between dataset and variant."
         )
     return name
 
 
-def _folder(name: str, root: Path | None) -> Path:
-    root = root or shipped("zoo")
-    folder = root / check_name(name)
-    if not (folder / "card.yaml").is_file():
-        raise ZooError(f"The zoo holds no model {name!r}; it holds {', '.join(Zoo.list(root)) or 'none'}.")
-    return folder
+def _load_path(path: Path) -> Pretrained:
+    if not path.is_dir():
+        return load_checkpoint(path)
+    if (path / CARD).exists():
+        return load_entry(path)
+    if (path / BEST).exists():
+        return load_checkpoint(path / BEST)
+    raise ZooError(f"{path} holds no model: neither an entry of the zoo ({CARD}) nor a run ({BEST}).")
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def _unknown(name: str, root: Root = None) -> ZooError:
+    known = Zoo.list(root)
+    near = suggestion(name[:NAME_LENGTH], known)
+    path = " No such path exists either." if root is None else ""
+    shown = one_line(repr(name), NAME_LENGTH)
+    return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(known) or 'none'}.{near}{path}")
+
+
+def _is_name(name: str) -> bool:
+    return len(name) <= NAME_LENGTH and NAME.fullmatch(name) is not None
+
+
+def _exists(path: Path) -> bool:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ZooError(f"{path} cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise ZooError(f"{path} should hold keys and values.")
-    return content
+        return path.exists()
+    except (OSError, ValueError):  # a name that is too long, or has a null character
+        return False
 
 
-def _weights(path: Path, card: Mapping[str, Any]) -> dict[str, Tensor]:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ZooError(f"{path} cannot be read: {error}") from error
-    if hashlib.sha256(content).hexdigest() != card.get("sha256"):
-        raise ZooError(f"{path} is not the file that card.yaml was written for (its SHA-256 differs): fetch it again.")
-    try:
-        weights = load(content)
-    except SafetensorError as error:
-        raise ZooError(f"{path} is not a file of tensors: {error}") from error
-    for name, tensor in weights.items():
-        if not torch.isfinite(tensor).all():
-            raise ZooError(f"{path}: {name} holds numbers that are not finite.")
-    return weights
+def _names(root: Path) -> list[str]:
+    cards = (*root.glob(f"*/{CARD}"), *root.glob(f"*/*/{CARD}"))
+    return [name for card in cards if _is_name(name := card.parent.relative_to(root).as_posix())]
+
+
+def _roots(root: Root) -> tuple[Path, ...]:
+    if root is None:
+        return user_zoo(), shipped("zoo")
+    if not _exists(Path(root)) or not Path(root).is_dir():
+        raise ZooError(f"There is no zoo in {one_line(root)}: it is not a folder.")
+    return (Path(root),)

@@ -4,6 +4,8 @@ import pytest
 from PIL import Image
 
 from nmpm.cli import main
+from tests.data.convert import records
+from tests.data.convert.test_deepmind import METADATA, made
 
 
 @pytest.fixture
@@ -55,3 +57,15 @@ def test_types_that_the_files_do_not_name_can_be_named(dataset, tmp_path, monkey
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     assert main(["inspect", str(dataset), "--types", "7=honey", "--no-picture"]) == 0
     assert "honey (40-50)" in capsys.readouterr().out
+
+
+def test_the_format_can_be_named(tmp_path, monkeypatch, capsys):
+    """As the error for a dataset of unknown format advises."""
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    records.write_records(tmp_path / "ramps" / "train.tfrecord", records.trajectory_record(*made()))
+    (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
+    path = str(tmp_path / "ramps")
+    assert main(["inspect", path, "--format", "deepmind", "--gravity", "0,-9.81", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["path"] == path
+    assert main(["inspect", path, "--format", "nothing"]) == 1
+    assert "No format is called 'nothing'" in capsys.readouterr().err

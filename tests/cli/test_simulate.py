@@ -59,8 +59,8 @@ def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):
     [
         (["treacle"], "no preset or file treacle"),
         (["goop", "--workers", "0"], "--workers 0"),
-        (["goop", "--train", "-1"], "may be negative"),
-        (["goop", "--frames", "0"], "frames = 0"),
+        (["goop", "--train", "-1"], "--train -1: it must be at least 0"),
+        (["goop", "--frames", "0"], "--frames 0: it must be at least 1"),
     ],
 )
 def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):

@@ -38,7 +38,7 @@ def test_a_failing_line_is_an_exit_status(monkeypatch, capsys):
     from nmpm.cli import stress
     from nmpm.evaluation.stress import Line
 
-    monkeypatch.setattr(stress, "_measured", lambda *_, **__: [Line("long", "one", False, {}, "nothing")])
+    monkeypatch.setattr(stress, "_run_groups", lambda *_, **__: [Line("long", "one", False, {}, "nothing")])
     with pytest.raises(SystemExit) as exit_:
         main(["stress", "goop"])
     assert exit_.value.code == 1

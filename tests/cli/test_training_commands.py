@@ -143,7 +143,7 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 0
     stress = {"size": "quick", "passed": 5, "failed": []}
     assert Zoo.card("drop/tiny", root=tmp_path / "zoo")["stress"] == stress
-    assert "quick: 5 lines passed; failed: none." in Path("zoo/drop/tiny/README.md").read_text()
+    assert "held: 5 of 5 lines passed, quick; free: not run." in Path("zoo/drop/tiny/README.md").read_text()
     assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 1
     assert "exists" in capsys.readouterr().err
     model = Zoo.load("drop/tiny", root=tmp_path / "zoo")

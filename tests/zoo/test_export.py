@@ -149,7 +149,7 @@ def test_a_file_says_what_it_is(exported):
     assert Scene.from_dict(json.loads(about["scene"])) == scene
     assert (about["frames"], float(about["dt"])) == ("2", scene.dt)
     assert json.loads(about["constraints"])["energy"] is False
-    assert json.loads(about["inputs"])["material"]["about"].endswith("0 water, 1 sand")
+    assert json.loads(about["inputs"])["material"]["description"].endswith("0 water, 1 sand")
     assert [value.shape for value in session.get_inputs()] == [["B", "N", 2], ["B", "N", 2], ["B", "N"]]
     assert session.get_outputs()[0].shape == ["B", 2, "N", 2]
     model = onnx.load(path)

@@ -57,10 +57,10 @@ def as_json(subject: str, size: str, seconds: float, lines: Sequence[Line]) -> s
     return json.dumps(plain, indent=1)
 
 
-def write(folder: Path, text: str, lines: Sequence[Line]) -> list[Path]:
-    """`stress.json`, `stress.md` and `stress.png` in a folder, which is made if need be."""
+def write(folder: Path, text: str, lines: Sequence[Line], stem: str = "stress") -> list[Path]:
+    """Write `<stem>.json`, `<stem>.md` and `<stem>.png` into a folder, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / name for name in ("stress.json", "stress.md", "stress.png")]
+    paths = [folder / f"{stem}.{suffix}" for suffix in ("json", "md", "png")]
     with replacing(paths[0]) as part:
         part.write_text(text + "\n", encoding="utf-8")
     with replacing(paths[1]) as part:

@@ -1,4 +1,4 @@
-"""Trained emulators as files that run without this package: ONNX, and machine code of AOTInductor."""
+"""Trained emulators as files that run without this package: ONNX, and AOTInductor packages."""
 
 from nmpm.zoo.export.describe import description
 from nmpm.zoo.export.formats import FORMATS

@@ -1,6 +1,6 @@
-"""Packages of AOTInductor (.pt2): machine code for the processor they were made on, run by torch from Python or C++.
+"""Packages of AOTInductor (.pt2): machine code for the CPU that compiled it, run by torch from Python or C++.
 
-They take contiguous tensors, and take others for such without a word: call `contiguous()` on what goes in.
+They read inputs as contiguous tensors and do not check: call `contiguous()` on inputs.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from nmpm.zoo.export.parts import Part
 from nmpm.zoo.export.program import first_line, program
 
 
-def write_compiled(part: Part, about: Mapping[str, str], path: Path) -> None:
+def write_compiled(part: Part, metadata: Mapping[str, str], path: Path) -> None:
     """Write a part as a package of AOTInductor.
 
     Args:
-        part: What to write.
-        about: Kept in the package as its metadata.
+        part: The part to write.
+        metadata: Stored in the package.
         path: The file; its name must end in .pt2.
 
     Raises:
@@ -33,7 +33,7 @@ def write_compiled(part: Part, about: Mapping[str, str], path: Path) -> None:
 
     check_compiler()
     exported = program(part)
-    settings = {"aot_inductor.metadata": dict(about)}
+    settings = {"aot_inductor.metadata": dict(metadata)}
     with replacing(path) as temporary:
         try:
             with torch.no_grad():
@@ -50,7 +50,7 @@ def run_compiled(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]
     """The outputs of a package."""
     from torch import _inductor
 
-    # Machine code reads memory in the order in which it was made, and does not look whether an input has that.
+    # Machine code does not check the strides of its inputs.
     ordered = {name: value.contiguous() for name, value in inputs.items()}
     with torch.no_grad():
         outputs: tuple[Tensor, ...] = _inductor.aoti_load_package(str(path))(**ordered)
@@ -58,16 +58,16 @@ def run_compiled(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]
 
 
 def check_compiler() -> None:
-    """Make sure that there is a C++ compiler.
+    """Check that there is a C++ compiler.
 
     Raises:
-        ConfigError: naming the one that is looked for.
+        ConfigError: naming the compilers that were looked for.
     """
     from torch._inductor import config
 
     names = [name for name in config.cpp.cxx if name]
     if not any(map(shutil.which, names)):
         raise ConfigError(
-            f"--format pt2 compiles the model, and there is no C++ compiler {' or '.join(names)}: install g++ or clang,"
+            f"--format pt2 compiles the model, but there is no C++ compiler {' or '.join(names)}: install g++ or clang,"
             " or name yours in the environment variable CXX. --format onnx needs none."
         )

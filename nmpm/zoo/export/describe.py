@@ -1,4 +1,4 @@
-"""What an exported file says of itself, as keys and texts; texts of several values are JSON."""
+"""Metadata of exported files, as keys and texts; lists and mappings are JSON."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from nmpm.zoo.export.parts import Part, Value
 
 
 def description(part: Part, model: str, training_data: str) -> dict[str, str]:
-    """Model, versions, scene, grid, frames, inputs and outputs with their units, and what rollouts are held to.
+    """Model, versions, scene, grid, frames, constraints, and inputs and outputs with their units.
 
     Args:
-        part: What is exported.
-        model: Its name.
-        training_data: What it was trained on, in words; simulated data must be called so.
+        part: The exported part.
+        model: The model's name.
+        training_data: What it was trained on, in words; simulated data must be called simulated.
     """
     emulator = part.emulator
     grid = dataclasses.asdict(emulator.grid)
@@ -39,4 +39,4 @@ def description(part: Part, model: str, training_data: str) -> dict[str, str]:
 
 
 def _values(values: tuple[Value, ...]) -> str:
-    return json.dumps({value.name: {"shape": value.shape, "about": value.about} for value in values})
+    return json.dumps({value.name: {"shape": value.shape, "description": value.description} for value in values})

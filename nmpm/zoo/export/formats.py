@@ -1,4 +1,4 @@
-"""The formats of exported files, by the suffix that names them."""
+"""The formats of exported files, by suffix."""
 
 from __future__ import annotations
 
@@ -22,31 +22,30 @@ class Format:
     """A format of exported files.
 
     Args:
-        write: Writes a part with what the file is to say of itself.
-        run: The outputs of a file for inputs by name.
+        write: Writes a part with its metadata.
+        run: Gives the outputs of a file for inputs by name.
     """
 
     write: Write
     run: Run
 
     def difference(self, part: Part, path: Path, batch: int, count: int, seed: int = 0) -> float:
-        """By how much a written file differs from the part itself on made-up inputs.
+        """The largest difference between a written file's outputs and the part's own, on random inputs.
 
         Args:
-            part: What was written.
+            part: The part that was written.
             path: The file.
             batch: Scenes.
             count: Particles.
             seed: Of the inputs.
 
         Returns:
-            The largest difference in any output: in cells for the step, the processor's own units else; inf if one of
-            them is no number where the other is.
+            The difference in cells for the step, else in the output's own units; inf where either is NaN.
         """
         inputs = part.example(batch, count, seed)
-        found, expected = self.run(path, inputs), part(**inputs)
+        actual, expected = self.run(path, inputs), part(**inputs)
         worst = 0.0
-        for value, one, other in zip(part.outputs, found, expected, strict=True):
+        for value, one, other in zip(part.outputs, actual, expected, strict=True):
             gap = (one - other).abs().nan_to_num(nan=float("inf")).max().item() if other.numel() else 0.0
             worst = max(worst, gap / part.scale(value.name))
         return worst

@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 OPSET = 20  # the first whose GridSample takes 3-D
 
 
-def write_onnx(part: Part, about: Mapping[str, str], path: Path) -> None:
+def write_onnx(part: Part, metadata: Mapping[str, str], path: Path) -> None:
     """Write a part as an ONNX file.
 
     Args:
-        part: What to write.
-        about: Kept in the file as its metadata.
+        part: The part to write.
+        metadata: Stored in the file.
         path: The file.
 
     Raises:
-        ConfigError: if a package is missing, or the network uses what ONNX does not have; names it.
+        ConfigError: naming a package that is missing, or an operation of the network that ONNX lacks.
     """
     check_installed()
     import onnx
 
     model = _translated(part, program(part))
     _describe(model, part)
-    onnx.helper.set_model_props(model, dict(about))
+    onnx.helper.set_model_props(model, dict(metadata))
     with replacing(path) as temporary:
         onnx.save(model, temporary)
 
@@ -60,10 +60,10 @@ def run_onnx(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
 
 
 def check_installed() -> None:
-    """Make sure that the packages are there that writing and running ONNX takes.
+    """Check that the packages for writing and running ONNX are installed.
 
     Raises:
-        ConfigError: naming the one that is not, and how to install it.
+        ConfigError: naming the missing one, and how to install it.
     """
     try:
         import onnx  # noqa: F401
@@ -76,7 +76,7 @@ def check_installed() -> None:
 def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
     try:
         with _quiet():
-            made: Any = torch.onnx.export(
+            written: Any = torch.onnx.export(
                 exported,
                 (),
                 input_names=[value.name for value in part.inputs],
@@ -90,15 +90,15 @@ def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
         recipe = type(part.emulator.recipe.processor).__name__
         raise ConfigError(
             f"The model cannot be written as ONNX, which lacks an operation of {recipe} or of the transfer:"
-            f" {_reason(error)}. --format pt2 takes whatever torch.export does."
+            f" {_reason(error)}. --format pt2 supports all that torch.export does."
         ) from error
-    model: ModelProto = made.model_proto
+    model: ModelProto = written.model_proto
     return model
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what torch says of itself meanwhile: its own deprecations, and that torchvision is not there."""
+    """Silence torch's warnings about its own deprecations and a missing torchvision."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -111,17 +111,17 @@ def _quiet() -> Iterator[None]:
 
 
 def _reason(error: BaseException) -> str:
-    """What the innermost cause says first."""
+    """Type and first line of the innermost cause."""
     while error.__cause__ is not None:
         error = error.__cause__
     return f"{type(error).__name__}: {first_line(error)}"
 
 
 def _describe(model: ModelProto, part: Part) -> None:
-    """Give inputs, outputs and open sizes the names and words of the part."""
+    """Name the open sizes as the part does, and describe inputs and outputs."""
     renamed: dict[str, str] = {}
     for info, value in _paired(model, part):
-        info.doc_string = f"{value.shape} {value.about}"
+        info.doc_string = f"{value.shape} {value.description}"
         for place, size in zip(info.type.tensor_type.shape.dim, value.shape, strict=True):
             if isinstance(size, str):
                 renamed[place.dim_param] = size

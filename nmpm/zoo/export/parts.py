@@ -1,7 +1,7 @@
 """Parts of an emulator as functions of plain tensors, which `torch.export` can follow.
 
-Their numbers are the emulator's own: they call it. Only what a program cannot decide as it runs is decided here: that
-all particles are real, that the sums are torch's own, and that nothing is trained.
+They call the emulator itself. Only what a program cannot decide at run time is fixed here: all particles are real,
+sums are torch's own, nothing is trained.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
 VARYING = {"B": 2, "N": 7, "M": 7}
-"""Sizes that an exported part leaves open: scenes, particles, obstacle particles. Examples have so many, and neither 0
-nor 1, which torch.export takes for constants."""
+"""Sizes that an exported part leaves open (scenes, particles, obstacle particles), with their values in examples:
+neither 0 nor 1, which torch.export takes for constants."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """A tensor that goes in or comes out.
+    """An input or output tensor.
 
     Args:
-        name: What it is called in the file.
+        name: Its name in the file.
         shape: Its sizes, those that vary by their name in `VARYING`.
-        about: What it holds, with its unit.
-        dtype: Its numbers.
+        description: Its meaning, with its unit.
+        dtype: Its type.
     """
 
     name: str
     shape: tuple[str | int, ...]
-    about: str
+    description: str
     dtype: torch.dtype = torch.float32
 
 
 class Part(nn.Module, ABC):
-    """What is exported: a function of named float32 tensors, with a copy of the emulator, on the CPU.
+    """An exportable function of named float32 tensors, with a copy of the emulator on the CPU.
 
     Args:
-        emulator: Where it is from.
+        emulator: On any device; it is left there.
     """
 
     inputs: tuple[Value, ...]
@@ -55,7 +55,7 @@ class Part(nn.Module, ABC):
 
     @abstractmethod
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
-        """Made-up inputs: for tracing, and to compare programs with the emulator.
+        """Random inputs, for tracing and for comparing programs with the emulator.
 
         Args:
             batch: Scenes.
@@ -63,8 +63,8 @@ class Part(nn.Module, ABC):
             seed: Of the numbers.
         """
 
-    def scale(self, output: str) -> float:  # noqa: ARG002 (outputs in cells, or without a unit, are as they are)
-        """What an output is divided by to be in cells."""
+    def scale(self, output: str) -> float:  # noqa: ARG002 (outputs in cells or without a unit need no scale)
+        """The factor by which an output is divided to be in cells."""
         return 1.0
 
 
@@ -72,8 +72,8 @@ class Step(Part):
     """One call of the emulator: from a state to the next m frames and the state after them.
 
     Raises:
-        ConfigError: if the emulator is held to what a program cannot decide: contact with obstacles, or bounds beyond
-            which there is an error.
+        ConfigError: if the emulator has constraints that a program cannot decide: contact with obstacles, or an error
+            at the bounds.
     """
 
     def __init__(self, emulator: Emulator) -> None:
@@ -100,8 +100,8 @@ class Step(Part):
         self.inputs = tuple(value for name, value in possible.items() if needed.get(name, True))
         positions = Value("positions", ("B", emulator.frames, "N", scene.dim), "the next frames, in domain length")
         velocity = Value("next_velocity", state, "at the last frame, in domain length per frame: the next call's")
-        held = Value("next_budget", ("B",), "the budget that was kept: the next call's")
-        self.outputs = (positions, velocity, held) if emulator.constraints.energy else (positions, velocity)
+        kept = Value("next_budget", ("B",), "the budget that was kept: the next call's")
+        self.outputs = (positions, velocity, kept) if emulator.constraints.energy else (positions, velocity)
         known = torch.tensor(scene.gravity or (0.0,) * scene.dim) * scene.dt**2
         self.register_buffer("known_gravity", known, persistent=False)
 
@@ -116,7 +116,7 @@ class Step(Part):
         solid: Tensor | None = None,
         budget: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """The outputs, of the inputs that this emulator has."""
+        """The outputs for the inputs that this emulator needs."""
         state = self._state(position, velocity, material, gravity)
         solid = self.emulator.solid(state) if solid is None else solid
         own = self.emulator.budget(state)
@@ -145,7 +145,7 @@ class Step(Part):
         scene, grid = self.emulator.scene, self.emulator.grid
         low, high = torch.tensor(scene.bounds).T
         spread = 0.5 * torch.tensor(grid.spacing)
-        made = {
+        values = {
             "position": low + (high - low) * torch.rand(batch, count, scene.dim, generator=random),
             "velocity": spread * torch.randn(batch, count, scene.dim, generator=random),
             "material": torch.randint(len(scene.materials), (batch, count), generator=random),
@@ -153,7 +153,7 @@ class Step(Part):
             "solid": self.emulator.walls.expand(batch, 1, *grid.shape).clone(),
             "budget": torch.full((batch,), float("nan")),
         }
-        return {value.name: made[value.name] for value in self.inputs}
+        return {value.name: values[value.name] for value in self.inputs}
 
     def scale(self, output: str) -> float:
         return 1.0 if output == "next_budget" else min(self.emulator.grid.spacing)
@@ -165,12 +165,13 @@ class Network(Part):
     def __init__(self, emulator: Emulator) -> None:
         super().__init__(emulator)
         scene, shape = emulator.scene, emulator.grid.shape
-        seen, said = ", ".join(scene.input_channels), ", ".join(scene.output_channels)
-        about = f"channels {seen}; velocities in cells per frame, volumes and solids as shares of a cell"
+        channels = ", ".join(scene.input_channels)
+        description = f"channels {channels}; velocities in cells per frame, volumes and solids as shares of a cell"
         decoder = type(emulator.decoder).__name__
-        self.inputs = (Value("grid", ("B", len(scene.input_channels), *shape), about),)
+        self.inputs = (Value("grid", ("B", len(scene.input_channels), *shape), description),)
         out: tuple[str | int, ...] = ("B", emulator.frames, len(scene.output_channels), *shape)
-        self.outputs = (Value("fields", out, f"channels {said}, in cells per frame, for the decoder {decoder}"),)
+        fields = f"channels {', '.join(scene.output_channels)}, in cells per frame, for the decoder {decoder}"
+        self.outputs = (Value("fields", out, fields),)
 
     def forward(self, grid: Tensor) -> tuple[Tensor]:
         """(B, C_in, *S) → (B, m, C_out, *S)."""
@@ -185,7 +186,7 @@ class Network(Part):
 
 
 class Solid(Part):
-    """From the particles that obstacles are made of to the solid fraction that the step sees.
+    """From obstacle particles to the solid fraction that the step takes.
 
     Raises:
         ConfigError: if the scene has no obstacles.
@@ -195,9 +196,9 @@ class Solid(Part):
         super().__init__(emulator)
         scene = emulator.scene
         if not scene.obstacles:
-            raise ConfigError("The model's scene has no obstacles: export its step, which needs nothing else.")
-        about = f"particles that fill the obstacles, each of volume {scene.particle_volume:g}, in domain length"
-        self.inputs = (Value("obstacle", ("B", "M", scene.dim), about),)
+            raise ConfigError("The model's scene has no obstacles: export its step alone.")
+        description = f"particles that fill the obstacles, each of volume {scene.particle_volume:g}, in domain length"
+        self.inputs = (Value("obstacle", ("B", "M", scene.dim), description),)
         share = "share of each cell that is wall or obstacle, from 0 to 1"
         self.outputs = (Value("solid", ("B", 1, *emulator.grid.shape), share),)
 
@@ -217,14 +218,14 @@ class Solid(Part):
 
 
 def _check_constraints(emulator: Emulator) -> None:
-    held = emulator.constraints
-    if held.solids and emulator.scene.obstacles:
+    constraints = emulator.constraints
+    if constraints.solids and emulator.scene.obstacles:
         raise ConfigError(
-            "constraints.solids cannot be exported: contact with obstacles looks at paths in as many pieces as the"
+            "constraints.solids cannot be exported: contact with obstacles splits paths into as many pieces as the"
             " fastest particle needs, and a program has a fixed number. Export with --free (constraints: solids: false,"
             " as `nmpm.Constraints(solids=False)`), or roll out in Python."
         )
-    if held.bounds == "error":
+    if constraints.bounds == "error":
         raise ConfigError(
             "constraints.bounds = error cannot be exported, as a program cannot raise errors: export with --free, or"
             " train with stop or reflect."

@@ -14,7 +14,7 @@ def program(part: Part) -> ExportedProgram:
     """The program of a part.
 
     Raises:
-        ConfigError: if torch.export cannot follow the network; names it.
+        ConfigError: if torch.export cannot follow the network, naming it.
     """
     sizes = {name: Dim(name, min=1) for name in VARYING}
     shapes = {value.name: _open(value, sizes) for value in part.inputs}
@@ -22,7 +22,7 @@ def program(part: Part) -> ExportedProgram:
     try:
         with torch.no_grad(), using("native"):
             return torch.export.export(part, (), example, dynamic_shapes=shapes)
-    except Exception as error:  # whatever a network of anybody's does that a program cannot
+    except Exception as error:  # any operation of a network that a program cannot do
         recipe = type(part.emulator.recipe.processor).__name__
         raise ConfigError(
             f"torch.export cannot follow {recipe} ({type(error).__name__}: {first_line(error)}). Networks that decide"
@@ -31,10 +31,10 @@ def program(part: Part) -> ExportedProgram:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says first, for a message."""
+    """The first line of an error's message."""
     return next((line for line in str(error).splitlines() if line.strip()), "no reason given")
 
 
 def _open(value: Value, sizes: dict[str, Dim]) -> dict[int, Dim]:
-    """Which axes of a value vary."""
+    """The open axes of a value."""
     return {axis: sizes[size] for axis, size in enumerate(value.shape) if isinstance(size, str)}

@@ -1,0 +1,95 @@
+"""Small files from anywhere: only regular files are opened, none is read beyond a limit, YAML holds plain data only."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nmpm._support.limits import DIGITS, TEXT_BYTES, TEXT_DEPTH
+from nmpm._support.messages import one_line
+from nmpm.errors import DataError
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_NUMBER = re.compile(r"[-+0-9_.:eE]+")
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """The content of a regular file of at most `limit` bytes; pipes and devices are not opened.
+
+    Raises:
+        DataError: if there is no such file, or it cannot be read, is not a regular file, or is larger.
+    """
+    try:
+        # Before opening, as that would block on a named pipe.
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError(f"{path} cannot be read: it is not a regular file.")
+        if status.st_size > limit:
+            raise DataError(f"{path} cannot be read: it has more than {limit:,} bytes.")
+        with path.open("rb") as file:
+            return file.read(status.st_size)
+    except DataError:
+        raise
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"{path} cannot be read: {reason}.") from error
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds, of strings, numbers, truth values, lists and mappings.
+
+    Raises:
+        DataError: if the file cannot be read or is too large, too deep or not YAML, uses anchors, aliases or tags, or
+            holds other values, such as dates.
+    """
+    content = read_bounded(path, TEXT_BYTES)
+    try:
+        text = content.decode("utf-8")
+        _check_events(text)
+        plain = yaml.load(text, _LOADER)  # noqa: S506 (a safe loader)
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        raise DataError(f"{path} cannot be read: {one_line(error)}") from error
+    if not isinstance(plain, dict):
+        raise DataError(f"{path} should hold keys and values.")
+    _check_plain(plain, path)
+    return plain
+
+
+def _check_events(text: str) -> None:
+    """Refuse what makes a short text a large or slow one, before anything is built.
+
+    Raises:
+        ValueError: naming it and its line.
+    """
+    depth = 0
+    for event in yaml.parse(text, _LOADER):
+        line = event.start_mark.line + 1 if event.start_mark else 0
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+            raise ValueError(f"line {line} has an anchor or alias; write the values out.")
+        tag = getattr(event, "tag", None)
+        if tag is not None:
+            raise ValueError(f"line {line} has the tag {one_line(tag, 60)}; only plain values are read.")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > TEXT_DEPTH:
+            raise ValueError(f"line {line} is nested more than {TEXT_DEPTH} deep.")
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > DIGITS and _NUMBER.fullmatch(event.value):
+            raise ValueError(f"line {line} has a number of more than {DIGITS} digits.")
+
+
+def _check_plain(value: Any, path: Path) -> None:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise DataError(f"{path} cannot be read: its key {one_line(repr(key), 60)} is not a string; quote it.")
+            _check_plain(item, path)
+    elif isinstance(value, list):
+        for item in value:
+            _check_plain(item, path)
+    elif value is not None and not isinstance(value, str | int | float):
+        raise DataError(f"{path} cannot be read: it holds the {type(value).__name__} {one_line(value, 60)}; quote it.")

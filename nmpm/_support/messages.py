@@ -1,0 +1,18 @@
+"""Text for error messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def one_line(text: object, limit: int = 200) -> str:
+    """The text without line breaks, cut to `limit` characters."""
+    joined = " ".join(str(text).split())
+    return joined if len(joined) <= limit else f"{joined[: limit - 1]}…"
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """The sentence "Did you mean …?" after a space, with the nearest known names; empty if none is near."""
+    near = get_close_matches(name, list(known), n=3)
+    return f" Did you mean {' or '.join(near)}?" if near else ""

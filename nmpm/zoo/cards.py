@@ -1,0 +1,102 @@
+"""The text of a card: errors beside the trivial predictors, training, constraints and stress tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from nmpm.evaluation.comparison import PREDICTORS, figure_names
+
+CONSTRAINTS = {
+    "energy": "energy (kinetic plus potential energy never exceeds that of the first state)",
+    "rest_speed": "rest_speed = {value:g} cells per frame (slower particles stay where they are)",
+    "solids": "solids (no particle enters an obstacle)",
+    "bounds": "bounds = {value} (no particle leaves the scene's bounds)",
+}
+"""What each constraint enforces, by its key in `card.yaml`."""
+
+
+def stress_digest(report: Mapping[str, Any]) -> dict[str, Any]:
+    """A summary of a report of `nmpm stress`: its size, how many lines passed, and which failed."""
+    lines = report["lines"]
+    return {
+        "size": report["size"],
+        "passed": sum(line["passed"] is True for line in lines),
+        "failed": [f"{line['group']}: {line['name']}" for line in lines if line["passed"] is False],
+    }
+
+
+def stress_line(card: Mapping[str, Any]) -> str:
+    """Stress tests with constraints ("held") and without ("free"), e.g. "held: 41 of 42; free: 30 of 42"."""
+    kinds = {"held": card.get("stress"), "free": card.get("stress_free")}
+    return "; ".join(f"{kind}: {_stress_outcome(digest)}" for kind, digest in kinds.items())
+
+
+def readme(card: Mapping[str, Any], pictured: bool) -> str:
+    """The README of an entry, as Markdown.
+
+    Args:
+        card: The content of `card.yaml`.
+        pictured: Whether the entry has a `rollout.png`.
+    """
+    training, test = card["training"], card["test"]
+    names = figure_names(test)
+    lines = [
+        f"# {card['name']}",
+        "",
+        f"An emulator of: {card['dataset']}. {card.get('about', '')}".rstrip(),
+        "",
+        f"Test error ×10⁻³ of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
+        " length² (`mse`: over all frames), exact earth mover's distance (`emd`) in domain length.",
+        "",
+        f"| predictor | {' | '.join(names)} |",
+        f"|---|{'---:|' * len(names)}",
+        *(f"| {label} | {' | '.join(_errors(test, kind))} |" for kind, label in PREDICTORS.items()),
+        "",
+        f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
+        f"{training['precision']}; {training['parameters']:,} parameters; one run.",
+        "",
+        *_constraint_lines(card),
+        f"`nmpm stress`: {stress_line(card)}. `held` is with these constraints, `free` with the bounds alone.",
+        "",
+        "```python",
+        "from nmpm import Zoo",
+        "",
+        f'model = Zoo.load("{card["name"]}")',
+        "positions = model.rollout(model.example(), frames=400)  # (1, 400, N, D)",
+        "```",
+    ]
+    lines += ["", "![rollout](rollout.png)"] if pictured else []
+    return "\n".join(lines) + "\n"
+
+
+def _errors(test: Mapping[str, float], kind: str) -> Iterator[str]:
+    """A predictor's errors ×10⁻³ to 3 significant digits, in the order of `figure_names`."""
+    prefix = "" if kind == "model" else f"{kind}/"
+    for name in figure_names(test):
+        value = test.get(prefix + name)
+        yield "" if value is None else f"{1e3 * value:.3g}"
+
+
+def _trajectories(card: Mapping[str, Any]) -> str:
+    count = len(card.get("per_trajectory") or ())
+    return "1 trajectory" if count == 1 else f"{count} trajectories" if count else "the test split"
+
+
+def _constraint_lines(card: Mapping[str, Any]) -> list[str]:
+    """What the constraints that act enforce; none for cards of version 0.1, which do not state them."""
+    if "constraints" not in card:
+        return []
+    acting = dict(card["constraints"])
+    if not card.get("obstacles"):
+        acting.pop("solids", None)
+    stated = [CONSTRAINTS[name].format(value=value) for name, value in acting.items() if value and name in CONSTRAINTS]
+    return [f"Rollouts are constrained by {'; '.join(stated)}.", ""]
+
+
+def _stress_outcome(digest: Mapping[str, Any] | None) -> str:
+    if digest is None:
+        return "not run"
+    failed = digest["failed"]
+    names = f" (failed: {'; '.join(failed)})" if failed else ""
+    return f"{digest['passed']} of {digest['passed'] + len(failed)} lines passed, {digest['size']}{names}"

@@ -1,0 +1,147 @@
+"""Trained emulators with what is known of their training."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from nmpm._support.devices import find_device
+from nmpm.data.initial_states import thrown_blocks
+from nmpm.emulator import Emulator, rollout
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+from nmpm.zoo.states import StateBuilder
+
+NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
+"""Precisions of a pretrained network, by name."""
+SIMULATED = ", simulated by nmpm"
+"""What follows a preset's name in the description of its dataset."""
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """A trained model, ready to roll out or to fine-tune.
+
+    Args:
+        emulator: In evaluation mode.
+        card: What `card.yaml` of the zoo says, or what is known of a checkpoint.
+    """
+
+    emulator: Emulator
+    card: Mapping[str, Any]
+
+    @property
+    def scene(self) -> Scene:
+        """The facts of the scenes that the model was trained for."""
+        return self.emulator.scene
+
+    @property
+    def name(self) -> str:
+        """The model's name in the zoo, or its checkpoint's path."""
+        return str(self.card.get("name", "unnamed"))
+
+    @property
+    def horizon(self) -> int:
+        """Frames that the training unrolled; 4 bundles where the card does not say."""
+        training = self.card.get("training")
+        stated = training.get("horizon") if isinstance(training, Mapping) else None
+        return stated if isinstance(stated, int) and stated > 0 else 4 * self.emulator.frames
+
+    @property
+    def preset(self) -> str | None:
+        """Name of the simulator preset that made the training data; None for recorded or unknown data."""
+        name, simulated, _ = str(self.card.get("dataset", "")).partition(SIMULATED)
+        return name if simulated else None
+
+    def state(
+        self,
+        position: ArrayLike | Tensor,
+        velocity: ArrayLike | Tensor | None = None,
+        material: str | Sequence[str] | ArrayLike | Tensor | None = None,
+        obstacle: ArrayLike | Tensor | None = None,
+        gravity: ArrayLike | Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> Particles:
+        """A state to start a rollout from, of N particles in each of B scenes, in D dimensions.
+
+        Args:
+            position: (N, D) or (B, N, D), in domain length.
+            velocity: (D,), (N, D) or (B, N, D), in domain length per second; at rest when left out.
+            material: A name of `scene.materials` for all particles; or (N,) or (B, N) names, or indices into
+                `scene.materials`. May be left out where the scene has one material.
+            obstacle: (M, D) or (B, M, D) positions of particles that fill the obstacles.
+            gravity: (D,) or (B, D), in domain length per second squared. Needed where gravity varies; elsewhere it may
+                be left out, and otherwise must be the scene's.
+            dtype: Of positions, velocities and gravity; float64 for domains far from the origin.
+
+        Returns:
+            The state on the model's device, with velocities and gravity converted to frames.
+
+        Raises:
+            DataError: if shapes do not fit together, values are not finite, a particle is outside of the domain or far
+                faster than the model was calibrated for, a material is unknown, or gravity is not the model's.
+
+        Warns:
+            UserWarning: if the velocities look as if they were per frame.
+        """
+        builder = StateBuilder(self.emulator, position, dtype)
+        return builder.build(velocity, material, obstacle, gravity).to(self.emulator.device)
+
+    def example(self, seed: int = 0, count: int = 1000, blocks: int = 1) -> Particles:
+        """A state to start from: blocks of particles thrown into the scene's box.
+
+        Args:
+            seed: Of places and velocities, 0 or more.
+            count: Approximate number of particles.
+            blocks: Number of blocks.
+
+        Raises:
+            ConfigError: if a number is too small, or the blocks do not fit into the box.
+        """
+        for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
+            if value < least:
+                raise ConfigError(f"{name} = {value}: it must be at least {least}.")
+        try:
+            return thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
+        except ValueError as error:
+            raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
+
+    def with_network(self, precision: str) -> Pretrained:
+        """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16".
+
+        Raises:
+            ConfigError: if there is no such precision, or the network cannot have it.
+        """
+        if precision not in NETWORK_PRECISIONS:
+            raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
+        return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
+
+    def to(self, device: torch.device | str) -> Pretrained:
+        """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest.
+
+        This model is left where it is; the returned one has a copy of its tensors if the device differs.
+
+        Raises:
+            ConfigError: if this machine does not have the device.
+        """
+        target = find_device(device)
+        if target.type == self.emulator.device.type and target.index in (None, self.emulator.device.index):
+            return self
+        return dataclasses.replace(self, emulator=copy.deepcopy(self.emulator).to(target))
+
+    def rollout(self, state: Particles, frames: int) -> Tensor:
+        """Predict from a state, which is moved to the model's device.
+
+        Returns:
+            (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
+        """
+        return rollout(self.emulator, state.to(self.emulator.device), frames)

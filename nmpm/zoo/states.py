@@ -1,0 +1,216 @@
+"""States from plain arrays in SI units, with checks for the mistakes that would silently give a wrong rollout."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm._support.messages import one_line, suggestion
+from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.emulator.rollouts import check_inputs
+from nmpm.errors import DataError
+from nmpm.particles import Particles
+
+TOO_FAST = 2.0
+"""Speeds above this multiple of the calibrated range are errors."""
+SUSPICIOUSLY_SLOW = 0.005
+"""If no speed exceeds this fraction of the calibrated range, but speeds per frame would be within it, a warning."""
+
+
+class StateBuilder:
+    """Builds a model's states from arrays; shapes and units are those of `Pretrained.state`.
+
+    Args:
+        emulator: Gives the scene, and the range of velocities and gravity that it was calibrated for.
+        position: (N, D) or (B, N, D).
+        dtype: Floating-point type of the state.
+
+    Raises:
+        DataError: if the positions have another shape.
+    """
+
+    def __init__(self, emulator: Emulator, position: Any, dtype: torch.dtype) -> None:
+        self.emulator, self.scene, self.dtype = emulator, emulator.scene, dtype
+        found = _numbers("position", position)
+        dim = self.scene.dim
+        if found.dim() not in (2, 3) or found.shape[-1] != dim or not found.numel():
+            raise DataError(
+                f"position has the shape {tuple(found.shape)}; it must be (N, {dim}) or (B, N, {dim}) for this model's"
+                f" {dim}-D scenes, with at least one particle."
+            )
+        self.position = found.reshape(-1, *found.shape[-2:])
+        self.batch, self.count = self.position.shape[:2]
+
+    def build(self, velocity: Any, material: Any, obstacle: Any, gravity: Any) -> Particles:
+        """The state, with velocities and gravity converted to frames.
+
+        Raises:
+            DataError: as `Pretrained.state`.
+        """
+        dt, solid = self.scene.dt, self._obstacle(obstacle)
+        kind, speed = self._material(material), self._velocity(velocity)
+        state = Particles(
+            position=self.position.to(self.dtype),
+            velocity=(speed * dt).to(self.dtype),
+            material=kind,
+            mask=torch.ones_like(kind, dtype=torch.bool),
+            obstacle=solid.to(self.dtype),
+            obstacle_mask=torch.ones(solid.shape[:2], dtype=torch.bool, device=solid.device),
+            gravity=(self._gravity(gravity) * dt**2).to(self.dtype),
+        )
+        check_inputs(self.emulator, state)
+        self._check_speeds(speed, kind)
+        return state
+
+    def _velocity(self, given: Any) -> Tensor:
+        shape = (self.batch, self.count, self.scene.dim)
+        if given is None:
+            return torch.zeros_like(self.position)
+        return self._expanded("velocity", given, [shape[2:], shape[1:], shape], shape)
+
+    def _material(self, given: Any) -> Tensor:
+        materials, shape = self.scene.materials, (self.batch, self.count)
+        if given is None:
+            if len(materials) > 1:
+                raise DataError(f"material is needed, as the model has several: {', '.join(materials)}.")
+            given = materials[0]
+        if not isinstance(given, Tensor):
+            names = np.asarray(given)
+            if names.dtype.kind in "UO":
+                given = np.vectorize(self._index_of, otypes=[np.int64])(names)
+        found = self._expanded("material", given, [(), shape[1:], shape], shape)
+        wrong = (found != found.round()) | (found < 0) | (found >= len(materials))
+        if wrong.any():
+            scene, particle = map(int, wrong.nonzero()[0])
+            raise DataError(
+                f"Scene {scene}, particle {particle}: material {found[scene, particle]:g} is not an index into"
+                f" {list(materials)}. Type ids of datasets are not indices: give names, such as {materials[0]!r}."
+            )
+        return found.long().contiguous()
+
+    def _index_of(self, name: object) -> int:
+        if name not in self.scene.materials:
+            raise DataError(
+                f"Material {one_line(repr(name), 60)} is unknown to this model, which has"
+                f" {', '.join(self.scene.materials)}.{suggestion(str(name)[:60], self.scene.materials)}"
+            )
+        return self.scene.materials.index(str(name))
+
+    def _obstacle(self, given: Any) -> Tensor:
+        dim = self.scene.dim
+        if given is None:
+            return self.position.new_zeros(self.batch, 0, dim)
+        if not self.scene.obstacles:
+            raise DataError("obstacle: the model was trained without obstacles and would not see them; leave it out.")
+        found = _numbers("obstacle", given)
+        count = found.shape[-2] if found.dim() > 1 else 0
+        shape = (self.batch, count, dim)
+        found = self._expanded("obstacle", found, [shape[1:], shape], shape)
+        if not found.isfinite().all():
+            raise DataError("obstacle has values that are not finite.")
+        return found
+
+    def _gravity(self, given: Any) -> Tensor:
+        scene, shape = self.scene, (self.batch, self.scene.dim)
+        if given is None:
+            if scene.gravity_varies:
+                raise DataError("gravity is needed, in length/s²: this model's scenes differ in it.")
+            return self._expanded("gravity", scene.gravity or (0.0,) * scene.dim, [shape[1:]], shape)
+        found = self._expanded("gravity", given, [shape[1:], shape], shape)
+        if not found.isfinite().all():
+            raise DataError(f"gravity = {found.tolist()} must be finite.")
+        if scene.gravity_varies:
+            self._check_gravity_range(found)
+        else:
+            self._check_fixed_gravity(found)
+        return found
+
+    def _check_fixed_gravity(self, found: Tensor) -> None:
+        if self.scene.gravity is None:
+            raise DataError("gravity: it is not known for this model's scenes, so none can be set; leave it out.")
+        fixed = found.new_tensor(self.scene.gravity)
+        largest = float(fixed.abs().max())
+        if (found - fixed).abs().max() <= 1e-3 * largest:
+            return
+        per_frame = (found / self.scene.dt**2 - fixed).abs().max() <= 1e-2 * largest
+        hint = " It seems to be per frame squared: divide it by dt²." if per_frame and largest else ""
+        raise DataError(
+            f"gravity = {found[0].tolist()} length/s², but the model knows only {list(self.scene.gravity)}, with which"
+            f" it was trained; leave it out.{hint}"
+        )
+
+    def _check_gravity_range(self, found: Tensor) -> None:
+        low, high = (limit / self.scene.dt for limit in self._ranges("gravity_"))
+        outside = (found < low - 0.01 * low.abs()) | (found > high + 0.01 * high.abs())
+        if outside.any():
+            scene = int(outside.any(-1).nonzero()[0])
+            raise DataError(
+                f"Scene {scene}: gravity = {found[scene].tolist()} length/s² is outside of the range that the model"
+                f" was calibrated for, {_format(low)} … {_format(high)}."
+            )
+
+    def _check_speeds(self, velocity: Tensor, material: Tensor) -> None:
+        """Compare velocities (B, N, D) in length/s with the range that the network was calibrated for."""
+        ranges = [self._ranges(f"{name}.velocity_") for name in self.scene.materials]
+        limits = torch.stack([torch.maximum(low.abs(), high.abs()) for low, high in ranges]).to(velocity)
+        ratio = (velocity.detach().abs() / limits[material].clamp(min=1e-30)).amax(-1)
+        fastest = int(ratio.argmax())
+        most, (scene, particle) = float(ratio.max()), divmod(fastest, self.count)
+        particle_text = (
+            f"Scene {scene}, particle {particle}: the fastest, with the velocity"
+            f" {_format(velocity[scene, particle])} length/s"
+        )
+        limit = _format(limits[material[scene, particle]])
+        if most > TOO_FAST:
+            raise DataError(
+                f"{particle_text}, is far beyond {limit}, up to which the model was calibrated. Velocities are in"
+                " domain length per second."
+            )
+        if 0 < most < SUSPICIOUSLY_SLOW and TOO_FAST / 100 < most / self.scene.dt < TOO_FAST:
+            warnings.warn(
+                f"{particle_text}, is very slow beside {limit}, up to which the model was calibrated. Velocities are in"
+                f" domain length per second; if yours are per frame, divide them by dt = {self.scene.dt:g} s.",
+                stacklevel=4,
+            )
+
+    def _ranges(self, prefix: str) -> tuple[Tensor, Tensor]:
+        """Lower and upper limits (D,) of the input channels of that prefix, in length/s; infinite where unlimited."""
+        channels = [i for i, name in enumerate(self.scene.input_channels) if name.startswith(prefix)]
+        scale = torch.tensor(self.emulator.grid.spacing, dtype=torch.float64) / self.scene.dt
+        low, high = (
+            limit[channels].flatten().cpu().double() for limit in (self.emulator.input_low, self.emulator.input_high)
+        )
+        low = torch.where(low <= -UNLIMITED / 2, -torch.inf, low)
+        return low * scale, torch.where(high >= UNLIMITED / 2, torch.inf, high) * scale
+
+    def _expanded(self, name: str, given: Any, allowed: list[tuple[int, ...]], shape: tuple[int, ...]) -> Tensor:
+        found = _numbers(name, given)
+        if tuple(found.shape) not in allowed:
+            raise DataError(
+                f"{name} has the shape {tuple(found.shape)}; with positions {tuple(self.position.shape)} it must be"
+                f" {' or '.join(map(str, allowed))}."
+            )
+        return found.expand(shape)
+
+
+def _numbers(name: str, values: Any) -> Tensor:
+    """The values as a float64 tensor of its own memory, on the CPU.
+
+    Raises:
+        DataError: if they are not real numbers.
+    """
+    try:
+        found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError(f"{name} cannot be read as an array of numbers: {one_line(error)}.") from error
+    if found.is_complex() or found.dtype is torch.bool:
+        raise DataError(f"{name} holds {str(found.dtype).removeprefix('torch.')} values; real numbers are needed.")
+    return found.to("cpu", torch.float64, copy=True)
+
+
+def _format(values: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"

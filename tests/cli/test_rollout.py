@@ -1,0 +1,102 @@
+import errno
+import os
+import tempfile
+
+import numpy as np
+import pytest
+
+from nmpm._support.shipped import shipped
+from nmpm.cli import main
+from nmpm.data.format import Split
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    return tmp_path
+
+
+def test_names_and_paths_give_the_same_rollout(folder):
+    (folder / "copy").symlink_to(shipped("zoo") / "goop")
+    few = ["--frames", "4", "--particles", "50"]
+    assert main(["rollout", "goop", *few, "--out", "a.h5", "--device", "cpu"]) == 0
+    assert main(["rollout", "./copy", *few, "--out", "b.h5"]) == 0
+    assert main(["rollout", "goop", "--root", str(shipped("zoo")), *few, "--out", "c.h5"]) == 0
+    a, b, c = (Split(folder / f"{name}.h5").read(0).position for name in "abc")
+    assert a.shape[0] == 6
+    np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(a, c)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["goop", "--frames", "0"], "--frames 0: it must be at least 1."),
+        (["goop", "--particles", "0"], "--particles 0: it must be at least 1."),
+        (["goop", "--particles", "-5"], "--particles -5: it must be at least 1."),
+        (["goop", "--blocks", "0"], "--blocks 0: it must be at least 1."),
+        (["goop", "--seed", "-1"], "--seed -1: it must be at least 0."),
+        (["goop", "--trajectory", "-1"], "--trajectory -1: it must be at least 0."),
+        (["goop", "--particles", "1000000"], "Use fewer particles or more blocks."),
+        (["goop", "--data", "nowhere.h5"], "--data nowhere.h5: there is no such file."),
+        (["goop", "--data", "."], "--data .: it is a folder; name a file in it"),
+        (["goop", "--out", "no/where.h5"], "--out no/where.h5: the folder no does not exist"),
+        (["goop", "--out", "."], "--out .: it is a folder"),
+        (["goop", "--device", "cuda:77"], "has no device 'cuda:77'"),
+        (["goop", "--device", "gpu"], "--device gpu: it is not one of auto, cpu, cuda, mps"),
+        (["goop", "--device", "meta"], "--device meta: it is not one of"),
+        (["gop"], "Did you mean goop?"),
+        (["nothing.ckpt"], "nothing.ckpt: there is no such checkpoint"),
+        (["."], "holds no model"),
+        (["goop", "--root", "nowhere"], "There is no zoo in nowhere"),
+    ],
+)
+def test_wrong_calls_get_one_line(words, message, folder, capsys):
+    assert main(["rollout", *words]) == 1
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not list(folder.glob("*.h5"))
+
+
+WRITERS = [
+    ["rollout", "goop", "--out", "a.h5"],
+    ["export", "goop", "--out", "a.onnx"],
+    ["simulate", "goop", "--out", "new"],
+    ["simulate", "goop", "--preview", "a.png"],
+    ["inspect", ".", "--out", "a.png"],
+]
+
+
+@pytest.mark.parametrize("words", WRITERS, ids=lambda words: " ".join(words))
+def test_a_read_only_folder_is_found_before_the_work(words, folder, monkeypatch, capsys):
+    def fail(**_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
+    assert main(words) == 1
+    assert "is not writable (Read-only file system)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["simulate", "goop", "--preview", "a.gif"], "--preview a.gif: pictures are PNG"),
+        (["simulate", "goop", "--seed", "-1"], "--seed -1: it must be at least 0."),
+        (["simulate", "goop", "--out", "file"], "--out file: it is a file; name a folder."),
+        (["simulate", "goop", "--out", "file/new"], "is a file, not a folder"),
+        (["inspect", "nowhere"], "nowhere: there is no such file or folder."),
+        (["inspect", ".", "--out", "no/a.png"], "--out no/a.png: the folder no does not exist"),
+        (["render", "nowhere.h5"], "FILE nowhere.h5: there is no such file."),
+        (["export", "goop", "--out", "no/a.onnx"], "--out no/a.onnx: the folder no does not exist"),
+        (["export", "gop"], "Did you mean goop?"),
+        (["export", "."], "holds no model"),
+    ],
+)
+def test_wrong_calls_of_other_commands(words, message, folder, capsys):
+    (folder / "file").touch()
+    assert main(words) == 1
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1

@@ -1,0 +1,64 @@
+import pytest
+
+from nmpm._support.shipped import shipped
+from nmpm.cli import main
+from nmpm.zoo import Zoo
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+def copy(name, folder):
+    folder.mkdir(parents=True)
+    for path in (shipped("zoo") / name).iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+
+
+def test_own_models_are_marked_in_the_list(home, capsys):
+    copy("goop", home / "zoo" / "goop" / "mine")
+    assert main(["zoo", "list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == Zoo.list()
+    assert [line.split()[1] for line in lines if "yours" in line] == ["yours"]
+    assert next(line for line in lines if "yours" in line).startswith("goop/mine")
+
+
+def test_another_zoo_before_or_after_the_command(tmp_path, capsys):
+    copy("goop", tmp_path / "other" / "goop")
+    for words in (["--root", "other", "list"], ["list", "--root", "other"]):
+        assert main(["zoo", *words]) == 0
+        assert capsys.readouterr().out.count("\n") == 1
+    assert main(["zoo", "card", "goop", "--root", "other"]) == 0
+    assert "sha256" in capsys.readouterr().out
+
+
+def test_a_damaged_card_does_not_hide_the_others(home, capsys):
+    copy("goop", home / "zoo" / "broken")
+    (home / "zoo" / "broken" / "card.yaml").write_text("{")
+    copy("goop", home / "zoo" / "bare")
+    (home / "zoo" / "bare" / "card.yaml").write_text("name: bare\n")
+    assert main(["zoo", "list"]) == 0
+    said = capsys.readouterr().out
+    assert "cannot be read" in said
+    assert "full-rollout MSE not measured   data not stated" in said
+    assert "goop, simulated by nmpm" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["card", "gop"], "Did you mean goop?"),
+        (["card", "../goop"], "cannot name a model"),
+        (["list", "--root", "nowhere"], "There is no zoo in nowhere"),
+        (["add", "nowhere", "mine"], "not a finished run"),
+    ],
+)
+def test_wrong_calls_get_one_line(words, message, capsys):
+    assert main(["zoo", *words]) == 1
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1

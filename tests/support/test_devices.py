@@ -1,0 +1,44 @@
+import pytest
+import torch
+
+from nmpm._support.devices import find_device
+from nmpm.errors import ConfigError
+
+
+@pytest.fixture
+def two_gpus(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+
+
+@pytest.fixture
+def cpu_alone(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+
+
+@pytest.mark.usefixtures("two_gpus")
+def test_auto_prefers_a_gpu():
+    assert find_device("auto") == torch.device("cuda")
+    assert find_device("cuda:1") == torch.device("cuda", 1)
+    with pytest.raises(ConfigError, match="has no device 'cuda:2'; it has cuda:0 … 1"):
+        find_device("cuda:2")
+
+
+@pytest.mark.usefixtures("cpu_alone")
+def test_auto_takes_the_cpu_where_there_is_no_other():
+    assert find_device("auto") == find_device(torch.device("cpu")) == torch.device("cpu")
+
+
+@pytest.mark.usefixtures("cpu_alone")
+@pytest.mark.parametrize("name", ["cuda", "cuda:1", "mps", "xpu", "cpu:3"])
+def test_devices_of_other_machines(name):
+    with pytest.raises(ConfigError, match=f"has no device '{name}'; it has cpu"):
+        find_device(name)
+
+
+@pytest.mark.parametrize("name", ["", "gpu", "cuda:x", "c" * 1000, None])
+def test_names_that_are_no_devices(name):
+    with pytest.raises(ConfigError, match="is not one of auto, cpu, cuda, mps") as caught:
+        find_device(name)
+    assert len(str(caught.value)) < 200

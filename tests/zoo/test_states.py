@@ -1,0 +1,161 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes import box
+
+from nmpm.emulator import EmulatorRecipe
+from nmpm.errors import DataError
+from nmpm.processors import Pointwise
+from nmpm.zoo.registry import Pretrained
+
+POSITIONS = np.random.default_rng(0).uniform(0.3, 0.7, (20, 2))
+
+
+def model_of(scene, fastest=4.0) -> Pretrained:
+    """A model that was calibrated for velocities of up to `fastest` length/s along each axis."""
+    emulator = EmulatorRecipe(scene, 14, 2, processor=Pointwise()).build().eval().requires_grad_(False)
+    channels = [i for i, name in enumerate(scene.input_channels) if "velocity" in name]
+    cells = fastest * scene.dt / emulator.grid.spacing[0]
+    emulator.input_high[channels], emulator.input_low[channels] = cells, -cells
+    return Pretrained(emulator, {})
+
+
+@pytest.fixture
+def model() -> Pretrained:
+    return model_of(box())
+
+
+def test_units_are_converted_to_frames(model):
+    state = model.state(POSITIONS, velocity=(1.0, -2.0))
+    dt = model.scene.dt
+    assert state.position.shape == (1, 20, 2)
+    assert state.position.dtype == torch.float32
+    torch.testing.assert_close(state.velocity, torch.tensor([1.0 * dt, -2.0 * dt]).expand(1, 20, 2))
+    torch.testing.assert_close(state.gravity, torch.tensor([[0.0, -9.81 * dt**2]]))
+    assert state.mask.all()
+    assert (state.material == 0).all()
+    assert model.rollout(state, 3).shape == (1, 3, 20, 2)
+
+
+def test_numpy_torch_lists_and_batches_are_the_same(model):
+    velocity = np.linspace(-1, 1, 40).reshape(20, 2)
+    one = model.state(POSITIONS, velocity)
+    others = (
+        model.state(torch.from_numpy(POSITIONS), torch.from_numpy(velocity)),
+        model.state(POSITIONS.tolist(), velocity.tolist()),
+        model.state(np.stack([POSITIONS] * 3), velocity).scenes(slice(1, 2)),
+    )
+    for other in others:
+        for field in dataclasses.fields(one):
+            assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
+
+
+def test_the_arrays_are_copied_and_gradients_kept(model):
+    positions = POSITIONS.astype(np.float32)
+    state = model.state(positions)
+    positions += 0.1
+    np.testing.assert_allclose(state.position[0], POSITIONS, atol=1e-6)
+    velocity = torch.zeros(20, 2, requires_grad=True)
+    model.state(POSITIONS, velocity).velocity.sum().backward()
+    torch.testing.assert_close(velocity.grad, torch.full((20, 2), model.scene.dt))
+    assert model.state(POSITIONS, dtype=torch.float64).position.dtype == torch.float64
+
+
+def test_materials_by_name_or_index():
+    model = model_of(box(materials=("water", "sand")))
+    names = ["sand"] * 5 + ["water"] * 15
+    by_name = model.state(POSITIONS, material=names)
+    assert by_name.material.tolist() == [[1] * 5 + [0] * 15]
+    by_index = model.state(POSITIONS, material=np.array([1] * 5 + [0] * 15, dtype=np.uint8))
+    assert torch.equal(by_index.material, by_name.material)
+    assert (model.state(np.stack([POSITIONS] * 2), material="sand").material == 1).all()
+    with pytest.raises(DataError, match=r"material is needed.*water, sand"):
+        model.state(POSITIONS)
+
+
+def test_obstacles_where_the_model_has_them():
+    model = model_of(box(obstacles=True))
+    state = model.state(np.stack([POSITIONS] * 2), obstacle=[[0.5, 0.2], [0.52, 0.2], [0.54, 0.2]])
+    assert state.obstacle.shape == (2, 3, 2)
+    assert state.obstacle_mask.all()
+    assert model.state(POSITIONS).obstacle.shape == (1, 0, 2)
+    with pytest.raises(DataError, match="trained without obstacles"):
+        model_of(box()).state(POSITIONS, obstacle=[[0.5, 0.2]])
+
+
+def test_gravity_where_it_varies():
+    model = model_of(box(gravity=None, gravity_varies=True))
+    channels = [i for i, name in enumerate(model.scene.input_channels) if name.startswith("gravity")]
+    cells = 12.0 * model.scene.dt**2 / model.emulator.grid.spacing[0]
+    model.emulator.input_low[channels], model.emulator.input_high[channels] = -cells, cells
+    state = model.state(np.stack([POSITIONS] * 2), gravity=[[0.0, -9.81], [3.0, 0.0]])
+    torch.testing.assert_close(state.gravity[1], torch.tensor([3.0 * model.scene.dt**2, 0.0]))
+    with pytest.raises(DataError, match="gravity is needed"):
+        model.state(POSITIONS)
+    with pytest.raises(DataError, match=r"gravity = \[0.0, -30.0\] length/s² is outside .* \(-12, -12\)"):
+        model.state(POSITIONS, gravity=(0.0, -30.0))
+
+
+def test_an_unknown_gravity_cannot_be_set():
+    with pytest.raises(DataError, match="not known for this model's scenes"):
+        model_of(box(gravity=None)).state(POSITIONS, gravity=(0.0, -9.81))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"position": np.zeros((20, 3))}, r"position has the shape \(20, 3\); it must be \(N, 2\)"),
+        ({"position": np.zeros((0, 2))}, "at least one particle"),
+        ({"position": 100 * POSITIONS}, r"outside of the domain"),
+        ({"position": np.full((20, 2), np.nan)}, "must be finite"),
+        ({"position": [["a", "b"]]}, "cannot be read as an array of numbers"),
+        ({"position": POSITIONS > 0}, "bool values; real numbers"),
+        ({"velocity": np.zeros((19, 2))}, r"velocity has the shape \(19, 2\).*\(20, 2\)"),
+        ({"velocity": np.full((20, 2), np.inf)}, "must be finite"),
+        ({"material": "gopp"}, "Material 'gopp' is unknown.* Did you mean goop"),
+        ({"material": ["goop"] * 19}, r"material has the shape \(19,\)"),
+        ({"material": np.full(20, 7)}, "particle 0: material 7 is not an index.*Type ids"),
+        ({"material": np.full(20, -1)}, "material -1 is not an index"),
+        ({"material": np.full(20, 0.5)}, "material 0.5 is not an index"),
+        ({"gravity": (0.0, -1.62)}, r"knows only \[0.0, -9.81\]"),
+        ({"gravity": (0.0, -9.81 * 0.0025**2)}, "per frame squared: divide it by dt²"),
+        ({"gravity": (0.0, -9.81, 0.0)}, r"gravity has the shape \(3,\)"),
+    ],
+)
+def test_mistakes_are_named(model, given, message):
+    with pytest.raises(DataError, match=message) as caught:
+        model.state(**({"position": POSITIONS} | given))
+    assert len(str(caught.value)) < 400
+
+
+def test_the_models_own_gravity_may_be_given(model):
+    assert torch.equal(model.state(POSITIONS, gravity=(0.0, -9.81)).gravity, model.state(POSITIONS).gravity)
+
+
+def test_speeds_far_beyond_the_calibrated_range_are_refused(model):
+    velocity = np.zeros((20, 2))
+    velocity[17] = (0.0, -7.9)
+    model.state(POSITIONS, velocity)
+    velocity[17] = (0.0, -8.1)
+    with pytest.raises(DataError, match=r"particle 17: the fastest.*\(0, -8.1\).*\(4, 4\).*per second"):
+        model.state(POSITIONS, velocity)
+
+
+def test_an_uncalibrated_model_knows_no_range():
+    emulator = EmulatorRecipe(box(), 14, 2, processor=Pointwise()).build().eval()
+    assert Pretrained(emulator, {}).state(POSITIONS, velocity=(1e3, 0.0)).velocity.max() > 1
+
+
+def test_velocities_per_frame_are_suspected(model):
+    per_second = np.full((20, 2), 1.5)
+    with pytest.warns(UserWarning, match=r"if yours are per frame, divide them by dt = 0.0025 s") as caught:
+        model.state(POSITIONS, per_second * model.scene.dt)
+    assert caught[0].filename == __file__
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("speed", [0.0, 1e-6, 0.1, 1.5])
+def test_plausible_velocities_are_not(model, speed):
+    model.state(POSITIONS, velocity=(speed, 0.0))
