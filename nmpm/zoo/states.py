@@ -160,19 +160,19 @@ class StateBuilder:
         ratio = (velocity.detach().abs() / limits[material].clamp(min=1e-30)).amax(-1)
         fastest = int(ratio.argmax())
         most, (scene, particle) = float(ratio.max()), divmod(fastest, self.count)
-        particle_text = (
+        particle_is = (
             f"Scene {scene}, particle {particle}: the fastest, with the velocity"
             f" {_format(velocity[scene, particle])} length/s"
         )
         limit = _format(limits[material[scene, particle]])
         if most > TOO_FAST:
             raise DataError(
-                f"{particle_text}, is far beyond {limit}, up to which the model was calibrated. Velocities are in"
-                " domain length per second."
+                f"{particle_is}, is far beyond {limit}, up to which the model was calibrated. Velocities are in domain"
+                " length per second."
             )
         if 0 < most < SUSPICIOUSLY_SLOW and TOO_FAST / 100 < most / self.scene.dt < TOO_FAST:
             warnings.warn(
-                f"{particle_text}, is very slow beside {limit}, up to which the model was calibrated. Velocities are in"
+                f"{particle_is}, is very slow beside {limit}, up to which the model was calibrated. Velocities are in"
                 f" domain length per second; if yours are per frame, divide them by dt = {self.scene.dt:g} s.",
                 stacklevel=4,
             )

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import pytest
 import torch
 from scenes import box, cloud
 
+from nmpm._support.shipped import shipped
 from nmpm.cli import main
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
@@ -23,6 +25,7 @@ from nmpm.processors import GridLayout, GridProcessor, Pointwise, Processor
 from nmpm.scene import Scene
 from nmpm.transfer import Affine, Linear, Nearest
 from nmpm.zoo.export import FORMATS, Network, Solid, Step, description
+from nmpm.zoo.export.formats import Format
 
 RUNNER = Path(__file__).parents[2] / "docs" / "run_onnx.py"
 FREE = Constraints(solids=False)
@@ -257,12 +260,28 @@ def test_a_zoo_model_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert "simulated by nmpm" in about["training_data"]
 
 
+def test_a_model_by_its_path_is_named_after_its_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(shipped("zoo") / "goop", tmp_path / "models" / "mine")
+    assert main(["export", str(tmp_path / "models" / "mine"), "--processor"]) == 0
+    assert (tmp_path / "mine-processor.onnx").is_file()
+
+
+def test_a_file_that_differs_from_its_model_is_deleted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Format, "difference", lambda *_, **__: 0.5)
+    assert main(["export", "goop", "--processor"]) == 1
+    message = "Verification failed: goop-processor.onnx differed from the model by 0.5 cells in one call"
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.onnx"))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["export", "nothing"], "holds no model 'nothing'"),
         (["export", "nothing.ckpt"], "there is no such checkpoint"),
-        (["export", "goop", "--format", "pt2", "--out", "goop.onnx"], "ends in .pt2"),
+        (["export", "goop", "--format", "pt2", "--out", "goop.onnx"], "its name must end in .pt2"),
         (["export", "goop", "--out", "nowhere/goop.onnx"], "the folder nowhere does not exist"),
         (["export", "waterramps"], "Export with --free"),
     ],
