@@ -11,35 +11,61 @@ from typing import Any
 import numpy as np
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.utils.checkpoint import checkpoint
 
-from nmpm._support.collectives import broadcast_from_rank0, global_mean, normal_like, rank_slice
+from nmpm._support.collectives import global_mean, normal_like, rank_slice
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
 from nmpm.emulator.recipe import FORMAT, check_format
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirrored
+from nmpm.training.budget import Budget
 from nmpm.training.losses import position_error
 from nmpm.training.schedules import Schedule
 
 OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  # (jsonargparse knows this form)
 
 CALIBRATION_BATCHES = 4
-CLOCK_EVERY = 16  # steps
 
 
 def adam(parameters: Iterable[Tensor]) -> Optimizer:
     """The paper's optimizer."""
     return torch.optim.Adam(parameters, lr=1e-3)
+
+
+def check_learning_rate(rate: object) -> None:
+    """Make sure that a learning rate, where it is a plain number, is positive and finite.
+
+    Raises:
+        ConfigError: if it is not.
+    """
+    if isinstance(rate, int | float) and not 0 < rate < math.inf:
+        raise ConfigError(f"model.optimizer.lr = {rate} must be a positive number.")
+
+
+def build_optimizer(make: OptimizerCallable, parameters: Iterable[Tensor]) -> Optimizer:
+    """The optimizer of some parameters.
+
+    Raises:
+        ConfigError: if an argument is not allowed, such as a negative learning rate.
+    """
+    try:
+        optimizer = make(parameters)
+    except NmpmError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"model.optimizer does not take its arguments: {error}.") from error
+    for group in optimizer.param_groups:
+        check_learning_rate(group.get("lr"))
+    return optimizer
 
 
 class EmulatorModule(LightningModule):
@@ -106,7 +132,7 @@ class EmulatorModule(LightningModule):
         self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
         self.test_errors = Comparison(scene, chosen)
         self.validated_step = -1
-        self._clock_read = 0.0
+        self._budget: Budget | None = None  # (set with the optimizer)
 
     @classmethod
     def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
@@ -199,16 +225,19 @@ class EmulatorModule(LightningModule):
         self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        optimizer = self.make_optimizer(self.emulator.parameters())
-        total = self._total_steps()
-        if math.isinf(total) and self._timer() is None:
-            raise ConfigError(
-                "The training has no end, as its batches are endless: give --trainer.max_steps N or --trainer.max_time"
-                " DD:HH:MM:SS (or, to count epochs, --trainer.limit_train_batches N)."
-            )
+        """The optimizer, and the schedule of its learning rate.
+
+        Raises:
+            ConfigError: if the learning rate is not a positive number, or the training has no end.
+        """
+        budget = Budget(self.trainer)
+        budget.check()
+        optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
+        steps = budget.steps
         scheduler = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: self.schedule.factor(step, total, self._clock(step))
+            optimizer, lambda step: self.schedule.factor(step, steps, budget.time_share(step))
         )
+        self._budget = budget
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def bundles(self, progress: float) -> int:
@@ -219,33 +248,9 @@ class EmulatorModule(LightningModule):
 
     def _progress(self) -> float:
         """Share of the training that is over, by steps or by the clock, whichever is further."""
-        if not self.unroll_growth:
+        if not self.unroll_growth or self._budget is None:
             return 1.0
-        return max(self.global_step / self._total_steps(), self._clock(self.global_step))
-
-    def _total_steps(self) -> float:
-        """Optimizer steps of the whole training; infinite where nothing but its time is limited."""
-        steps = self.trainer.estimated_stepping_batches  # -1 where epochs are limited and their batches are endless
-        return steps if steps > 0 else math.inf
-
-    def _timer(self) -> Timer | None:
-        """The trainer's `max_time`, if there is one."""
-        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
-        return next((one for one in callbacks if isinstance(one, Timer) and one._duration), None)
-
-    def _clock(self, step: int) -> float:
-        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine.
-
-        By the clock of rank 0: with rates of their own, the ranks' weights would drift apart. Several ranks ask it
-        every `CLOCK_EVERY` steps only, as the answer is read back from the device.
-        """
-        timer = self._timer()
-        if timer is None:
-            return 0.0
-        if self.trainer.world_size == 1 or step % CLOCK_EVERY == 0:
-            elapsed = min(timer.time_elapsed() / (timer._duration or 1.0), 1.0)
-            self._clock_read = broadcast_from_rank0(elapsed, self.trainer.strategy.root_device)
-        return self._clock_read
+        return max(self.global_step / self._budget.steps, self._budget.time_share(self.global_step))
 
     def _unrolled(self, particles: Particles, count: int) -> Iterator[Bundle]:
         if not self.recompute:
