@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 
 from nmpm._support.version import __version__
@@ -58,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; errors that a user can mend are printed without a traceback.
 
     Returns:
-        The exit status: 0 for success, 1 for an error, 2 for a wrong call.
+        The exit status: 0 for success, 1 for an error, 2 for a wrong call, 130 for an interruption.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
@@ -68,12 +69,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"nmpm {__version__}\n")
         return 0
     if words[0] not in COMMANDS:
-        sys.stderr.write(f"nmpm: there is no command {words[0]!r}; there are {', '.join(COMMANDS)}. See nmpm --help.\n")
+        near = get_close_matches(words[0], COMMANDS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(COMMANDS)}."
+        sys.stderr.write(f"nmpm: there is no command {words[0]!r}; {hint} See nmpm --help.\n")
         return 2
-    command: Callable[[list[str]], None] = import_module(COMMANDS[words[0]][0]).run
     try:
-        command(words)
+        command: Callable[[list[str]], int | None] = import_module(COMMANDS[words[0]][0]).run
+        return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
         return 1
-    return 0
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write(f"\nnmpm {words[0]}: {interrupt or 'interrupted.'}\n")
+        return 130

@@ -83,6 +83,29 @@ def check_endless_batches(trainer: Trainer) -> None:
         raise ConfigError(ENDLESS)
 
 
+def time_left(trainer: Trainer, first_step: int, elapsed: float) -> tuple[float, float | None]:
+    """Share of the training that is over, and seconds left; by steps or by time, whichever ends first.
+
+    Args:
+        trainer: Training.
+        first_step: Step at which this process began.
+        elapsed: Seconds since then.
+
+    Returns:
+        The share, in [0, 1], and the seconds, None before the first step where only steps are limited.
+    """
+    budget, taken = Budget(trainer), trainer.global_step - first_step
+    share, left = trainer.global_step / max(budget.steps, 1), None
+    if taken and math.isfinite(budget.steps):
+        left = elapsed / taken * (budget.steps - trainer.global_step)
+    for timer in _timers(trainer):
+        duration = timer._duration or 1.0
+        share = max(share, timer.time_elapsed() / duration)
+        remaining = max(duration - timer.time_elapsed(), 0.0)
+        left = remaining if left is None else min(left, remaining)
+    return min(share, 1.0), left
+
+
 def _timers(trainer: Trainer) -> list[Timer]:
     """Those that limit the training: the trainer's `max_time`, and timers among its callbacks."""
     callbacks = trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)

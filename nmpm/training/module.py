@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
 import numpy as np
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.collectives import global_mean, normal_like, rank_slice
+from nmpm._support.specs import class_path
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
@@ -29,6 +31,7 @@ from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirrored
 from nmpm.training.budget import Budget
 from nmpm.training.losses import position_error
+from nmpm.training.parts import check_same_optimizer, check_same_recipe, check_same_scene
 from nmpm.training.schedules import Schedule
 
 OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  # (jsonargparse knows this form)
@@ -155,7 +158,7 @@ class EmulatorModule(LightningModule):
         """
         theirs = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
         if isinstance(theirs, Scene):
-            _check_same(self.emulator.scene, theirs)
+            check_same_scene(self.emulator.scene, theirs)
 
     def on_fit_start(self) -> None:
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
@@ -168,12 +171,29 @@ class EmulatorModule(LightningModule):
             compile_network(self.emulator.processor, example)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """State the format of the hyperparameters."""
+        """State the format of the hyperparameters, and which optimizer the stored state belongs to."""
         checkpoint["nmpm_format"] = FORMAT
+        if self.trainer.optimizers:
+            checkpoint["nmpm_optimizer"] = class_path(type(self.trainer.optimizers[0]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint that a newer version wrote."""
+        """Compare the checkpoint with this model, and with its optimizer if a training goes on.
+
+        Raises:
+            ConfigError: if a newer version wrote it, or a part differs.
+        """
         check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
+        check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
+        if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
+            self.check_optimizer(checkpoint)
+
+    def check_optimizer(self, checkpoint: Mapping[str, Any]) -> None:
+        """Make sure that a training can go on with a checkpoint's optimizer state.
+
+        Raises:
+            ConfigError: if it is of another optimizer.
+        """
+        check_same_optimizer(checkpoint, build_optimizer(self.make_optimizer, self.emulator.parameters()))
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Make the batch's randomness a function of its number, so that a resumed run repeats it.
@@ -196,7 +216,7 @@ class EmulatorModule(LightningModule):
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
         error = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
         loss, logged = global_mean(error, batch.mask.sum())
-        self.log("train/loss", logged, prog_bar=True)
+        self.log("train/loss", logged)
         return loss
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:
@@ -268,12 +288,3 @@ class EmulatorModule(LightningModule):
         noise = self.position_noise * normal_like(particles.position)
         return particles.moved(particles.position + noise, particles.velocity)
 
-
-def _check_same(mine: Scene, theirs: Scene) -> None:
-    different = mine.differences(theirs)
-    if different:
-        facts = "; ".join(f"{name} = {getattr(mine, name)}, not {getattr(theirs, name)}" for name in different)
-        raise ConfigError(
-            f"The model was made for other scenes than the data's: {facts}. For another box, or other particles, take"
-            " EmulatorModule.of(emulator.over(data.scene)); what else differs needs a model of its own."
-        )

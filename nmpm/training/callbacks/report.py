@@ -111,7 +111,7 @@ class Report(Callback):
                 "seconds": round(self.trained_seconds, 1),
                 "precision": str(trainer.precision),
                 "devices": trainer.world_size,
-                "hardware": hardware(),
+                "hardware": device_name(trainer.strategy.root_device),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
@@ -134,11 +134,13 @@ def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Ten
     return LabelledTrajectories.from_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
 
 
-def hardware() -> str:
-    """What this process computes on, in words."""
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"{_processor()}, {torch.get_num_threads()} threads"
+def device_name(device: torch.device) -> str:
+    """The model of a device: of the GPU, or of the processor with the number of threads that torch uses."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "cpu":
+        return f"{_processor()}, {torch.get_num_threads()} threads"
+    return device.type
 
 
 def _processor() -> str:
