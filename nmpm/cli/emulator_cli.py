@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import operator
+import os
 import shlex
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +47,13 @@ class EmulatorCLI(LightningCLI):
 
     Args:
         words: The command as the user gave it.
-        held: Keeps the run folder's lock.
+        locks: Takes the descriptor of the run folder's lock. (Callbacks that copy the module copy this object too, so
+            it must not hold what cannot be copied.)
         options: Of LightningCLI.
     """
 
-    def __init__(self, words: list[str], held: ExitStack, **options: Any) -> None:
-        self.words, self.held = words, held
+    def __init__(self, words: list[str], locks: list[int], **options: Any) -> None:
+        self.words, self.locks = words, locks
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # (static there)
@@ -130,7 +132,7 @@ class EmulatorCLI(LightningCLI):
             self.model.check_optimizer(resumed)
         if rank_zero_only.rank:
             return
-        self.held.enter_context(self.run_folder.locked())
+        self.locks.append(self.run_folder.lock())
         if resumed is None:
             self.run_folder.check_new()
         weights = sum(parameter.numel() for parameter in self.model.emulator.parameters())
@@ -217,11 +219,12 @@ def run_command(words: list[str], found: list[str]) -> int:
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
     sys.argv = [sys.argv[0], *found]
+    locks: list[int] = []
     try:
-        with ExitStack() as held, quiet_lightning(), _terminated_like_interrupted():
+        with quiet_lightning(), _terminated_like_interrupted():
             EmulatorCLI(
                 words,
-                held,
+                locks,
                 seed_everything_default=0,
                 parser_kwargs={"parser_mode": "omegaconf+"},
                 save_config_kwargs={"overwrite": True},
@@ -235,6 +238,9 @@ def run_command(words: list[str], found: list[str]) -> int:
         if isinstance(ended.__context__, KeyboardInterrupt):  # Lightning's answer to it
             raise ended.__context__ from None
         raise
+    finally:
+        for descriptor in locks:
+            os.close(descriptor)
     return 0
 
 

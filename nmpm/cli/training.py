@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 from nmpm._support.shipped import find_config
@@ -48,7 +49,7 @@ def check_files(words: list[str]) -> None:
     Raises:
         ConfigError: naming the option.
     """
-    options = dict(zip(words, words[1:], strict=False)) | dict(word.split("=", 1) for word in words if "=" in word)
+    options = dict(pairwise(words)) | dict(word.split("=", 1) for word in words if "=" in word)
     for option, kind in FILES.items():
         value = options.get(option)
         if value is not None and value not in CHECKPOINT_NAMES and not Path(value).exists():

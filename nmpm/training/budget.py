@@ -20,45 +20,41 @@ ENDLESS = (
 )
 
 
-class Budget:
-    """The steps and the time that a trainer may spend.
+def total_steps(trainer: Trainer) -> float:
+    """Optimizer steps of the whole training; infinite where nothing but its time is limited. Loads its data."""
+    steps = trainer.estimated_stepping_batches  # -1 where epochs are limited and their batches are endless
+    return math.inf if steps == -1 else steps
 
-    Args:
-        trainer: About to train; its data are loaded when the steps are asked for.
-    """
 
-    def __init__(self, trainer: Trainer) -> None:
-        self.trainer = trainer
+class Clock:
+    """Share of a trainer's time that is over, the same on all ranks."""
+
+    def __init__(self) -> None:
         self._share = 0.0
 
-    @property
-    def steps(self) -> float:
-        """Optimizer steps of the whole training; infinite where nothing but its time is limited."""
-        steps = self.trainer.estimated_stepping_batches  # -1 where epochs are limited and their batches are endless
-        return math.inf if steps == -1 else steps
-
-    def time_share(self, step: int) -> float:
-        """Share of the trainer's time that is over, in [0, 1]; 0 where it is not limited.
+    def share(self, trainer: Trainer, step: int) -> float:
+        """The share at a step, in [0, 1]; 0 where the time is not limited.
 
         All ranks get rank 0's: by clocks of their own, their learning rates and weights would drift apart. Several
         ranks exchange it every `CLOCK_EVERY` steps only.
         """
-        timers = _timers(self.trainer)
+        timers = _timers(trainer)
         if not timers:
             return 0.0
-        if self.trainer.world_size == 1 or step % CLOCK_EVERY == 0:
+        if trainer.world_size == 1 or step % CLOCK_EVERY == 0:
             elapsed = max(timer.time_elapsed() / (timer._duration or 1.0) for timer in timers)
-            self._share = broadcast_from_rank0(min(elapsed, 1.0), self.trainer.strategy.root_device)
+            self._share = broadcast_from_rank0(min(elapsed, 1.0), trainer.strategy.root_device)
         return self._share
 
-    def check(self) -> None:
-        """Make sure that the training ends.
 
-        Raises:
-            ConfigError: if neither its steps nor its time are limited.
-        """
-        if math.isinf(self.steps) and not _stops_by_time(self.trainer):
-            raise ConfigError(ENDLESS)
+def check_end(trainer: Trainer) -> None:
+    """Make sure that a training ends. Loads its data.
+
+    Raises:
+        ConfigError: if neither its steps nor its time are limited.
+    """
+    if math.isinf(total_steps(trainer)) and not _stops_by_time(trainer):
+        raise ConfigError(ENDLESS)
 
 
 def check_endless_batches(trainer: Trainer) -> None:
@@ -94,10 +90,10 @@ def time_left(trainer: Trainer, first_step: int, elapsed: float) -> tuple[float,
     Returns:
         The share, in [0, 1], and the seconds, None before the first step where only steps are limited.
     """
-    budget, taken = Budget(trainer), trainer.global_step - first_step
-    share, left = trainer.global_step / max(budget.steps, 1), None
-    if taken and math.isfinite(budget.steps):
-        left = elapsed / taken * (budget.steps - trainer.global_step)
+    total, taken = total_steps(trainer), trainer.global_step - first_step
+    share, left = trainer.global_step / max(total, 1), None
+    if taken and math.isfinite(total):
+        left = elapsed / taken * (total - trainer.global_step)
     for timer in _timers(trainer):
         duration = timer._duration or 1.0
         share = max(share, timer.time_elapsed() / duration)

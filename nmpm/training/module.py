@@ -29,7 +29,7 @@ from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirrored
-from nmpm.training.budget import Budget
+from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.losses import position_error
 from nmpm.training.parts import check_same_optimizer, check_same_recipe, check_same_scene
 from nmpm.training.schedules import Schedule
@@ -135,7 +135,7 @@ class EmulatorModule(LightningModule):
         self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
         self.test_errors = Comparison(scene, chosen)
         self.validated_step = -1
-        self._budget: Budget | None = None  # (set with the optimizer)
+        self._clock = Clock()
 
     @classmethod
     def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
@@ -250,14 +250,12 @@ class EmulatorModule(LightningModule):
         Raises:
             ConfigError: if the learning rate is not a positive number, or the training has no end.
         """
-        budget = Budget(self.trainer)
-        budget.check()
+        check_end(self.trainer)
         optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
-        steps = budget.steps
+        total = total_steps(self.trainer)
         scheduler = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: self.schedule.factor(step, steps, budget.time_share(step))
+            optimizer, lambda step: self.schedule.factor(step, total, self._clock.share(self.trainer, step))
         )
-        self._budget = budget
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def bundles(self, progress: float) -> int:
@@ -268,9 +266,10 @@ class EmulatorModule(LightningModule):
 
     def _progress(self) -> float:
         """Share of the training that is over, by steps or by the clock, whichever is further."""
-        if not self.unroll_growth or self._budget is None:
+        if not self.unroll_growth:
             return 1.0
-        return max(self.global_step / self._budget.steps, self._budget.time_share(self.global_step))
+        step = self.global_step
+        return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
 
     def _unrolled(self, particles: Particles, count: int) -> Iterator[Bundle]:
         if not self.recompute:
@@ -287,4 +286,3 @@ class EmulatorModule(LightningModule):
             return particles
         noise = self.position_noise * normal_like(particles.position)
         return particles.moved(particles.position + noise, particles.velocity)
-

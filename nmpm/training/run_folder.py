@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,9 +23,8 @@ class RunFolder:
     root: Path
     checkpoints: Mapping[str, Path]
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep other processes from training in this folder.
+    def lock(self) -> int:
+        """Keep other processes from training in this folder until the descriptor that is returned is closed.
 
         The lock is the operating system's: it ends with the process, however it ends. Where the file system has none,
         nothing is locked.
@@ -35,21 +33,21 @@ class RunFolder:
             ConfigError: if another process trains here.
         """
         self.root.mkdir(parents=True, exist_ok=True)
-        with (self.root / ".lock").open("a+") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                file.seek(0)
-                raise ConfigError(
-                    f"Another process ({file.read().strip() or 'unknown'}) is training in {self.root}. Wait for it, or"
-                    " choose another folder with --trainer.default_root_dir."
-                ) from error
-            except OSError:
-                pass
-            file.truncate(0)
-            file.write(f"{os.getpid()}")
-            file.flush()
-            yield
+        descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.read(descriptor, 20).decode() or "unknown"
+            os.close(descriptor)
+            raise ConfigError(
+                f"Another process ({holder}) is training in {self.root}. Wait for it, or choose another folder with"
+                " --trainer.default_root_dir."
+            ) from error
+        except OSError:
+            return descriptor
+        os.truncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+        return descriptor
 
     def check_new(self) -> None:
         """Make sure that no run is written over.

@@ -185,13 +185,6 @@ def test_mistakes_get_one_line_that_says_how_to_mend_them(words, complaint, caps
     assert len(message) < 600
 
 
-def test_an_unknown_key_is_named(capsys):
-    Path("mine.yaml").write_text("model: {widht: 3}\n")
-    with pytest.raises(SystemExit):
-        main(["fit", "--config", "mine.yaml"])
-    assert "widht" in capsys.readouterr().err
-
-
 def test_a_file_here_comes_before_the_shipped_one():
     assert find_config("goop.yaml").parent.name == "configs"
     Path("goop.yaml").write_text("seed_everything: 1\n")

@@ -8,7 +8,10 @@ MISTAKES = [
     (["--model.cels", "32"], "no option --model.cels; did you mean --model.cells?"),
     (["--data.nme", "goop"], "no option --data.nme; did you mean --data.name?"),
     (["--model.constraints.enrgy", "true"], "did you mean --model.constraints.energy?"),
-    (["--model.processor", "nmpm.processors.Unet"], "--model.processor: there is no nmpm.processors.Unet; did you mean"),
+    (
+        ["--model.processor", "nmpm.processors.Unet"],
+        "--model.processor: there is no nmpm.processors.Unet; did you mean",
+    ),
     (["--model.optimizer", "torch.optim.Adm"], "--model.optimizer: there is no torch.optim.Adm; did you mean"),
     (["--model.processor.widht", "3"], "the argument widht is unknown; did you mean width?"),
     (["--trainer.max_steps", "abc"], "--trainer.max_steps: abc is not of type int"),

@@ -1,4 +1,4 @@
-"""Every limit that Lightning allows either ends the training with its learning rate at zero, or is refused in a line."""
+"""Every limit that Lightning allows either ends the training with its learning rate at zero, or is refused."""
 
 import functools
 import math
@@ -105,5 +105,5 @@ def test_a_timer_that_waits_for_the_end_of_an_endless_epoch_does_not_count(tmp_p
 @pytest.mark.parametrize("kind", [torch.optim.Adam, SOAP])
 def test_learning_rates_that_are_not_positive_are_refused(make_dataset, tmp_path, kind, rate):
     data = data_of(make_dataset())
-    with pytest.raises(ConfigError, match="must be a positive number|Invalid learning rate"):
+    with pytest.raises(ConfigError, match=r"must be a positive number|Invalid learning rate"):
         trainer_with(tmp_path, max_steps=1).fit(module_of(data, optimizer=functools.partial(kind, lr=rate)), data)

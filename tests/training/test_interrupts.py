@@ -106,9 +106,9 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from nmpm.training.run_folder import RunFolder
-with RunFolder(Path(sys.argv[1]), {}).locked():
-    print("locked", flush=True)
-    time.sleep(60)
+RunFolder(Path(sys.argv[1]), {}).lock()
+print("locked", flush=True)
+time.sleep(60)
 """
 
 
@@ -116,16 +116,17 @@ def test_a_folder_is_trained_in_by_one_process_and_free_again_when_that_is_kille
     held = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     try:
         assert held.stdout.readline() == "locked\n"
-        with pytest.raises(ConfigError, match=rf"process \({held.pid}\) is training in"), folder_of(tmp_path).locked():
-            pass
+        with pytest.raises(ConfigError, match=rf"process \({held.pid}\) is training in"):
+            folder_of(tmp_path).lock()
     finally:
         held.kill()
         held.wait()
-    with folder_of(tmp_path).locked():
-        pass
+    os.close(folder_of(tmp_path).lock())
 
 
-@pytest.mark.parametrize("left", ["checkpoints/best.ckpt", "checkpoints/last.ckpt", "report.json", "logs/a/metrics.csv"])
+@pytest.mark.parametrize(
+    "left", ["checkpoints/best.ckpt", "checkpoints/last.ckpt", "report.json", "logs/a/metrics.csv"]
+)
 def test_what_a_run_left_is_not_written_over(tmp_path, left):
     folder = folder_of(tmp_path)
     folder.check_new()

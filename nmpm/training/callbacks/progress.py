@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from datetime import timedelta
 from typing import Any
@@ -11,7 +12,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.trainer.states import TrainerFn
 from tqdm import tqdm
 
-from nmpm.training.budget import time_left
+from nmpm.training.budget import time_left, total_steps
 
 SCALE = 1000
 """Of the bar's length: it shows the share that is over, of steps or time, whichever is further."""
@@ -58,7 +59,7 @@ class Progress(ProgressBar):
             self._loss = "" if loss is None else f"loss {float(loss):.3g}"
         self._show_step(trainer)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self._show_step(trainer)
         self._close()
 
@@ -116,8 +117,8 @@ class Progress(ProgressBar):
             trainer: Training.
             left: Seconds left; None where not known yet.
         """
-        total = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
-        of = f"/{int(total)}" if 0 < total < float("inf") else ""
+        total = total_steps(trainer)
+        of = f"/{int(total)}" if math.isfinite(total) else ""
         eta = "" if left is None else f"{timedelta(seconds=round(left))} left"
         parts = (f"{self._doing}: step {trainer.global_step}{of}", eta, self._loss, self._valid)
         return ", ".join(part for part in parts if part)
