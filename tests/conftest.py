@@ -1,4 +1,4 @@
-"""Data that several rooms test with: recorded trajectories where there are any, tiny made-up ones everywhere."""
+"""The option --device, and data for tests: recorded trajectories where there are any, tiny made-up ones everywhere."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -6,10 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 
 Sizes = Sequence[tuple[int, int]]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", help="where tests that take the fixture `device` run, e.g. cuda")
+
+
+@pytest.fixture(scope="session")
+def device(pytestconfig: pytest.Config) -> torch.device:
+    """Where contracts of emulators, transfers and processors are tested."""
+    chosen = torch.device(pytestconfig.getoption("--device"))
+    if chosen.type == "cuda" and not torch.cuda.is_available():
+        pytest.skip("--device cuda: this machine has no GPU that torch can use")
+    return chosen
 
 
 @pytest.fixture(scope="session")
