@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from jsonargparse import set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
@@ -130,7 +130,7 @@ class EmulatorCLI(LightningCLI):
         resumed = self._load_checkpoint()
         if resumed is not None:
             self.model.check_optimizer(resumed)
-        if rank_zero_only.rank:
+        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         self.locks.append(self.run_folder.lock())
         if resumed is None:

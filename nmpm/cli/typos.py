@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import sys
 from collections.abc import Iterable, Iterator
@@ -78,5 +77,4 @@ def _part_arguments() -> Iterator[tuple[str, str]]:
     """Arguments of processors, transfers and decoders, and the options that set them."""
     for part, base in PARTS.items():
         for kind in base.__subclasses__():
-            if dataclasses.is_dataclass(kind):
-                yield from ((field.name, f"model.{part}.{field.name}") for field in dataclasses.fields(kind))
+            yield from ((name, f"model.{part}.{name}") for name in vars(kind).get("__dataclass_fields__", ()))

@@ -1,8 +1,8 @@
 """Every shipped configuration on torch's `meta` device, which stands in for a GPU on a machine without one.
 
-Its tensors hold no values: mixing them with tensors of the CPU raises, and so does reading one back. Its order is
-Lightning's: `setup` with the model still on the host, then the move to the device, then `on_fit_start` with windows that
-are on the device.
+Its tensors hold no values: mixing them with tensors of the CPU raises, and so does reading one back. The order is
+Lightning's: `setup` with the model still on the host, then the move to the device, then `on_fit_start` with windows
+that are on the device.
 """
 
 import contextlib

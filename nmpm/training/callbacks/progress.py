@@ -9,8 +9,8 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 from lightning.pytorch.trainer.states import TrainerFn
-from tqdm import tqdm
 
 from nmpm.training.budget import time_left, total_steps
 
@@ -31,7 +31,7 @@ class Progress(ProgressBar):
     def __init__(self) -> None:
         super().__init__()
         self._enabled = True
-        self._bar: tqdm[Any] | None = None
+        self._bar: Tqdm | None = None
         self._doing = self._loss = self._valid = ""
         self._first_step = 0
 
@@ -132,10 +132,10 @@ class Progress(ProgressBar):
         bar.update(max(0, min(SCALE, round(SCALE * share)) - bar.n))
         bar.update(0)
 
-    def _open(self, what: str, total: float, keep: bool = False) -> tqdm[Any]:
+    def _open(self, what: str, total: float, keep: bool = False) -> Tqdm:
         form = "{percentage:3.0f}% |{bar:20}| {desc}" if keep else "{desc} {n_fmt}/{total_fmt}"
         pause = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS
-        return tqdm(
+        return Tqdm(
             desc=what,
             total=total,
             leave=keep,
