@@ -31,9 +31,9 @@ def recorded() -> Path:
     """The folder of recorded trajectories."""
     folder = os.environ.get("NMPM_TEST_DATA")
     if not folder:
-        pytest.skip("recorded trajectories are not at hand: NMPM_TEST_DATA is not set")
+        pytest.skip("NMPM_TEST_DATA is not set")
     if not Path(folder).is_dir():
-        pytest.skip(f"recorded trajectories are not at hand: NMPM_TEST_DATA={folder} is no folder")
+        pytest.skip(f"NMPM_TEST_DATA={folder} is no folder")
     return Path(folder)
 
 

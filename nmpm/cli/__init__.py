@@ -16,18 +16,18 @@ COMMANDS = {
     "test": ("nmpm.cli.training", "Roll a checkpoint out over the test split; write table, picture and animation."),
     "predict": ("nmpm.cli.training", "Roll a checkpoint out over the test split and write the trajectories."),
     "simulate": ("nmpm.cli.simulate", "Simulate a dataset of one of the shipped scenes, or of one's own."),
-    "convert": ("nmpm.cli.convert", "Bring a dataset of another format into the native layout."),
-    "inspect": ("nmpm.cli.inspect", "Say on one screen what a dataset holds, and what is odd about it."),
+    "convert": ("nmpm.cli.convert", "Convert a dataset of another format to the native layout."),
+    "inspect": ("nmpm.cli.inspect", "Summarise a dataset on one screen, with anything odd about it."),
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
-    "stress": ("nmpm.cli.stress", "Put a model through the extremes: pass or fail, with measured margins."),
+    "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
 }
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]
 
-Emulators of particle simulations on a grid: train them, judge them by rollouts, use pretrained ones.
+Emulators of particle simulations on a grid: train them, evaluate them by rollouts, use pretrained ones.
 
 commands:
 {commands}
@@ -35,12 +35,12 @@ commands:
 first steps:
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --config goop.yaml --ckpt_path last go on after an interruption
-  nmpm inspect FOLDER                          look at recorded data, of any format that convert reads
+  nmpm inspect FOLDER                          summarise recorded data of any format that convert reads
   nmpm fit --config waterdrop.yaml --data.path FOLDER
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
-  nmpm render out.h5                           draw what came out
-  nmpm stress goop                             see what breaks it
+  nmpm render out.h5                           draw the rollout
+  nmpm stress goop                             test it at the extremes
 
 Add --help to any command for its options; fit --print_config prints a whole configuration.
 A --config that is not a file in the working directory is looked up among the shipped ones: {configs}.
@@ -56,7 +56,7 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; errors that a user can mend are printed without a traceback.
+    """Run a command; errors that a user can correct are printed without a traceback.
 
     Returns:
         The exit status: 0 for success, 1 for an error, 2 for a wrong call, 130 for an interruption.

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 REMARKS = re.compile(
     "|".join(
         (
-            r"Seed set to",
+            r"(\[rank: \d+\] )?Seed set to",
+            r"Found current_model_state in the checkpoint",
             r"Using .*(Automatic Mixed Precision|precision)",
             r"(GPU|TPU|HPU|IPU) available: ",
             r"LOCAL_RANK: ",

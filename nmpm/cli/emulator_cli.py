@@ -30,7 +30,7 @@ from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from nmpm.training.callbacks.progress import Progress
-from nmpm.training.callbacks.report import Report, device_name
+from nmpm.training.callbacks.report import ReportWriter, device_name
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.module import EmulatorModule, check_learning_rate
@@ -101,7 +101,7 @@ class EmulatorCLI(LightningCLI):
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(Progress())
         self.stop_on_signal = StopOnSignal(self._checkpoint_file("resume"))
-        guards = [DivergenceGuard(), Report(), PredictionWriter(), self.stop_on_signal]
+        guards = [DivergenceGuard(), ReportWriter(), PredictionWriter(), self.stop_on_signal]
         kwargs["callbacks"] = [*callbacks, *guards]
         return super().instantiate_trainer(**kwargs)
 
@@ -185,12 +185,10 @@ class EmulatorCLI(LightningCLI):
         if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor:
             if self.model.validated_step < self.trainer.global_step:
                 self._validate_last_weights(checkpoint)
-            best = checkpoint.best_model_path
-        else:
-            best = ""
-        self.trainer.test(
-            self.model, datamodule=self.datamodule, ckpt_path=best or None, verbose=False, weights_only=True
-        )
+            # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
+            if checkpoint.best_model_path:
+                self.model.load_state_dict(read_checkpoint(Path(checkpoint.best_model_path))["state_dict"])
+        self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
 
     def _validate_last_weights(self, checkpoint: ModelCheckpoint) -> None:
         self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)

@@ -28,7 +28,7 @@ from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
-from nmpm.training.augmentation import check_mirrors, mirrored
+from nmpm.training.augmentation import check_mirrors, mirror_windows
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.losses import position_error
 from nmpm.training.parts import check_same_optimizer, check_same_recipe, check_same_scene
@@ -72,7 +72,7 @@ def build_optimizer(make: OptimizerCallable, parameters: Iterable[Tensor]) -> Op
 
 
 class EmulatorModule(LightningModule):
-    """Trains an emulator on windows and judges it by rollouts.
+    """Trains an emulator on windows; validates and tests it by full rollouts.
 
     Args:
         scene: The facts of the scenes; from the command line it comes from the data.
@@ -139,11 +139,14 @@ class EmulatorModule(LightningModule):
 
     @classmethod
     def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
-        """A module that trains a copy of an emulator, with its weights and statistics.
+        """A module that trains a copy of an emulator: `EmulatorModule.of(Zoo.load("goop").emulator, unroll=4)`.
+
+        The copy starts with the emulator's weights and normalisation statistics; the original stays as it is.
 
         Args:
-            emulator: For example `Zoo.load("goop").emulator`.
-            options: Further arguments of the constructor, such as `unroll` and `optimizer`.
+            emulator: Trained before; of the zoo, or `load_module(path).emulator`.
+            options: Arguments of the constructor, such as `unroll` and `optimizer`; those of the recipe replace the
+                emulator's own, for example its `constraints`.
         """
         recipe = {field.name: getattr(emulator.recipe, field.name) for field in dataclasses.fields(emulator.recipe)}
         module = cls(**(recipe | options))
@@ -151,14 +154,14 @@ class EmulatorModule(LightningModule):
         return module
 
     def setup(self, stage: str) -> None:  # noqa: ARG002
-        """Check that the data are of the model's scene.
+        """Make sure that the data are of the model's scene.
 
         Raises:
-            ConfigError: if the data's scene is another.
+            ConfigError: naming the facts in which they differ.
         """
-        theirs = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
-        if isinstance(theirs, Scene):
-            check_same_scene(self.emulator.scene, theirs)
+        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        if isinstance(scene, Scene):
+            check_same_scene(self.emulator.scene, scene)
 
     def on_fit_start(self) -> None:
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
@@ -196,23 +199,23 @@ class EmulatorModule(LightningModule):
         check_same_optimizer(checkpoint, build_optimizer(self.make_optimizer, self.emulator.parameters()))
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
-        """Make the batch's randomness a function of its number, so that a resumed run repeats it.
+        """Seed the batch's random numbers by its index, so that a resumed run repeats them.
 
-        It is the same for all processes: each takes its own rows of what is drawn for all.
+        All ranks use the same seed: each takes its own rows of the numbers drawn for all.
         """
         entropy = (self.seed, 0, self.trainer.fit_loop.total_batch_idx)
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
-        """This process's part of the mean error over the particles of all processes, which is what is logged.
+        """This rank's part of the mean position error over the particles of all ranks, which is logged.
 
         Over several batches (`accumulate_grad_batches`) Lightning takes the plain mean, so that a particle weighs a
-        little more in a batch with fewer.
+        little more in a batch with fewer particles.
         """
         for axis in self.mirror:
-            chances = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
-            batch = mirrored(batch, self.emulator.scene, axis, chances < 0.5)
-        bundles = self._unrolled(self._perturbed(batch.initial), self.bundles(self._progress()))
+            draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
+            batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
+        bundles = self._unroll(self._add_position_noise(batch.initial), self.bundles(self._progress()))
         predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
         error = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, self.emulator.grid)
         loss, logged = global_mean(error, batch.mask.sum())
@@ -259,7 +262,7 @@ class EmulatorModule(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def bundles(self, progress: float) -> int:
-        """How many bundles a step unrolls when this share of the training is over."""
+        """Number of bundles that a step unrolls once this share of the training is over."""
         if progress >= self.unroll_growth:
             return self.unroll
         return 1 + int((self.unroll - 1) * progress / self.unroll_growth)
@@ -271,7 +274,7 @@ class EmulatorModule(LightningModule):
         step = self.global_step
         return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
 
-    def _unrolled(self, particles: Particles, count: int) -> Iterator[Bundle]:
+    def _unroll(self, particles: Particles, count: int) -> Iterator[Bundle]:
         if not self.recompute:
             yield from unroll(self.emulator, particles, count)
             return
@@ -281,7 +284,7 @@ class EmulatorModule(LightningModule):
             yield bundle
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
-    def _perturbed(self, particles: Particles) -> Particles:
+    def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
             return particles
         noise = self.position_noise * normal_like(particles.position)

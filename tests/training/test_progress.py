@@ -12,7 +12,7 @@ from test_training import Questions, data_of, module_of
 from nmpm.optimizers import SOAP
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.progress import Progress
-from nmpm.training.callbacks.report import Report
+from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 
 
@@ -53,7 +53,7 @@ def test_values_are_read_back_at_the_start_at_logged_steps_and_at_the_end_alone(
         LearningRateMonitor("step"),
         Progress(),
         DivergenceGuard(),
-        Report(),
+        ReportWriter(),
         StopOnSignal(tmp_path / "last.ckpt"),
     ]
     trainer = trainer_with(tmp_path, *guards, max_steps=25, precision="bf16-mixed")

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nmpm.training.callbacks.report import Report, device_name
+from nmpm.training.callbacks.report import ReportWriter, device_name
 
 
 def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
@@ -26,5 +26,5 @@ def test_a_report_names_the_device_that_the_trainer_used(monkeypatch, device, na
         precision="32-true",
         world_size=1,
     )
-    figures = Report()._figures(trainer, SimpleNamespace(emulator=emulator, unroll=2), {})
+    figures = ReportWriter()._figures(trainer, SimpleNamespace(emulator=emulator, unroll=2), {})
     assert name in figures["training"]["hardware"]
