@@ -43,7 +43,7 @@ def data_of(folder: Path, **options) -> TrajectoryDataModule:
 
 
 def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = None, **options) -> dict:
-    """Train, keep the last checkpoint in the file `last`, and give the record."""
+    """Train, write the last checkpoint to the file `last`, and return the record."""
     module = data_of(folder, **options.pop("data", {}))
     model = {"unroll": 2, "position_noise": 1e-4, "grid_noise": 0.01, "mirror": (0,)} | options.pop("model", {})
     if options.pop("soap", False):

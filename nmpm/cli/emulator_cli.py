@@ -168,9 +168,11 @@ class EmulatorCLI(LightningCLI):
         try:
             self.trainer.fit(**options)
         except SystemExit as ended:
-            if isinstance(ended.__context__, KeyboardInterrupt):
+            if not isinstance(ended.__context__, KeyboardInterrupt):
+                raise
+            if self.trainer.is_global_zero:
                 raise KeyboardInterrupt(self._how_to_go_on()) from None
-            raise
+            raise SystemExit(130) from None
 
     def _how_to_go_on(self) -> str:
         step = self.stop_on_signal.saved_step

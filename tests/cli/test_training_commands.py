@@ -169,6 +169,10 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]) == 0
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data]) == 1
     assert "--ckpt_path last" in capsys.readouterr().err
+    changed = ["--model.processor.width", "8", "--ckpt_path", "last"]
+    for command in ("fit", "test"):
+        assert main([command, "--config", "waterdrop.yaml", *TINY, *data, *changed]) == 1
+        assert "The checkpoint has model.processor.width = 32, not 8." in capsys.readouterr().err
     more = ["--trainer.max_steps", "4", "--ckpt_path", "last", "--resume.every_n_train_steps", "1"]
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *more]) == 0
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 4
@@ -220,6 +224,15 @@ def test_configurations_are_laid_over_one_another_and_refer_to_other_values(make
         (["fit", "--config", "waterdrop.yaml", "--data.path", "nowhere"], r"nowhere"),
         (["fit", "--config", "goop.yaml", *TINY_GOOP, "--model.cells", "4"], r"too small for a U-Net of depth 3"),
         (["fit", "--config", "goop.yaml", *TINY, *TINY_GOOP, "--model.unroll", "20"], r"frames.*needs 162"),
+        # before the whole goop is simulated
+        (["fit", "--config", "goop.yaml", "--model.optimizer.lr", "-1"], r"lr = -1.0 must be a positive number"),
+        (["fit", "--config", "goop.yaml", "--trainer.max_steps", "-1", "--trainer.max_time", "null"], "has no end"),
+        (["fit", "--config", "goop.yaml", "--trainer.limit_train_batches", "0.5"], "0.5 is a share"),
+        (["fit", "--config", "goop.yaml", "--ckpt_path", "last"], r"no runs/goop/checkpoints/last\.ckpt"),
+        (
+            ["fit", "--config", "goop.yaml", "--ckpt_path", "nowhere.ckpt"],
+            r"--ckpt_path nowhere\.ckpt: there is no such",
+        ),
     ],
 )
 def test_mistakes_get_one_line_that_says_how_to_mend_them(words, complaint, capsys):

@@ -141,24 +141,28 @@ def test_what_a_run_left_is_not_written_over(tmp_path, left):
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_a_terminal_saves_the_run_before_its_first_checkpoint(make_dataset, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("kind", "devices"), [(signal.SIGINT, 1), (signal.SIGTERM, 2)])
+def test_a_signal_saves_the_run_of_one_or_two_processes(make_dataset, tmp_path, monkeypatch, kind, devices):
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text("seed_everything: 1\n")
     sizes = ((40, 9),) * 2
     data = ["--data.path", str(make_dataset(train=sizes, valid=sizes, test=sizes))]
     long = ["--trainer.max_steps", "100000", "--trainer.log_every_n_steps", "1", "--resume.every_n_train_steps", "9999"]
-    words = [sys.executable, "-m", "nmpm", *FIT, *data, *long, "--trainer.default_root_dir", "run"]
-    run = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    spread = ["--trainer.devices", str(devices), "--trainer.strategy", "ddp" if devices > 1 else "auto"]
+    words = [sys.executable, "-m", "nmpm", *FIT, *data, *long, *spread, "--trainer.default_root_dir", "run"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    run = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True)
     try:
         end = time.monotonic() + 120
         while not list(Path("run").glob("logs/*/events*")) and time.monotonic() < end:
             time.sleep(0.1)
         time.sleep(2)
-        run.send_signal(signal.SIGINT)
+        run.send_signal(kind)
         _, said = run.communicate(timeout=60)
     finally:
-        run.kill()
+        if run.poll() is None:
+            os.killpg(run.pid, signal.SIGKILL)
     assert run.returncode == 130
-    assert "Go on with: nmpm fit" in said
+    assert said.count("Go on with: nmpm fit") == 1
     assert "Traceback" not in said
     assert Path("run/checkpoints/last.ckpt").is_file()
