@@ -9,7 +9,7 @@ from nmpm._support.shipped import find_config
 from nmpm.errors import ConfigError
 
 FILES = {"--data.path": "dataset", "--ckpt_path": "checkpoint"}
-CHECKPOINT_NAMES = ("last", "best")
+NOT_FILES = ("last", "best", "null")
 
 
 def run(words: list[str]) -> int:
@@ -52,5 +52,5 @@ def check_files(words: list[str]) -> None:
     options = dict(pairwise(words)) | dict(word.split("=", 1) for word in words if "=" in word)
     for option, kind in FILES.items():
         value = options.get(option)
-        if value is not None and value not in CHECKPOINT_NAMES and not Path(value).exists():
+        if value is not None and value not in NOT_FILES and not Path(value).exists():
             raise ConfigError(f"{option} {value}: there is no such {kind}.")
