@@ -13,8 +13,8 @@ from nmpm.errors import ConfigError
 class SOAP(pytorch_optimizer.SOAP):
     """Adam in the eigenbasis of Shampoo's preconditioner, by `pytorch_optimizer`, with defaults for grid networks.
 
-    Source: N. Vyas et al., SOAP: Improving and Stabilizing Shampoo using Adam, arXiv 2409.11321. What it is worth is
-    measured in `benchmarks/README.md`.
+    Source: N. Vyas et al., SOAP: Improving and Stabilizing Shampoo using Adam, arXiv 2409.11321. Compared with Adam
+    in `benchmarks/README.md`.
 
     Args:
         params: Of an emulator.
@@ -24,7 +24,7 @@ class SOAP(pytorch_optimizer.SOAP):
         precondition_frequency: Steps between changes of basis.
 
     Raises:
-        ConfigError: if weights are complex.
+        ConfigError: if the learning rate is not positive, or weights are complex.
     """
 
     def __init__(
@@ -35,6 +35,8 @@ class SOAP(pytorch_optimizer.SOAP):
         max_precondition_dim: int = 600,
         precondition_frequency: int = 10,
     ) -> None:
+        if not lr > 0:
+            raise ConfigError(f"SOAP: lr = {lr} must be a positive number.")
         weights = list(params)
         if any(weight.is_complex() for weight in weights):
             raise ConfigError(

@@ -1,4 +1,4 @@
-"""Data that several rooms test with: recorded trajectories where there are any, tiny made-up ones everywhere."""
+"""The option --device, and data for tests: recorded trajectories where there are any, tiny made-up ones everywhere."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -6,10 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 
 Sizes = Sequence[tuple[int, int]]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", help="where tests that take the fixture `device` run, e.g. cuda")
+
+
+@pytest.fixture(scope="session")
+def device(pytestconfig: pytest.Config) -> torch.device:
+    """Where contracts of emulators, transfers and processors are tested."""
+    chosen = torch.device(pytestconfig.getoption("--device"))
+    if chosen.type == "cuda" and not torch.cuda.is_available():
+        pytest.skip("--device cuda: this machine has no GPU that torch can use")
+    return chosen
 
 
 @pytest.fixture(scope="session")
@@ -17,9 +31,9 @@ def recorded() -> Path:
     """The folder of recorded trajectories."""
     folder = os.environ.get("NMPM_TEST_DATA")
     if not folder:
-        pytest.skip("recorded trajectories are not at hand: NMPM_TEST_DATA is not set")
+        pytest.skip("NMPM_TEST_DATA is not set")
     if not Path(folder).is_dir():
-        pytest.skip(f"recorded trajectories are not at hand: NMPM_TEST_DATA={folder} is no folder")
+        pytest.skip(f"NMPM_TEST_DATA={folder} is no folder")
     return Path(folder)
 
 

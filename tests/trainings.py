@@ -1,4 +1,4 @@
-"""Small trainings that keep a diary; run as a script (by torchrun) it does those of a JSON file in each process."""
+"""Small trainings that record each batch; as a script (under torchrun) it runs those of a JSON file on each rank."""
 
 import json
 import sys
@@ -17,19 +17,19 @@ from nmpm.training.schedules import Schedule
 TINY = UNet(width=4, depth=1, perceptron=(4,))
 
 
-def signs(batch: Window) -> list[str]:
-    """What tells the windows of a batch apart."""
+def fingerprints(batch: Window) -> list[str]:
+    """One number for each window of a batch, as text, that tells the windows apart."""
     return [f"{total:.10g}" for total in batch.frames.double().sum((1, 2, 3)).tolist()]
 
 
-class Diary(lightning.Callback):
-    """Notes the windows, loss, learning rate and seed of every batch."""
+class Record(lightning.Callback):
+    """Keeps the windows, loss, learning rate and seed of every batch."""
 
     def __init__(self):
         self.windows, self.losses, self.rates, self.seeds = [], [], [], []
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        self.windows.append(signs(batch))
+        self.windows.append(fingerprints(batch))
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
         self.seeds.append(torch.initial_seed())
@@ -43,7 +43,7 @@ def data_of(folder: Path, **options) -> TrajectoryDataModule:
 
 
 def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = None, **options) -> dict:
-    """Train, keep the last checkpoint in the file `last`, and give the diary."""
+    """Train, write the last checkpoint to the file `last`, and return the record."""
     module = data_of(folder, **options.pop("data", {}))
     model = {"unroll": 2, "position_noise": 1e-4, "grid_noise": 0.01, "mirror": (0,)} | options.pop("model", {})
     if options.pop("soap", False):
@@ -52,13 +52,13 @@ def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = N
     schedule = Schedule(warmup=30)
     emulator = EmulatorModule(module.scene, cells=8, frames=2, processor=TINY, schedule=schedule, **model)
     emulator.emulator.calibrated.fill_(options.pop("calibrated", False))
-    diary = Diary()
+    record = Record()
     trainer = lightning.Trainer(
         accelerator="cpu",
         devices=devices,
         strategy="ddp" if devices > 1 else "auto",
         default_root_dir=last.parent,
-        callbacks=[diary],
+        callbacks=[record],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -70,10 +70,10 @@ def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = N
     trainer.save_checkpoint(last)
     weights = torch.cat([value.double().flatten() for value in emulator.state_dict().values()])
     return {
-        "losses": diary.losses,
-        "windows": diary.windows,
-        "rates": diary.rates,
-        "seeds": diary.seeds,
+        "losses": record.losses,
+        "windows": record.windows,
+        "rates": record.rates,
+        "seeds": record.seeds,
         "weights": weights.tolist(),
         "rank": trainer.global_rank,
     }
@@ -83,5 +83,5 @@ if __name__ == "__main__":
     plan = Path(sys.argv[1])
     for name, run in json.loads(plan.read_text()).items():
         before = run.pop("ckpt_path", None)
-        told = train(Path(run.pop("folder")), plan.parent / f"{name}.ckpt", 2, before and Path(before), **run)
-        (plan.parent / f"{name}-{told['rank']}.json").write_text(json.dumps(told))
+        record = train(Path(run.pop("folder")), plan.parent / f"{name}.ckpt", 2, before and Path(before), **run)
+        (plan.parent / f"{name}-{record['rank']}.json").write_text(json.dumps(record))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 
 from nmpm._support.version import __version__
@@ -15,18 +16,18 @@ COMMANDS = {
     "test": ("nmpm.cli.training", "Roll a checkpoint out over the test split; write table, picture and animation."),
     "predict": ("nmpm.cli.training", "Roll a checkpoint out over the test split and write the trajectories."),
     "simulate": ("nmpm.cli.simulate", "Simulate a dataset of one of the shipped scenes, or of one's own."),
-    "convert": ("nmpm.cli.convert", "Bring a dataset of another format into the native layout."),
-    "inspect": ("nmpm.cli.inspect", "Say on one screen what a dataset holds, and what is odd about it."),
+    "convert": ("nmpm.cli.convert", "Convert a dataset of another format to the native layout."),
+    "inspect": ("nmpm.cli.inspect", "Summarise a dataset on one screen, with anything odd about it."),
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
-    "stress": ("nmpm.cli.stress", "Put a model through the extremes: pass or fail, with measured margins."),
+    "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
 }
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]
 
-Emulators of particle simulations on a grid: train them, judge them by rollouts, use pretrained ones.
+Emulators of particle simulations on a grid: train them, evaluate them by rollouts, use pretrained ones.
 
 commands:
 {commands}
@@ -34,12 +35,12 @@ commands:
 first steps:
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --config goop.yaml --ckpt_path last go on after an interruption
-  nmpm inspect FOLDER                          look at recorded data, of any format that convert reads
+  nmpm inspect FOLDER                          summarise recorded data of any format that convert reads
   nmpm fit --config waterdrop.yaml --data.path FOLDER
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
-  nmpm render out.h5                           draw what came out
-  nmpm stress goop                             see what breaks it
+  nmpm render out.h5                           draw the rollout
+  nmpm stress goop                             test it at the extremes
 
 Add --help to any command for its options; fit --print_config prints a whole configuration.
 A --config that is not a file in the working directory is looked up among the shipped ones: {configs}.
@@ -55,10 +56,10 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; errors that a user can mend are printed without a traceback.
+    """Run a command; errors that a user can correct are printed without a traceback.
 
     Returns:
-        The exit status: 0 for success, 1 for an error, 2 for a wrong call.
+        The exit status: 0 for success, 1 for an error, 2 for a wrong call, 130 for an interruption.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
@@ -68,12 +69,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"nmpm {__version__}\n")
         return 0
     if words[0] not in COMMANDS:
-        sys.stderr.write(f"nmpm: there is no command {words[0]!r}; there are {', '.join(COMMANDS)}. See nmpm --help.\n")
+        near = get_close_matches(words[0], COMMANDS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(COMMANDS)}."
+        sys.stderr.write(f"nmpm: there is no command {words[0]!r}; {hint} See nmpm --help.\n")
         return 2
-    command: Callable[[list[str]], None] = import_module(COMMANDS[words[0]][0]).run
     try:
-        command(words)
+        command: Callable[[list[str]], int | None] = import_module(COMMANDS[words[0]][0]).run
+        return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
         return 1
-    return 0
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write(f"\nnmpm {words[0]}: {interrupt or 'interrupted.'}\n")
+        return 130

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nmpm._support.collectives import all_gather
+from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Window
@@ -71,7 +71,12 @@ def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:
     axes = (0, *range(2, state.dim()))
     cells = state.numel() // state.shape[1]
     figures = (state.mean(axes), state.std(axes), state.amin(axes), state.amax(axes))
-    return _Inputs(cells, *(values.cpu() for values in figures))  # processes have devices of their own
+    return _Inputs(cells, *map(_shareable, figures))
+
+
+def _shareable(values: Tensor) -> Tensor:
+    """The values on the CPU, where several processes with devices of their own combine them; else where they are."""
+    return values.cpu() if rank_and_world_size()[1] > 1 else values
 
 
 def _combined(parts: Sequence[_Inputs]) -> _Inputs:
@@ -104,7 +109,7 @@ def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
     for index in range(len(emulator.scene.materials)):
         chosen = [window.mask & (window.material == index) for window in windows]
         values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(unknown, chosen, strict=True)])
-        found.append(_Unknowns(len(values), values.square().mean(0).cpu()))
+        found.append(_Unknowns(len(values), _shareable(values.square().mean(0))))
     return found
 
 

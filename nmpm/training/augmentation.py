@@ -1,4 +1,4 @@
-"""Exact symmetries of scenes, used to show the network more than was recorded."""
+"""Data augmentation by exact symmetries of scenes: mirror images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def check_mirrors(scene: Scene, axes: Sequence[int]) -> None:
     """Make sure that a mirror image along each axis is a scene of the same family.
 
     Raises:
-        ConfigError: if an axis does not exist, or a gravity that the model is not told of acts along it.
+        ConfigError: if an axis does not exist, or gravity acts along it and is not an input of the model.
     """
     for axis in axes:
         if not 0 <= axis < scene.dim:
@@ -29,26 +29,26 @@ def check_mirrors(scene: Scene, axes: Sequence[int]) -> None:
             )
 
 
-def mirrored(window: Window, scene: Scene, axis: int, chosen: Tensor) -> Window:
-    """Windows of which some are replaced by their mirror image along an axis, about the domain's middle.
+def mirror_windows(window: Window, scene: Scene, axis: int, chosen: Tensor) -> Window:
+    """Replace some windows by their mirror image along an axis, about the domain's middle.
 
     Args:
         window: B windows.
         scene: Gives the domain.
-        axis: Which axis to turn round.
-        chosen: (B,) bool, which windows to turn.
+        axis: Which axis to mirror.
+        chosen: (B,) bool, which windows to mirror.
     """
     middle = sum(scene.domain[axis]) / 2
     return dataclasses.replace(
         window,
-        frames=_turned(window.frames, axis, middle, chosen),
-        obstacle=_turned(window.obstacle, axis, middle, chosen),
-        gravity=_turned(window.gravity, axis, 0.0, chosen),
+        frames=_reflect(window.frames, axis, middle, chosen),
+        obstacle=_reflect(window.obstacle, axis, middle, chosen),
+        gravity=_reflect(window.gravity, axis, 0.0, chosen),
     )
 
 
-def _turned(values: Tensor, axis: int, middle: float, chosen: Tensor) -> Tensor:
-    """Vectors (B, …, D) with one component of the chosen ones reflected about `middle`."""
+def _reflect(values: Tensor, axis: int, middle: float, chosen: Tensor) -> Tensor:
+    """Reflect one component of the chosen vectors (B, …, D) about `middle`."""
     reflected = values.clone()
     reflected[..., axis] = 2 * middle - values[..., axis]
     return torch.where(chosen.reshape(-1, *(1,) * (values.dim() - 1)), reflected, values)

@@ -1,4 +1,4 @@
-"""Read checkpoints as tensors and plain data; nothing in them is executed."""
+"""Read checkpoints as tensors and plain data, without executing anything in them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from nmpm.errors import DataError
 from nmpm.training.module import EmulatorModule
 
 FORMER_ARGUMENTS = frozenset({"horizons", "emd"})
-"""Hyperparameters of version 0.1.0 that are not the model's any more: metrics are chosen anew where it is judged."""
+"""Hyperparameters of version 0.1.0 that the model no longer has: metrics are now chosen for each evaluation."""
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The content of a checkpoint, on the CPU, of which nothing is executed.
+    """Read a checkpoint onto the CPU, without executing anything in it.
 
     Raises:
         DataError: if it is missing, damaged, or holds more than tensors and plain data.
@@ -29,19 +29,19 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         reason = str(error).strip().split("\n")[0]
         raise DataError(
             f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain data, which"
-            f" is never executed. Take another, such as best.ckpt or last.ckpt beside it. ({reason})"
+            f" is never executed. Use another, such as best.ckpt or last.ckpt beside it. ({reason})"
         ) from error
     if not isinstance(content, dict) or "state_dict" not in content:
-        raise DataError(f"{path} is no checkpoint of a training: it holds no state_dict.")
+        raise DataError(f"{path} is not a checkpoint of a training: it has no state_dict.")
     return content
 
 
 def load_module(path: Path) -> EmulatorModule:
-    """The module of a checkpoint, on the CPU.
+    """Load the module of a checkpoint onto the CPU.
 
     Raises:
         DataError: if the file cannot be read, or is not a checkpoint of an emulator.
-        ConfigError: if a newer nmpm wrote it, or it names a part that is not known.
+        ConfigError: if a newer nmpm wrote it, or it names an unknown part.
     """
     content = read_checkpoint(path)
     stored = content.get("hyper_parameters", {})

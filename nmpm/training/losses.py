@@ -21,7 +21,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
         grid: Gives the cells' size.
 
     Returns:
-        A number; NaN if there is no real particle. (The readers refuse such recordings; to ask here would halt a GPU.)
+        (); NaN if there is no real particle. Readers refuse such recordings; a check here would synchronise the GPU.
 
     Raises:
         ValueError: if the shapes differ.

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
 import numpy as np
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
-from torch.optim import Optimizer
 from torch.utils.checkpoint import checkpoint
 
-from nmpm._support.collectives import broadcast_from_rank0, global_mean, normal_like, rank_slice
+from nmpm._support.collectives import global_mean, normal_like, rank_slice
+from nmpm._support.specs import class_path
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
@@ -27,23 +26,18 @@ from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
-from nmpm.training.augmentation import check_mirrors, mirrored
+from nmpm.training.augmentation import check_mirrors, mirror_windows
+from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.losses import density_error, position_error
+from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
+from nmpm.training.parts import check_same_optimizer, check_same_recipe, check_same_scene
 from nmpm.training.schedules import Schedule
 
-OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  # (jsonargparse knows this form)
-
 CALIBRATION_BATCHES = 4
-CLOCK_EVERY = 16  # steps
-
-
-def adam(parameters: Iterable[Tensor]) -> Optimizer:
-    """The paper's optimizer."""
-    return torch.optim.Adam(parameters, lr=1e-3)
 
 
 class EmulatorModule(LightningModule):
-    """Trains an emulator on windows and judges it by rollouts.
+    """Trains an emulator on windows; validates and tests it by full rollouts.
 
     Args:
         scene: The facts of the scenes; from the command line it comes from the data.
@@ -109,15 +103,18 @@ class EmulatorModule(LightningModule):
         self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
         self.test_errors = Comparison(scene, chosen)
         self.validated_step = -1
-        self._clock_read = 0.0
+        self._clock = Clock()
 
     @classmethod
     def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
-        """A module that trains a copy of an emulator, with its weights and statistics.
+        """A module that trains a copy of an emulator: `EmulatorModule.of(Zoo.load("goop").emulator, unroll=4)`.
+
+        The copy starts with the emulator's weights and normalisation statistics; the original stays as it is.
 
         Args:
-            emulator: For example `Zoo.load("goop").emulator`.
-            options: Further arguments of the constructor, such as `unroll` and `optimizer`.
+            emulator: Trained before; of the zoo, or `load_module(path).emulator`.
+            options: Arguments of the constructor, such as `unroll` and `optimizer`; those of the recipe replace the
+                emulator's own, for example its `constraints`.
         """
         recipe = {field.name: getattr(emulator.recipe, field.name) for field in dataclasses.fields(emulator.recipe)}
         module = cls(**(recipe | options))
@@ -125,14 +122,14 @@ class EmulatorModule(LightningModule):
         return module
 
     def setup(self, stage: str) -> None:  # noqa: ARG002
-        """Check that the data are of the model's scene.
+        """Make sure that the data are of the model's scene.
 
         Raises:
-            ConfigError: if the data's scene is another.
+            ConfigError: naming the facts in which they differ.
         """
-        theirs = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
-        if isinstance(theirs, Scene):
-            _check_same(self.emulator.scene, theirs)
+        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        if isinstance(scene, Scene):
+            check_same_scene(self.emulator.scene, scene)
 
     def on_fit_start(self) -> None:
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
@@ -145,34 +142,51 @@ class EmulatorModule(LightningModule):
             compile_network(self.emulator.processor, example)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """State the format of the hyperparameters."""
+        """State the format of the hyperparameters, and which optimizer the stored state belongs to."""
         checkpoint["nmpm_format"] = FORMAT
+        if self.trainer.optimizers:
+            checkpoint["nmpm_optimizer"] = class_path(type(self.trainer.optimizers[0]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint that a newer version wrote."""
+        """Compare the checkpoint with this model, and with its optimizer if a training goes on.
+
+        Raises:
+            ConfigError: if a newer version wrote it, or a part differs.
+        """
         check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
+        check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
+        if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
+            self.check_optimizer(checkpoint)
+
+    def check_optimizer(self, checkpoint: Mapping[str, Any]) -> None:
+        """Make sure that a training can go on with a checkpoint's optimizer state.
+
+        Raises:
+            ConfigError: if it is of another optimizer.
+        """
+        check_same_optimizer(checkpoint, build_optimizer(self.make_optimizer, self.emulator.parameters()))
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
-        """Make the batch's randomness a function of its number, so that a resumed run repeats it.
+        """Seed the batch's random numbers by its index, so that a resumed run repeats them.
 
-        It is the same for all processes: each takes its own rows of what is drawn for all.
+        All ranks use the same seed: each takes its own rows of the numbers drawn for all.
         """
         entropy = (self.seed, 0, self.trainer.fit_loop.total_batch_idx)
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
-        """This process's part of the mean error over the particles of all processes, which is what is logged.
+        """This rank's part of the mean error over the particles of all ranks, which is logged.
 
         Over several batches (`accumulate_grad_batches`) Lightning takes the plain mean, so that a particle weighs a
-        little more in a batch with fewer.
+        little more in a batch with fewer particles.
         """
         for axis in self.mirror:
-            chances = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
-            batch = mirrored(batch, self.emulator.scene, axis, chances < 0.5)
-        bundles = self._unrolled(self._perturbed(batch.initial), self.bundles(self._progress()))
+            draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
+            batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
+        bundles = self._unroll(self._add_position_noise(batch.initial), self.bundles(self._progress()))
         error = self._error(torch.cat([bundle.position for bundle in bundles], dim=1), batch)
         loss, logged = global_mean(error, batch.mask.sum())
-        self.log("train/loss", logged, prog_bar=True)
+        self.log("train/loss", logged)
         return loss
 
     def _error(self, predicted: Tensor, batch: Window) -> Tensor:
@@ -212,20 +226,21 @@ class EmulatorModule(LightningModule):
         self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        optimizer = self.make_optimizer(self.emulator.parameters())
-        total = self._total_steps()
-        if math.isinf(total) and self._timer() is None:
-            raise ConfigError(
-                "The training has no end, as its batches are endless: give --trainer.max_steps N or --trainer.max_time"
-                " DD:HH:MM:SS (or, to count epochs, --trainer.limit_train_batches N)."
-            )
+        """The optimizer, and the schedule of its learning rate.
+
+        Raises:
+            ConfigError: if the learning rate is not a positive number, or the training has no end.
+        """
+        check_end(self.trainer)
+        optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
+        total = total_steps(self.trainer)
         scheduler = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: self.schedule.factor(step, total, self._clock(step))
+            optimizer, lambda step: self.schedule.factor(step, total, self._clock.share(self.trainer, step))
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def bundles(self, progress: float) -> int:
-        """How many bundles a step unrolls when this share of the training is over."""
+        """Number of bundles that a step unrolls once this share of the training is over."""
         if progress >= self.unroll_growth:
             return self.unroll
         return 1 + int((self.unroll - 1) * progress / self.unroll_growth)
@@ -234,33 +249,10 @@ class EmulatorModule(LightningModule):
         """Share of the training that is over, by steps or by the clock, whichever is further."""
         if not self.unroll_growth:
             return 1.0
-        return max(self.global_step / self._total_steps(), self._clock(self.global_step))
+        step = self.global_step
+        return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
 
-    def _total_steps(self) -> float:
-        """Optimizer steps of the whole training; infinite where nothing but its time is limited."""
-        steps = self.trainer.estimated_stepping_batches  # -1 where epochs are limited and their batches are endless
-        return steps if steps > 0 else math.inf
-
-    def _timer(self) -> Timer | None:
-        """The trainer's `max_time`, if there is one."""
-        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
-        return next((one for one in callbacks if isinstance(one, Timer) and one._duration), None)
-
-    def _clock(self, step: int) -> float:
-        """Share of the trainer's `max_time` that is over, so that the rate comes down in time on a slow machine.
-
-        By the clock of rank 0: with rates of their own, the ranks' weights would drift apart. Several ranks ask it
-        every `CLOCK_EVERY` steps only, as the answer is read back from the device.
-        """
-        timer = self._timer()
-        if timer is None:
-            return 0.0
-        if self.trainer.world_size == 1 or step % CLOCK_EVERY == 0:
-            elapsed = min(timer.time_elapsed() / (timer._duration or 1.0), 1.0)
-            self._clock_read = broadcast_from_rank0(elapsed, self.trainer.strategy.root_device)
-        return self._clock_read
-
-    def _unrolled(self, particles: Particles, count: int) -> Iterator[Bundle]:
+    def _unroll(self, particles: Particles, count: int) -> Iterator[Bundle]:
         if not self.recompute:
             yield from unroll(self.emulator, particles, count)
             return
@@ -270,18 +262,8 @@ class EmulatorModule(LightningModule):
             yield bundle
             particles = particles.moved(bundle.position[:, -1], bundle.velocity)
 
-    def _perturbed(self, particles: Particles) -> Particles:
+    def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
             return particles
         noise = self.position_noise * normal_like(particles.position)
         return particles.moved(particles.position + noise, particles.velocity)
-
-
-def _check_same(mine: Scene, theirs: Scene) -> None:
-    different = mine.differences(theirs)
-    if different:
-        facts = "; ".join(f"{name} = {getattr(mine, name)}, not {getattr(theirs, name)}" for name in different)
-        raise ConfigError(
-            f"The model was made for other scenes than the data's: {facts}. For another box, or other particles, take"
-            " EmulatorModule.of(emulator.over(data.scene)); what else differs needs a model of its own."
-        )

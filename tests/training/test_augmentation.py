@@ -4,7 +4,7 @@ from scenes import box, cloud
 
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
-from nmpm.training.augmentation import check_mirrors, mirrored
+from nmpm.training.augmentation import check_mirrors, mirror_windows
 
 
 def window_of(scene, batch=3):
@@ -14,16 +14,16 @@ def window_of(scene, batch=3):
     return Window(frames, *rest)
 
 
-def test_a_mirror_image_turns_one_axis_of_the_chosen_windows_about_the_middle():
+def test_a_mirror_image_reflects_one_axis_of_the_chosen_windows_about_the_middle():
     scene = box(gravity=(1.0, -9.81), gravity_varies=True, obstacles=True)
     window, chosen = window_of(scene), torch.tensor([True, False, True])
-    image = mirrored(window, scene, 0, chosen)
+    image = mirror_windows(window, scene, 0, chosen)
     assert torch.allclose(image.frames[chosen][..., 0], 1.0 - window.frames[chosen][..., 0])
     assert torch.allclose(image.obstacle[chosen][..., 0], 1.0 - window.obstacle[chosen][..., 0])
     assert torch.equal(image.gravity[chosen][:, 0], -window.gravity[chosen][:, 0])
     assert torch.equal(image.frames[..., 1], window.frames[..., 1])
     assert torch.equal(image.frames[1], window.frames[1])
-    twice = mirrored(image, scene, 0, chosen)
+    twice = mirror_windows(image, scene, 0, chosen)
     assert torch.allclose(twice.frames, window.frames, atol=1e-6)
     assert torch.allclose(image.initial.velocity[chosen][..., 0], -window.initial.velocity[chosen][..., 0], atol=1e-6)
 

@@ -95,3 +95,51 @@ def test_resumed_processes_go_on_with_their_own_windows(make_dataset, tmp_path):
     assert [len(seen) for seen in straight] == [23, 23]
     assert not set(straight[0]) & set(straight[1])
     assert [one + other for one, other in zip(begun, resumed, strict=True)] == straight
+
+
+DIVERGE = """
+import sys
+from pathlib import Path
+
+from lightning.pytorch import Trainer
+from test_training import data_of, module_of
+
+from nmpm.training import EmulatorModule
+from nmpm.training.callbacks.divergence import DivergedError, DivergenceGuard
+
+
+class OneRankDiverges(EmulatorModule):
+    def training_step(self, batch, batch_idx):
+        loss = super().training_step(batch, batch_idx)
+        return loss * float("nan") if self.global_rank == 1 and self.global_step == 2 else loss
+
+
+data = data_of(Path(sys.argv[1]))
+module = module_of(data)
+module.__class__ = OneRankDiverges
+trainer = Trainer(
+    accelerator="cpu", devices=2, strategy="ddp", max_steps=100, limit_val_batches=0, logger=False, log_every_n_steps=1,
+    enable_checkpointing=False, enable_progress_bar=False, default_root_dir=sys.argv[2], callbacks=[DivergenceGuard()],
+)
+try:
+    trainer.fit(module, datamodule=data)
+except DivergedError as error:
+    (Path(sys.argv[2]) / f"rank_{trainer.global_rank}.txt").write_text(str(error))
+"""
+
+
+@pytest.mark.slow
+def test_all_processes_stop_where_the_loss_of_one_is_not_finite(make_dataset, tmp_path):
+    (tmp_path / "diverge.py").write_text(DIVERGE)
+    words = ["--standalone", "--nproc_per_node", "2", str(tmp_path / "diverge.py"), str(make_dataset()), str(tmp_path)]
+    paths = [os.environ.get("PYTHONPATH", ""), str(Path(__file__).parent)]
+    subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", *words],
+        check=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True,
+        timeout=120,
+    )
+    said = [(tmp_path / f"rank_{rank}.txt").read_text() for rank in (0, 1)]
+    assert "at step 3 the loss of another rank is not finite" in said[0]
+    assert "at step 3 the loss is nan" in said[1]

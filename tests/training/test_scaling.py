@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from conftest import made_up_metadata, made_up_trajectory
-from trainings import data_of, signs, train
+from trainings import data_of, fingerprints, train
 
 from nmpm.data.format import Split, write_metadata, write_split
 from nmpm.emulator.calibration import calibrate
@@ -37,7 +37,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def two(folder, tmp_path_factory) -> dict[str, list[dict]]:
-    """Diaries of both processes, by the name of the training, and the folder of the checkpoints."""
+    """Records of both ranks, by the name of the training, and the folder of the checkpoints."""
     root = tmp_path_factory.mktemp("two")
     train(folder, root / "alone.ckpt", max_steps=5, data={**HELD, "batch_size": 3})
     runs = {
@@ -60,29 +60,31 @@ def two(folder, tmp_path_factory) -> dict[str, list[dict]]:
         assert launcher.wait(timeout=280) == 0
     finally:
         launcher.terminate()  # it ends the processes that it started
-    told = {name: [json.loads((root / f"{name}-{rank}.json").read_text()) for rank in (0, 1)] for name in runs}
-    return told | {"root": root}
+    records = {name: [json.loads((root / f"{name}-{rank}.json").read_text()) for rank in (0, 1)] for name in runs}
+    return records | {"root": root}
 
 
 def row(folder: Path, count: int) -> list[str]:
     """The first windows that a training sees, in order."""
     batches = iter(data_of(folder, **HELD, batch_size=1).train_dataloader())
-    return [sign for batch in islice(batches, count) for sign in signs(batch)]
+    return [window for batch in islice(batches, count) for window in fingerprints(batch)]
 
 
 def together(processes: list[dict]) -> list[str]:
     """The windows that processes saw, in the order of the plan."""
-    return list(chain(*(mine + other for mine, other in zip(*(told["windows"] for told in processes), strict=True))))
+    return list(
+        chain(*(mine + other for mine, other in zip(*(record["windows"] for record in processes), strict=True)))
+    )
 
 
 @pytest.mark.slow
 def test_two_processes_have_the_loss_curve_of_one_with_twice_the_batch(folder, two, tmp_path):
     one = train(folder, tmp_path / "one.ckpt", max_steps=14, data={"emphasis": 0.5})
     assert together(two["all"]) == list(chain(*one["windows"]))
-    for told in two["all"]:
-        assert told["losses"] == pytest.approx(one["losses"], rel=1e-5)
-        assert told["weights"] == pytest.approx(one["weights"], rel=1e-5, abs=1e-6)
-        assert told["seeds"] == one["seeds"]
+    for record in two["all"]:
+        assert record["losses"] == pytest.approx(one["losses"], rel=1e-5)
+        assert record["weights"] == pytest.approx(one["weights"], rel=1e-5, abs=1e-6)
+        assert record["seeds"] == one["seeds"]
 
 
 @pytest.mark.slow
@@ -141,8 +143,8 @@ class TestAccumulation:
         assert parts["weights"] == pytest.approx(whole["weights"], rel=1e-4, abs=1e-5)
 
     def test_every_batch_has_noise_of_its_own(self, folder, tmp_path):
-        told = train(folder, tmp_path / "last.ckpt", max_steps=3, accumulate_grad_batches=2)
-        assert len(set(told["seeds"])) == 6
+        record = train(folder, tmp_path / "last.ckpt", max_steps=3, accumulate_grad_batches=2)
+        assert len(set(record["seeds"])) == 6
 
 
 def test_calibration_of_parts_is_that_of_the_whole(folder, monkeypatch):
@@ -150,12 +152,12 @@ def test_calibration_of_parts_is_that_of_the_whole(folder, monkeypatch):
     windows = list(islice(data.train_dataloader(), 4))
     whole, parted = (EmulatorModule(data.scene, cells=8, frames=2).emulator for _ in range(2))
     calibrate(whole, windows)
-    asked = []  # what two processes would tell each other
-    monkeypatch.setattr("nmpm.emulator.calibration.all_gather", lambda value: asked.append(value) or [value])
+    sent = []  # what two ranks would exchange
+    monkeypatch.setattr("nmpm.emulator.calibration.all_gather", lambda value: sent.append(value) or [value])
     for part in (windows[:1], windows[1:]):
         calibrate(parted, part)
-    answers = iter([[asked[0], asked[2]], [asked[1], asked[3]]])
-    monkeypatch.setattr("nmpm.emulator.calibration.all_gather", lambda _: next(answers))
+    received = iter([[sent[0], sent[2]], [sent[1], sent[3]]])
+    monkeypatch.setattr("nmpm.emulator.calibration.all_gather", lambda _: next(received))
     calibrate(parted, windows[:1])
     for name, value in whole.named_buffers():
         torch.testing.assert_close(dict(parted.named_buffers())[name], value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +50,16 @@ class DivergenceGuard(Callback):
         pl_module: LightningModule,  # noqa: ARG002
         checkpoint: dict[str, Any],
     ) -> None:
-        for name, values in checkpoint["state_dict"].items():
-            if not torch.isfinite(values).all():
-                raise self._diverged(trainer, f"the weights {name} are not finite")
+        self._check_weights(trainer, checkpoint["state_dict"].items())
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        for name, values in pl_module.named_parameters():
-            if not torch.isfinite(values).all():
-                raise self._diverged(trainer, f"the weights {name} are not finite")
+        self._check_weights(trainer, pl_module.named_parameters())
+
+    def _check_weights(self, trainer: Trainer, weights: Iterable[tuple[str, Tensor]]) -> None:
+        """Called on all ranks; a rank that holds no weights, as under sharding, has nothing to report."""
+        broken = next((name for name, values in weights if not torch.isfinite(values).all()), None)
+        if any_rank(broken is not None, trainer.strategy.root_device):
+            raise self._diverged(trainer, f"the weights {broken or 'of another rank'} are not finite")
 
     def _diverged(self, trainer: Trainer, what: str) -> DivergedError:
         good = [

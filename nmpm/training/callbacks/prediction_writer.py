@@ -1,4 +1,4 @@
-"""The callback behind `nmpm predict`; apart from `nmpm.data.predictions`, as Lightning takes seconds to import."""
+"""Write the predictions of `nmpm predict`. Apart from `nmpm.data.predictions`, as Lightning takes seconds to import."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from nmpm.scene import Scene
 class PredictionWriter(BasePredictionWriter):
     """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder.
 
-    Of several processes, the first writes what all have made, in the order in which one alone would.
+    Rank 0 writes the predictions of all ranks, in the order of the test split.
     """
 
     def __init__(self) -> None:
         super().__init__(write_interval="batch")
-        self._made: list[Trajectory] = []
+        self._predicted: list[Trajectory] = []
 
     def write_on_batch_end(
         self,
@@ -39,12 +39,12 @@ class PredictionWriter(BasePredictionWriter):
         scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
         source = f"{trainer.ckpt_path or 'the model'}"
         for index in range(len(prediction)):
-            self._made.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
+            self._predicted.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        dealt = gather_to_rank0(self._made)
+        by_rank = gather_to_rank0(self._predicted)
         if trainer.is_global_zero:
-            turns = zip_longest(*dealt)  # trajectories are dealt in turn, so the last turn may be short
-            made = [trajectory for turn in turns for trajectory in turn if trajectory is not None]
-            write_split(Path(trainer.default_root_dir) / "predictions.h5", made)
-        self._made = []
+            rounds = zip_longest(*by_rank)  # ranks take trajectories in turn, so the last round may be short
+            ordered = [trajectory for turn in rounds for trajectory in turn if trajectory is not None]
+            write_split(Path(trainer.default_root_dir) / "predictions.h5", ordered)
+        self._predicted = []

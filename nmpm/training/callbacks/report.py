@@ -1,4 +1,4 @@
-"""What a test leaves behind: a table on the screen, the figures as JSON and CSV, a picture and an animation."""
+"""The report of a test: a table on the screen, the figures as JSON and CSV, a picture and an animation."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from nmpm.training.module import EmulatorModule
 from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
 
 
-class Report(Callback):
-    """Keeps the time that training took, and writes the report when a test ends.
+class ReportWriter(Callback):
+    """Measures the time that training takes, and writes the report when a test ends.
 
     Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions), `errors.csv`
     (error against frame), `rollout.png` and `rollout.gif` (the first test trajectory beside its prediction).
@@ -37,6 +37,10 @@ class Report(Callback):
         self._since: float | None = None
         self._trained = False
         self._first_rollout: tuple[Window, Tensor] | None = None
+
+    @property
+    def state_key(self) -> str:
+        return "Report"  # its name in checkpoints of earlier versions
 
     def state_dict(self) -> dict[str, Any]:
         return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps}
@@ -78,19 +82,19 @@ class Report(Callback):
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not isinstance(pl_module, EmulatorModule):
             return
-        judged = {kind: _all_ranks(metric) for kind, metric in pl_module.test_errors.errors.items()}
+        errors = {kind: _gather_ranks(metric) for kind, metric in pl_module.test_errors.errors.items()}
         if not trainer.is_global_zero:
             return
         folder = Path(trainer.default_root_dir)
         folder.mkdir(parents=True, exist_ok=True)
-        figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in judged.items()})
+        figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in errors.items()})
         with replacing(folder / "report.json") as part:
             part.write_text(json.dumps(figures, indent=1) + "\n")
-        _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in judged.items()})
+        _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()})
         if self._first_rollout is not None:
-            exhibit = labelled_trajectories(pl_module, *self._first_rollout)
-            write_snapshots(exhibit, folder / "rollout.png")
-            write_animation(exhibit, folder / "rollout.gif")
+            trajectories = labelled_trajectories(pl_module, *self._first_rollout)
+            write_snapshots(trajectories, folder / "rollout.png")
+            write_animation(trajectories, folder / "rollout.gif")
         _print_table(figures, folder)
 
     def _elapsed(self) -> float:
@@ -111,7 +115,7 @@ class Report(Callback):
                 "seconds": round(self.trained_seconds, 1),
                 "precision": str(trainer.precision),
                 "devices": trainer.world_size,
-                "hardware": hardware(),
+                "hardware": device_name(trainer.strategy.root_device),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
@@ -119,7 +123,7 @@ class Report(Callback):
 
 
 def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Tensor) -> LabelledTrajectories:
-    """The first trajectory of a batch beside its prediction, as something to draw.
+    """The first trajectory of a batch beside its prediction, for pictures.
 
     Both start with the two frames that the prediction started from; both end where the prediction is not finite.
     """
@@ -134,11 +138,13 @@ def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Ten
     return LabelledTrajectories.from_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
 
 
-def hardware() -> str:
-    """What this process computes on, in words."""
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"{_processor()}, {torch.get_num_threads()} threads"
+def device_name(device: torch.device) -> str:
+    """The model of a device: of the GPU, or of the processor with the number of threads that torch uses."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "cpu":
+        return f"{_processor()}, {torch.get_num_threads()} threads"
+    return device.type
 
 
 def _processor() -> str:
@@ -149,7 +155,7 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def _all_ranks(metric: MSE) -> tuple[list[dict[str, float]], list[Tensor]]:
+def _gather_ranks(metric: MSE) -> tuple[list[dict[str, float]], list[Tensor]]:
     """MSE per trajectory and curves, from all processes."""
     with metric.sync_context():
         return metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]

@@ -1,0 +1,267 @@
+"""LightningCLI with the data's scene flowing into the model, and a run's files in one folder."""
+
+from __future__ import annotations
+
+import operator
+import os
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+
+from nmpm._support.plugins import load_plugins
+from nmpm.cli.console import quiet_lightning
+from nmpm.cli.typos import BriefParser, UsageError
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.errors import ConfigError
+from nmpm.training.budget import check_endless_batches
+from nmpm.training.callbacks.divergence import DivergenceGuard
+from nmpm.training.callbacks.prediction_writer import PredictionWriter
+from nmpm.training.callbacks.progress import Progress
+from nmpm.training.callbacks.report import ReportWriter, device_name
+from nmpm.training.callbacks.stop_on_signal import StopOnSignal
+from nmpm.training.checkpoints import read_checkpoint
+from nmpm.training.module import EmulatorModule
+from nmpm.training.optimization import check_learning_rate
+from nmpm.training.run_folder import RunFolder
+
+BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
+# A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best
+# does not change.
+LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
+
+
+class EmulatorCLI(LightningCLI):
+    """Links what the model needs from the data and the other way round, and ends a fit with a test.
+
+    Args:
+        words: The command as the user gave it.
+        locks: Takes the descriptor of the run folder's lock. (Callbacks that copy the module copy this object too, so
+            it must not hold what cannot be copied.)
+        options: Of LightningCLI.
+    """
+
+    def __init__(self, words: list[str], locks: list[int], **options: Any) -> None:
+        self.words, self.locks = words, locks
+        super().__init__(EmulatorModule, TrajectoryDataModule, **options)
+
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # (static there)
+        """The one that is run: parsers of the others would cost seconds."""
+        return {self.words[0]: LightningCLI.subcommands()[self.words[0]]}
+
+    def init_parser(self, **options: Any) -> LightningArgumentParser:
+        """A parser whose errors are one line."""
+        parser = BriefParser(**options)
+        parser.add_argument("-c", "--config", action="config", help="Path to a configuration file in yaml format.")
+        return parser
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
+        parser.add_lightning_class_args(ModelCheckpoint, "resume")
+        parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
+        parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
+        parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
+
+    def before_instantiate_classes(self) -> None:
+        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""
+        config = self.config[self.subcommand]
+        config["weights_only"] = True
+        trainer = config["trainer"]
+        trainer["default_root_dir"] = trainer["default_root_dir"] or "runs/default"
+        trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
+        for saver in ("checkpoint", "resume"):
+            folder = Path(trainer["default_root_dir"]) / "checkpoints"
+            config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
+        optimizer = config["model"].get("optimizer")
+        if isinstance(optimizer, dict) or hasattr(optimizer, "get"):
+            check_learning_rate((optimizer.get("init_args") or {}).get("lr"))
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
+        config = self.config_init[self.subcommand]["trainer"]
+        configured = config.get("callbacks") or []
+        # What is given to Lightning's method replaces what is configured.
+        callbacks = [*(configured if isinstance(configured, list) else [configured]), *kwargs.get("callbacks", [])]
+        if config.get("logger") in (None, True):
+            table = CSVLogger(config["default_root_dir"], name="logs")
+            kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
+            callbacks.append(LearningRateMonitor("step"))
+        if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
+            callbacks.append(Progress())
+        self.stop_on_signal = StopOnSignal(self._checkpoint_file("resume"))
+        guards = [DivergenceGuard(), ReportWriter(), PredictionWriter(), self.stop_on_signal]
+        kwargs["callbacks"] = [*callbacks, *guards]
+        return super().instantiate_trainer(**kwargs)
+
+    def _parse_ckpt_path(self) -> None:
+        """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""
+
+    @property
+    def run_folder(self) -> RunFolder:
+        """Where this run's files are."""
+        files = {"last": self._checkpoint_file("resume"), "best": self._checkpoint_file("checkpoint")}
+        return RunFolder(Path(self.config_init[self.subcommand]["trainer"]["default_root_dir"]), files)
+
+    def _checkpoint_file(self, saver: str) -> Path:
+        config = self.config[self.subcommand][saver]
+        return Path(config["dirpath"]) / f"{config['filename']}{ModelCheckpoint.FILE_EXTENSION}"
+
+    def before_fit(self) -> None:
+        """Refuse, before data are simulated, what cannot be trained, and lock the run's folder.
+
+        Raises:
+            ConfigError: if the training has no end, another process trains in the folder, it holds a run that is not
+                to go on, or the checkpoint has other parts.
+            DataError: if the checkpoint cannot be read.
+        """
+        check_endless_batches(self.trainer)
+        resumed = self._load_checkpoint()
+        if resumed is not None:
+            self.model.check_optimizer(resumed)
+        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
+            return
+        self.locks.append(self.run_folder.lock())
+        if resumed is None:
+            self.run_folder.check_new()
+        weights = sum(parameter.numel() for parameter in self.model.emulator.parameters())
+        sys.stdout.write(
+            f"Data: {self.datamodule.description}. Model: {type(self.model.emulator.recipe.processor).__name__},"
+            f" {weights:,} parameters, on {device_name(self.trainer.strategy.root_device)}.\n"
+            f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n"
+        )
+        sys.stdout.flush()
+
+    def before_validate(self) -> None:
+        self._load_checkpoint()
+
+    def before_test(self) -> None:
+        self._load_checkpoint()
+
+    def before_predict(self) -> None:
+        self._load_checkpoint()
+
+    def _load_checkpoint(self) -> dict[str, Any] | None:
+        """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""
+        config = self.config_init[self.subcommand]
+        if not config.get("ckpt_path"):
+            return None
+        path = self.run_folder.checkpoint(str(config["ckpt_path"]))
+        content = read_checkpoint(path)
+        self.model.on_load_checkpoint(content)
+        config["ckpt_path"] = str(path)
+        return content
+
+    def fit(self, **options: Any) -> None:
+        """Train; an interruption says how to go on."""
+        try:
+            self.trainer.fit(**options)
+        except SystemExit as ended:
+            if not isinstance(ended.__context__, KeyboardInterrupt):
+                raise
+            if self.trainer.is_global_zero:
+                raise KeyboardInterrupt(self._how_to_go_on()) from None
+            raise SystemExit(130) from None
+
+    def _how_to_go_on(self) -> str:
+        step = self.stop_on_signal.saved_step
+        if step is None and not self.run_folder.checkpoints["last"].is_file():
+            return "interrupted before the first step; there is nothing to go on from."
+        where = f"stopped at step {step}" if step is not None else "interrupted"
+        return f"{where}. Go on with: {resuming_command(self.words)}"
+
+    def after_fit(self) -> None:
+        """Validate the last weights too, if no validation has, and test the best ones, once."""
+        checkpoint = self.trainer.checkpoint_callback
+        if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor:
+            if self.model.validated_step < self.trainer.global_step:
+                self._validate_last_weights(checkpoint)
+            # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
+            if checkpoint.best_model_path:
+                self.model.load_state_dict(read_checkpoint(Path(checkpoint.best_model_path))["state_dict"])
+        self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+
+    def _validate_last_weights(self, checkpoint: ModelCheckpoint) -> None:
+        self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
+        score = self.trainer.callback_metrics[str(checkpoint.monitor)]
+        if checkpoint.check_monitor_top_k(self.trainer, score):
+            path = self._checkpoint_file("checkpoint")
+            self.trainer.save_checkpoint(path, weights_only=False)
+            checkpoint.best_model_path, checkpoint.best_model_score = str(path), score
+
+
+def run_command(words: list[str], found: list[str]) -> int:
+    """Run a training command.
+
+    Args:
+        words: As the user gave it.
+        found: The same with the configuration files' paths.
+
+    Returns:
+        The exit status: 2 for an option or key that cannot be.
+
+    Raises:
+        ConfigError: if Lightning refuses the configuration.
+        KeyboardInterrupt: at SIGINT and SIGTERM, saying how to go on.
+    """
+    load_plugins()
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
+    sys.argv = [sys.argv[0], *found]
+    locks: list[int] = []
+    try:
+        with quiet_lightning(), _terminated_like_interrupted():
+            EmulatorCLI(
+                words,
+                locks,
+                seed_everything_default=0,
+                parser_kwargs={"parser_mode": "omegaconf+"},
+                save_config_kwargs={"overwrite": True},
+            )
+    except UsageError as error:
+        sys.stderr.write(f"nmpm {words[0]}: {error}\n")
+        return 2
+    except MisconfigurationException as error:
+        raise ConfigError(" ".join(str(error).split())) from error
+    except SystemExit as ended:
+        if isinstance(ended.__context__, KeyboardInterrupt):  # Lightning's answer to it
+            raise ended.__context__ from None
+        raise
+    finally:
+        for descriptor in locks:
+            os.close(descriptor)
+    return 0
+
+
+def resuming_command(words: list[str]) -> str:
+    """The command that goes on from the last checkpoint of one that was interrupted."""
+    kept = [word for word in words if not word.startswith("--ckpt_path=")]
+    if "--ckpt_path" in kept:
+        at = kept.index("--ckpt_path")
+        del kept[at : at + 2]
+    return shlex.join(["nmpm", *kept, "--ckpt_path", "last"])
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """Turn SIGTERM into KeyboardInterrupt, as SIGINT is."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)

@@ -1,0 +1,80 @@
+"""Mistakes in options and configuration files, in one line with the nearest name instead of pages of usage."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
+from typing import NoReturn
+
+from lightning.pytorch.cli import LightningArgumentParser
+
+from nmpm.decoders import Decoder
+from nmpm.processors import Processor
+from nmpm.transfer import Transfer
+
+PARTS = {"processor": Processor, "transfer": Transfer, "decoder": Decoder}
+LONGEST = 300
+"""Characters of a message of jsonargparse's that are shown."""
+
+
+class UsageError(Exception):
+    """An option or key that does not exist, or a value of the wrong kind; the message is one line."""
+
+
+class BriefParser(LightningArgumentParser):
+    """Raises `UsageError` where jsonargparse would print its usage and exit."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        parser = getattr(ex, "subcommand_parser", None) or self
+        names = [action.dest for action in parser._actions]
+        raise UsageError(explain(message, names)) from ex
+
+
+def explain(message: str, names: Iterable[str]) -> str:
+    """A message of jsonargparse in one line, with the nearest known name where one is unknown.
+
+    Args:
+        message: May have many lines.
+        names: Options of the parser, such as "model.cells".
+    """
+    if found := re.match(r"unrecognized arguments: --([\w.]+)", message):
+        return f"there is no option --{found[1]}{_hint(found[1], names, '--')}"
+    if found := re.match(r"Subcommand '\w+' does not accept option '([\w.]+)'", message):
+        return f"the configuration has an unknown key {found[1]}{_hint(found[1], names, '')}"
+    if found := re.match(r"Option '([\w.]+)' is not accepted", message):
+        return f"the argument {found[1]} is unknown{_hint(found[1], names, '')}"
+    key = re.match(r'Parser key "([\w.]+)":', message)
+    option = f"--{key[1]}: " if key else ""
+    if found := re.search(r"module '([\w.]+)' has no attribute '(\w+)'", message):
+        public = [name for name in vars(sys.modules.get(found[1], object())) if not name.startswith("_")]
+        return f"{option}there is no {found[1]}.{found[2]}{_question(found[2], public, f'{found[1]}.')}"
+    if found := re.search(r"Expected a <class '(\w+)'>\.? Got value: (.*)", message):
+        return f"{option}{found[2]} is not of type {found[1]}."
+    if found := re.search(r"Expected a typing\.Literal\[(.*?)\]\.? Got value: (\S+)", message):
+        return f"{option}{found[2]} is not one of {found[1]}."
+    rest = re.sub(r"- Expected a path but \S+ either not accessible or invalid", "", message[key.end() if key else 0 :])
+    line = " ".join(rest.split()).removeprefix("- ")
+    return option + (line if len(line) <= LONGEST else f"{line[:LONGEST]} …")
+
+
+def _hint(wrong: str, names: Iterable[str], mark: str) -> str:
+    """A question for the nearest of the options, else for an argument of a part that is spelt like the last word."""
+    if near := get_close_matches(wrong, list(names), n=1, cutoff=0.8):
+        return f"; did you mean {mark}{near[0]}?"
+    arguments = dict(_part_arguments())
+    near = get_close_matches(wrong.rpartition(".")[2], list(arguments), n=1, cutoff=0.75)
+    return f"; did you mean {mark}{arguments[near[0]]}?" if near else ". See --help for all there are."
+
+
+def _question(wrong: str, names: Iterable[str], before: str) -> str:
+    near = get_close_matches(wrong, list(names), n=1)
+    return f"; did you mean {before}{near[0]}?" if near else "."
+
+
+def _part_arguments() -> Iterator[tuple[str, str]]:
+    """Arguments of processors, transfers and decoders, and the options that set them."""
+    for part, base in PARTS.items():
+        for kind in base.__subclasses__():
+            yield from ((name, f"model.{part}.{name}") for name in vars(kind).get("__dataclass_fields__", ()))

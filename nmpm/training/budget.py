@@ -1,0 +1,113 @@
+"""What ends a training: its steps, its epochs or its time."""
+
+from __future__ import annotations
+
+import math
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.callbacks.timer import Interval
+
+from nmpm._support.collectives import broadcast_from_rank0
+from nmpm.errors import ConfigError
+
+CLOCK_EVERY = 16
+"""Steps between readings of rank 0's clock: other ranks read it back from the device."""
+
+ENDLESS = (
+    "The training has no end, as its batches are endless: give --trainer.max_steps N or --trainer.max_time DD:HH:MM:SS"
+    " (or, to count epochs, --trainer.limit_train_batches N)."
+)
+
+
+def total_steps(trainer: Trainer) -> float:
+    """Optimizer steps of the whole training; infinite where nothing but its time is limited. Loads its data."""
+    steps = trainer.estimated_stepping_batches  # -1 where epochs are limited and their batches are endless
+    return math.inf if steps == -1 else steps
+
+
+class Clock:
+    """Share of a trainer's time that is over, the same on all ranks."""
+
+    def __init__(self) -> None:
+        self._share = 0.0
+
+    def share(self, trainer: Trainer, step: int) -> float:
+        """The share at a step, in [0, 1]; 0 where the time is not limited.
+
+        All ranks get rank 0's: by clocks of their own, their learning rates and weights would drift apart. Several
+        ranks exchange it every `CLOCK_EVERY` steps only.
+        """
+        timers = _timers(trainer)
+        if not timers:
+            return 0.0
+        if trainer.world_size == 1 or step % CLOCK_EVERY == 0:
+            elapsed = max(timer.time_elapsed() / (timer._duration or 1.0) for timer in timers)
+            self._share = broadcast_from_rank0(min(elapsed, 1.0), trainer.strategy.root_device)
+        return self._share
+
+
+def check_end(trainer: Trainer) -> None:
+    """Make sure that a training ends. Loads its data.
+
+    Raises:
+        ConfigError: if neither its steps nor its time are limited.
+    """
+    if math.isinf(total_steps(trainer)) and not _stops_by_time(trainer):
+        raise ConfigError(ENDLESS)
+
+
+def check_endless_batches(trainer: Trainer) -> None:
+    """Make sure, before any data are loaded, that a training on endless batches takes a step and ends.
+
+    Raises:
+        ConfigError: if it does not, or if a share of the batches is asked for.
+    """
+    limit = trainer.limit_train_batches
+    for name, value in (
+        *(("max_steps", trainer.max_steps), ("max_epochs", trainer.max_epochs), ("limit_train_batches", limit)),
+        *(("max_time", timer._duration) for timer in _timers(trainer)),
+    ):
+        if value == 0:
+            raise ConfigError(f"--trainer.{name} {value:g}: nothing would be trained; give more, or run `nmpm test`.")
+    if isinstance(limit, float) and limit != 1.0:
+        raise ConfigError(
+            f"--trainer.limit_train_batches {limit} is a share of batches that are endless; give a whole number."
+        )
+    counted = isinstance(limit, int) and (trainer.max_epochs or -1) > 0
+    if trainer.max_steps == -1 and not counted and not _stops_by_time(trainer):
+        raise ConfigError(ENDLESS)
+
+
+def time_left(trainer: Trainer, first_step: int, elapsed: float) -> tuple[float, float | None]:
+    """Share of the training that is over, and seconds left; by steps or by time, whichever ends first.
+
+    Args:
+        trainer: Training.
+        first_step: Step at which this process began.
+        elapsed: Seconds since then.
+
+    Returns:
+        The share, in [0, 1], and the seconds, None before the first step where only steps are limited.
+    """
+    total, taken = total_steps(trainer), trainer.global_step - first_step
+    share, left = trainer.global_step / max(total, 1), None
+    if taken and math.isfinite(total):
+        left = elapsed / taken * (total - trainer.global_step)
+    for timer in _timers(trainer):
+        duration = timer._duration or 1.0
+        share = max(share, timer.time_elapsed() / duration)
+        remaining = max(duration - timer.time_elapsed(), 0.0)
+        left = remaining if left is None else min(left, remaining)
+    return min(share, 1.0), left
+
+
+def _timers(trainer: Trainer) -> list[Timer]:
+    """Those that limit the training: the trainer's `max_time`, and timers among its callbacks."""
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
+    return [one for one in callbacks if isinstance(one, Timer) and one._duration is not None]
+
+
+def _stops_by_time(trainer: Trainer) -> bool:
+    """Whether a timer stops the training between steps; one that waits for the epoch's end may wait for ever."""
+    return any(timer._interval == Interval.step for timer in _timers(trainer))

@@ -1,0 +1,84 @@
+"""The folder of a training run: one fit at a time, and no new run over an old one."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from nmpm.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where a run keeps its files.
+
+    Args:
+        root: Of report, pictures and logs.
+        checkpoints: Files of checkpoints by the names that `--ckpt_path` takes: "last" and "best".
+    """
+
+    root: Path
+    checkpoints: Mapping[str, Path]
+
+    def lock(self) -> int:
+        """Keep other processes from training in this folder until the descriptor that is returned is closed.
+
+        The lock is the operating system's: it ends with the process, however it ends. Where the file system has none,
+        nothing is locked.
+
+        Raises:
+            ConfigError: if another process trains here.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.read(descriptor, 20).decode() or "unknown"
+            os.close(descriptor)
+            raise ConfigError(
+                f"Another process ({holder}) is training in {self.root}. Wait for it, or choose another folder with"
+                " --trainer.default_root_dir."
+            ) from error
+        except OSError:
+            return descriptor
+        os.truncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+        return descriptor
+
+    def check_new(self) -> None:
+        """Make sure that no run is written over.
+
+        Raises:
+            ConfigError: if there is a checkpoint, a report or a log with figures.
+        """
+        last = self.checkpoints["last"]
+        folders = {path.parent for path in self.checkpoints.values()}
+        old = [path for folder in folders for path in folder.glob("*.ckpt")]
+        old += [path for path in (self.root / "report.json", *self.root.glob("logs/*/metrics.csv")) if path.is_file()]
+        if old:
+            resume = "Go on with it by adding --ckpt_path last, or choose" if last.is_file() else "Remove it, or choose"
+            raise ConfigError(
+                f"{self.root} already holds a run ({old[0].name}). {resume} another folder with"
+                " --trainer.default_root_dir."
+            )
+
+    def checkpoint(self, given: str) -> Path:
+        """The file that a `--ckpt_path` means.
+
+        Raises:
+            ConfigError: if it is "last" or "best", and there is none.
+        """
+        if given not in self.checkpoints:
+            return Path(given)
+        path = self.checkpoints[given]
+        if not path.is_file():
+            others = ", ".join(str(file) for file in sorted(path.parent.glob("*.ckpt"))) or "none"
+            raise ConfigError(
+                f"--ckpt_path {given}: there is no {path}; checkpoints there: {others}. Leave the option out to start"
+                " a new run."
+            )
+        return path

@@ -1,0 +1,54 @@
+from pathlib import Path
+
+import pytest
+
+from nmpm.cli import main
+
+MISTAKES = [
+    (["--model.cels", "32"], "no option --model.cels; did you mean --model.cells?"),
+    (["--data.nme", "goop"], "no option --data.nme; did you mean --data.name?"),
+    (["--model.constraints.enrgy", "true"], "did you mean --model.constraints.energy?"),
+    (
+        ["--model.processor", "nmpm.processors.Unet"],
+        "--model.processor: there is no nmpm.processors.Unet; did you mean",
+    ),
+    (["--model.optimizer", "torch.optim.Adm"], "--model.optimizer: there is no torch.optim.Adm; did you mean"),
+    (["--model.processor.widht", "3"], "the argument widht is unknown; did you mean width?"),
+    (["--trainer.max_steps", "abc"], "--trainer.max_steps: abc is not of type int"),
+    (["--data.source", "foo"], "--data.source: foo is not one of 'disk', 'simulate', 'hub'"),
+    (["--model.processor", "nmpm.transfer.Linear"], "--model.processor: Import path nmpm.transfer.Linear does not"),
+]
+
+
+@pytest.mark.parametrize(("words", "complaint"), MISTAKES, ids=lambda value: "")
+def test_a_wrong_option_gets_one_line_with_the_nearest_name(words, complaint, capsys):
+    assert main(["fit", "--config", "goop.yaml", *words]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert complaint in said.err
+    assert said.err.startswith("nmpm fit: ")
+    assert said.err.count("\n") == 1
+    assert len(said.err) < 350
+
+
+FILES = [
+    ("model: {widht: 3}", "unknown key model.widht; did you mean model.processor.width?"),
+    ("modle: {cells: 3}", "unknown key modle.cells; did you mean model.cells?"),
+    ("model: {processor: {class_path: nmpm.processors.UNet, init_args: {widht: 3}}}", "did you mean"),
+    ("model: {cells: 3\n  a: [", "Problems parsing config"),
+]
+
+
+@pytest.mark.parametrize(("text", "complaint"), FILES, ids=range(4))
+def test_a_wrong_key_in_a_file_too(text, complaint, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(text)
+    assert main(["fit", "--config", "mine.yaml"]) == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert said.count("\n") == 1
+
+
+def test_a_wrong_command_gets_the_nearest_one(capsys):
+    assert main(["fti"]) == 2
+    assert "did you mean fit?" in capsys.readouterr().err

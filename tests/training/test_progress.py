@@ -1,0 +1,85 @@
+"""The line of progress, and that training asks the device for nothing between two logged steps."""
+
+import traceback
+
+import pytest
+import torch
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.callbacks import LearningRateMonitor
+from lightning.pytorch.loggers import CSVLogger
+from test_training import Questions, data_of, module_of
+
+from nmpm.optimizers import SOAP
+from nmpm.training.callbacks.divergence import DivergenceGuard
+from nmpm.training.callbacks.progress import Progress
+from nmpm.training.callbacks.report import ReportWriter
+from nmpm.training.callbacks.stop_on_signal import StopOnSignal
+
+
+def trainer_with(root, *callbacks: Callback, **limits) -> Trainer:
+    quiet = {"enable_checkpointing": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    quiet |= {"check_val_every_n_epoch": None, "log_every_n_steps": 10, "limit_val_batches": 0}
+    return Trainer(
+        accelerator="cpu",
+        default_root_dir=root,
+        logger=CSVLogger(root),
+        gradient_clip_val=1.0,
+        callbacks=list(callbacks),
+        **(quiet | limits),
+    )
+
+
+class Readings(Questions):
+    """Steps at which a value is read back, but for the optimizer's own counters, which are on the host."""
+
+    ASKING = ("_local_scalar_dense", "nonzero", "equal", "masked_select", "is_nonzero")
+
+    def __init__(self, trainer: Trainer):
+        super().__init__()
+        self.trainer, self.steps = trainer, set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.overloadpacket.__name__ in self.ASKING:
+            files = [frame.filename for frame in traceback.extract_stack()]
+            if not any("torch/optim/" in file for file in files):
+                self.steps.add(self.trainer.global_step)
+        return super().__torch_dispatch__(func, types, args, kwargs)
+
+
+@pytest.mark.parametrize("optimizer", [torch.optim.Adam, SOAP])
+def test_values_are_read_back_at_the_start_at_logged_steps_and_at_the_end_alone(make_dataset, tmp_path, optimizer):
+    data = data_of(make_dataset())
+    guards = [
+        LearningRateMonitor("step"),
+        Progress(),
+        DivergenceGuard(),
+        ReportWriter(),
+        StopOnSignal(tmp_path / "last.ckpt"),
+    ]
+    trainer = trainer_with(tmp_path, *guards, max_steps=25, precision="bf16-mixed")
+    with Readings(trainer) as readings:
+        trainer.fit(module_of(data, optimizer=optimizer, mirror=(0,)), data)
+    assert readings.steps == {0, 10, 20, 25}
+
+
+def shown(capsys) -> list[str]:
+    return [line.strip() for line in capsys.readouterr().out.replace("\r", "\n").split("\n") if "step" in line]
+
+
+def test_the_line_says_steps_time_left_loss_and_the_validation_error(make_dataset, tmp_path, capsys):
+    data = data_of(make_dataset())
+    trainer = trainer_with(tmp_path, Progress(), max_steps=20, limit_val_batches=1, val_check_interval=10)
+    trainer.fit(module_of(data), data)
+    last = shown(capsys)[-1]
+    loss, error = (float(trainer.callback_metrics[name]) for name in ("train/loss", "valid/mse"))
+    assert last.startswith("100% |")
+    assert last.endswith(f"training: step 20/20, 0:00:00 left, loss {loss:.3g}, validation error {1e3 * error:.3g}e-3")
+
+
+def test_with_time_alone_it_says_the_time_left(make_dataset, tmp_path, capsys):
+    data = data_of(make_dataset())
+    trainer = trainer_with(tmp_path, Progress(), max_time="00:00:00:02")
+    trainer.fit(module_of(data), data)
+    last = shown(capsys)[-1]
+    assert last.startswith("100% |")
+    assert f"training: step {trainer.global_step}, 0:00:00 left" in last

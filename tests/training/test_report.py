@@ -1,0 +1,30 @@
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from nmpm.training.callbacks.report import ReportWriter, device_name
+
+
+def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
+    assert "threads" in device_name(torch.device("cpu"))
+    assert device_name(torch.device("cuda", 1)) == "GPU of cuda:1"
+    assert device_name(torch.device("mps")) == "mps"
+
+
+@pytest.mark.parametrize(("device", "name"), [("cpu", "threads"), ("cuda:0", "GPU of cuda:0")])
+def test_a_report_names_the_device_that_the_trainer_used(monkeypatch, device, name):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
+    emulator = SimpleNamespace(frames=8, parameters=lambda: iter(()))
+    trainer = SimpleNamespace(
+        strategy=SimpleNamespace(root_device=torch.device(device)),
+        datamodule=SimpleNamespace(description="made up"),
+        callback_metrics={"test/mse": torch.tensor(1.0)},
+        precision="32-true",
+        world_size=1,
+    )
+    figures = ReportWriter()._figures(trainer, SimpleNamespace(emulator=emulator, unroll=2), {})
+    assert name in figures["training"]["hardware"]
