@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import DEVICES, find_device
 from nmpm.errors import ConfigError
 
@@ -241,7 +241,7 @@ def describe_machine(device: torch.device, threads: int) -> str:
 def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
     """Write figures, if a path is given; dataclasses as mappings, devices as their names."""
     if path is not None:
-        with replacing(path) as part:
+        with atomic_write(path) as part:
             part.write_text(json.dumps(figures, indent=1, default=_plain) + "\n", encoding="utf-8")
 
 

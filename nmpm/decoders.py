@@ -22,7 +22,7 @@ class Decoder(ABC):
     """The known part of a bundle's velocities. Subclasses are stateless; all quantities in grid units."""
 
     @abstractmethod
-    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:
+    def carried_velocity(self, own: Tensor, smoothed: Tensor) -> Tensor:
         """The velocity (B, N, D) that the bundle starts from.
 
         Args:
@@ -31,11 +31,11 @@ class Decoder(ABC):
         """
 
     @abstractmethod
-    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:
+    def known_velocity(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:
         """The velocity (B, N, D) that is known for a frame.
 
         Args:
-            carried: (B, N, D), from `carried`.
+            carried: (B, N, D), from `carried_velocity`.
             previous: (B, N, D) velocity of the frame before, `carried` for the first.
             gravity: (B, 1, D) known acceleration.
             frame: 1 … m.
@@ -45,7 +45,7 @@ class Decoder(ABC):
 class _Ballistic(Decoder):
     """Decoders that keep the bundle's initial velocity, accelerated by known gravity."""
 
-    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
+    def known_velocity(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
         return carried + gravity * frame
 
 
@@ -53,10 +53,10 @@ class _Ballistic(Decoder):
 class Absolute(Decoder):
     """The paper's form: the network gives the whole velocity, v_i = g2p(output_i). Source: arXiv 2408.15753, eq. 5."""
 
-    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002 (nothing is known)
+    def carried_velocity(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002 (nothing is known)
         return torch.zeros_like(own)
 
-    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
+    def known_velocity(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
         return carried
 
 
@@ -64,7 +64,7 @@ class Absolute(Decoder):
 class Residual(_Ballistic):
     """The network gives increments to the grid's current velocity u: v_i = u + i g + g2p(output_i)."""
 
-    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
+    def carried_velocity(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
         return smoothed
 
 
@@ -75,7 +75,7 @@ class Flip(_Ballistic):
     Source: Brackbill & Ruppel, FLIP, J. Comput. Phys. 65 (1986): less smoothing than `Residual`, more noise.
     """
 
-    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
+    def carried_velocity(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
         return own
 
 
@@ -98,7 +98,7 @@ class Blend(_Ballistic):
         if not 0 <= self.flip <= 1:
             raise ConfigError(f"Blend.flip = {self.flip} must be from 0 to 1.")
 
-    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:
+    def carried_velocity(self, own: Tensor, smoothed: Tensor) -> Tensor:
         return self.flip * own + (1 - self.flip) * smoothed
 
 
@@ -109,8 +109,8 @@ class Acceleration(Decoder):
     Each frame's output acts where the particle is by then and stays with it, as forces do.
     """
 
-    def carried(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
+    def carried_velocity(self, own: Tensor, smoothed: Tensor) -> Tensor:  # noqa: ARG002
         return smoothed
 
-    def known(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
+    def known_velocity(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
         return previous + gravity

@@ -21,21 +21,21 @@ class _Batched:
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
         """The same on another device; `non_blocking` copies from pinned memory to a GPU do not block the host."""
-        return self._mapped(lambda values: values.to(device, non_blocking=non_blocking))
+        return self._map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Self:
         """The same in page-locked host memory, from which a GPU copies asynchronously."""
-        return self._mapped(Tensor.pin_memory)
+        return self._map(Tensor.pin_memory)
 
     def double(self) -> Self:
         """The same in float64; indices and masks keep their types."""
-        return self._mapped(lambda values: values.double() if values.is_floating_point() else values)
+        return self._map(lambda values: values.double() if values.is_floating_point() else values)
 
     def scenes(self, chosen: slice) -> Self:
         """Some of the scenes: views (B', …) of the tensors, the padding that of the whole batch."""
-        return self._mapped(lambda values: values[chosen])
+        return self._map(lambda values: values[chosen])
 
-    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
         names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both subclasses are dataclasses)
         return type(self)(**{name: change(getattr(self, name)) for name in names})
 
@@ -77,7 +77,7 @@ class Particles(_Batched):
         }
         _check_shapes(self, expected)
 
-    def moved(self, position: Tensor, velocity: Tensor) -> Particles:
+    def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
         """The same particles elsewhere: (B, N, D) positions and velocities."""
         return dataclasses.replace(self, position=position, velocity=velocity)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path`, of the same suffix, and renames it to `path` on success.
 
     Creates the folder if it does not exist. Readers of `path` see the old file or the complete new one; after an

@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1]
 """The folder of the package."""
 
 
-def shipped(folder: str) -> Path:
+def shipped_folder(folder: str) -> Path:
     """The shipped folder `configs` or `zoo`: inside the installed package, or beside it in a clone."""
     installed = PACKAGE / "_shipped" / folder
     return installed if installed.is_dir() else PACKAGE.parent / folder
@@ -25,7 +25,7 @@ def user_zoo() -> Path:
 
 def config_names() -> list[str]:
     """Names of the shipped configurations, as `--config` takes them."""
-    root = shipped("configs")
+    root = shipped_folder("configs")
     return sorted(str(path.relative_to(root)) for path in root.rglob("*.yaml"))
 
 
@@ -39,7 +39,7 @@ def find_config(name: str) -> Path:
     if given.is_file():
         return given
     if name in config_names():
-        return shipped("configs") / name
+        return shipped_folder("configs") / name
     raise ConfigError(
         f"--config {name}: there is no such file here, and the shipped configurations are {', '.join(config_names())}."
     )

@@ -222,7 +222,7 @@ def run_command(words: list[str], found: list[str]) -> int:
     sys.argv = [sys.argv[0], *found]
     locks: list[int] = []
     try:
-        with quiet_lightning(), _terminated_like_interrupted():
+        with quiet_lightning(), _treat_sigterm_like_sigint():
             EmulatorCLI(
                 words,
                 locks,
@@ -255,7 +255,7 @@ def resuming_command(words: list[str]) -> str:
 
 
 @contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
+def _treat_sigterm_like_sigint() -> Iterator[None]:
     """Turn SIGTERM into KeyboardInterrupt, as SIGINT is."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -102,18 +102,18 @@ def lines(found: Inspection) -> Iterator[str]:
             f"  {name:<6}{split.trajectories:>5} {trajectories}{read} of {_span(split.frames)} frames,"
             f" {_span(split.particles)} particles{static}"
         )
-    yield _labelled("materials", ", ".join(f"{name} ({_span(n)})" for name, n in found.materials.items()))
+    yield _format_label("materials", ", ".join(f"{name} ({_span(n)})" for name, n in found.materials.items()))
     if found.fields:
-        yield _labelled("fields", ", ".join(f"{name} {shape}" for name, shape in found.fields.items()))
-    yield _labelled("varies", ", ".join(found.varies) or "nothing but the initial state")
-    yield _labelled("bounds", _box(found.stated_bounds) + " stated")
-    yield _labelled("", _box(found.observed) + " observed")
-    yield _labelled("domain", f"{_box(found.domain)} for a grid; {', '.join(found.boundary)}")
-    yield _labelled("gravity", _gravity(found))
-    yield _labelled(
+        yield _format_label("fields", ", ".join(f"{name} {shape}" for name, shape in found.fields.items()))
+    yield _format_label("varies", ", ".join(found.varies) or "nothing but the initial state")
+    yield _format_label("bounds", _box(found.stated_bounds) + " stated")
+    yield _format_label("", _box(found.observed) + " observed")
+    yield _format_label("domain", f"{_box(found.domain)} for a grid; {', '.join(found.boundary)}")
+    yield _format_label("gravity", _gravity(found))
+    yield _format_label(
         "occupied", f"{100 * found.occupied:.2g}% of the domain, one trajectory {100 * found.occupied_each:.2g}%"
     )
-    yield _labelled("at rest", _rest(found))
+    yield _format_label("at rest", _rest(found))
     yield ""
     yield "  grid          particles per    cells per frame"
     yield "                occupied cell    median    99.9%      max"
@@ -125,10 +125,10 @@ def lines(found: Inspection) -> Iterator[str]:
             f"{grid.most_speed:>9.2f}{mark}"
         )
     for title, items in (("notes", found.notes), ("suspicious", found.findings or ("nothing found",))):
-        yield from _listed(title, items)
+        yield from _format_list(title, items)
 
 
-def _labelled(label: str, text: str) -> str:
+def _format_label(label: str, text: str) -> str:
     return f"  {label:<10}{text}"
 
 
@@ -157,7 +157,7 @@ def _rest(found: Inspection) -> str:
     return f"from frame {middle} on ({first}-{last}), {middle * found.dt:.3g} s{moving}"
 
 
-def _listed(title: str, items: Iterable[str]) -> Iterator[str]:
+def _format_list(title: str, items: Iterable[str]) -> Iterator[str]:
     items = list(items)
     if items:
         yield ""

@@ -126,12 +126,12 @@ def data_options(chosen: argparse.Namespace) -> Options:
         find_family(chosen.family)
     return Options(
         family=chosen.family,
-        types=_parsed("--types", chosen.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
-        static=_parsed("--static", chosen.static, _ids, 'type ids, e.g. 1,3, or "none"'),
-        bounds=_parsed("--bounds", chosen.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
+        types=_parse("--types", chosen.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
+        static=_parse("--static", chosen.static, _ids, 'type ids, e.g. 1,3, or "none"'),
+        bounds=_parse("--bounds", chosen.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
         dt=chosen.dt,
-        gravity=_parsed("--gravity", chosen.gravity, _numbers, "a number for each axis, e.g. 0,-9.81"),
-        periodic=_parsed("--boundary", chosen.boundary, _kinds, '"wall" or "periodic" for each axis'),
+        gravity=_parse("--gravity", chosen.gravity, _numbers, "a number for each axis, e.g. 0,-9.81"),
+        periodic=_parse("--boundary", chosen.boundary, _kinds, '"wall" or "periodic" for each axis'),
     )
 
 
@@ -141,7 +141,7 @@ def new_ids(text: str | None) -> dict[int, int] | None:
     Raises:
         ConfigError: if they cannot be read.
     """
-    pairs: dict[int, int] | None = _parsed("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
+    pairs: dict[int, int] | None = _parse("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
     return pairs
 
 
@@ -158,7 +158,7 @@ def _pairs(text: str) -> dict[int, int]:
     return {old: int(new) for old, new in _names(text).items()}
 
 
-def _parsed(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
+def _parse(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
     if text is None:
         return None
     try:

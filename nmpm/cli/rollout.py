@@ -36,7 +36,8 @@ def run(words: list[str]) -> None:
     from nmpm.zoo.registry import load_model
 
     model = load_model(chosen.model, chosen.device, chosen.root).with_network(chosen.precision)
-    state = _thrown(model, chosen) if chosen.data is None else _recorded(model, chosen.data, chosen.trajectory)
+    given = chosen.data is not None
+    state = _recorded_state(model, chosen.data, chosen.trajectory) if given else _thrown_state(model, chosen)
     _write(model, state, chosen)
     sys.stdout.write(f"wrote {chosen.frames + 2} frames of {state.position.shape[1]} particles to {chosen.out}\n")
 
@@ -82,14 +83,14 @@ def _check(chosen: argparse.Namespace) -> None:
     check_device(chosen.device)
 
 
-def _thrown(model: Pretrained, chosen: argparse.Namespace) -> Particles:
+def _thrown_state(model: Pretrained, chosen: argparse.Namespace) -> Particles:
     try:
         return model.example(chosen.seed, chosen.particles, chosen.blocks)
     except ConfigError as error:
         raise ConfigError(f"--particles {chosen.particles} --blocks {chosen.blocks}: {error}") from error
 
 
-def _recorded(model: Pretrained, path: Path, index: int) -> Particles:
+def _recorded_state(model: Pretrained, path: Path, index: int) -> Particles:
     """The state at the second frame of a recorded trajectory."""
     from nmpm.data.format import Split, read_metadata
     from nmpm.data.loading.padded_batch import collate

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm._support.version import __version__
 from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.folder_lock import lock_folder
@@ -163,7 +163,7 @@ def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
     foreign = [f"{split}.h5" for split in SPLITS if (folder / f"{split}.h5").exists()]
     if foreign:
         raise DataError(f"{folder}: {', '.join(foreign)} exists already and was not simulated; choose another folder.")
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(request.to_dict(), indent=1), encoding="utf-8")
 
 
@@ -209,7 +209,7 @@ def _simulate_parts(request: SimulationRequest, folder: Path, workers: int) -> N
 
 def _simulate_part(request: SimulationRequest, folder: Path, split: str, index: int) -> None:
     run = request.preset.simulate(request.trajectory_seed(split, index))
-    with replacing(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
+    with atomic_write(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
         np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import h5py
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
@@ -77,7 +77,7 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
     Raises:
         DataError: if a write fails, e.g. because the disk is full; `path` is then as it was.
     """
-    with replacing(path) as part, part.open("w+b", buffering=0) as raw:
+    with atomic_write(path) as part, part.open("w+b", buffering=0) as raw:
         target = _NeverFailingFile(raw.fileno())
 
         def check() -> None:

@@ -57,7 +57,7 @@ def lattice(box: Sequence[Interval], spacing: float) -> Tensor:
     return torch.cartesian_prod(*axes).reshape(-1, len(axes)).float()
 
 
-def resting(scene: Scene, position: Tensor, obstacle: Tensor | None = None) -> Particles:
+def state_at_rest(scene: Scene, position: Tensor, obstacle: Tensor | None = None) -> Particles:
     """Particles (N, D) of the first material at rest, and perhaps obstacle particles (M, D): one scene (B = 1)."""
     material = torch.zeros(1, len(position), dtype=torch.int64)
     return _state(scene, position[None], torch.zeros_like(position)[None], material, obstacle)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
 from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
@@ -157,7 +157,7 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
     plain = {key: value for key, value in plain.items() if value is not None} | metadata.extra
     path = Path(folder) / METADATA_FILE
     try:
-        with replacing(path) as part:
+        with atomic_write(path) as part:
             part.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise DataError(

@@ -84,7 +84,7 @@ class Advection:
         Raises:
             DataError: as `constrained_path`.
         """
-        return self._checked(self._free(flight))
+        return self._check_bounds(self._free(flight))
 
     def constrained_path(self, flight: Flight, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
@@ -102,7 +102,7 @@ class Advection:
         if self.constraints.rest_speed:
             still = at_rest(flight.cells, path, self.constraints.rest_speed, flight.gravity)
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
-        return self._checked(path)
+        return self._check_bounds(path)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
@@ -123,15 +123,15 @@ class Advection:
         cells, velocity, path = flight.cells, flight.carried, []
         fields = flight.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
         for frame, field in enumerate(fields, start=1):
-            arrived = self._moved(flight, field, cells, velocity, frame)
+            arrived = self._advance(flight, field, cells, velocity, frame)
             velocity, cells = arrived - cells, arrived
             path.append(cells)
         return torch.stack(path, dim=1)
 
-    def _moved(self, flight: Flight, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
+    def _advance(self, flight: Flight, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
         """(B, N, D) positions after a frame, from cells (B, N, D) and the velocity (B, N, D) of the frame before."""
-        known = self.decoder.known(flight.carried, velocity, flight.gravity, frame)
-        return self._confined(cells + (known + self.gather(field, cells, flight.material)))
+        known = self.decoder.known_velocity(flight.carried, velocity, flight.gravity, frame)
+        return self._confine(cells + (known + self.gather(field, cells, flight.material)))
 
     def _within_energy(self, flight: Flight, budget: Tensor) -> Tensor:
         """(B, m, N, D) positions of which no frame exceeds an energy (B,).
@@ -139,12 +139,12 @@ class Advection:
         On a CPU the free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
         """
         if not can_branch(budget):
-            return self._limited(flight, budget, flight.cells.unsqueeze(1)[:, :0])
+            return self._limit_energy(flight, budget, flight.cells.unsqueeze(1)[:, :0])
         path = self._free(flight)
         exceeds = (self._energies(flight, path) > budget.unsqueeze(1)).any(0)
         if not bool(exceeds.any()):
             return path
-        return self._limited(flight, budget, path[:, : int(exceeds.int().argmax())])
+        return self._limit_energy(flight, budget, path[:, : int(exceeds.int().argmax())])
 
     def _energies(self, flight: Flight, path: Tensor) -> Tensor:
         """(B, m) energy of each frame of a path (B, m, N, D)."""
@@ -156,7 +156,7 @@ class Advection:
             parts.append(energy(own, steps, gravity, part.share))
         return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
 
-    def _limited(self, flight: Flight, budget: Tensor, begun: Tensor) -> Tensor:
+    def _limit_energy(self, flight: Flight, budget: Tensor, begun: Tensor) -> Tensor:
         """(B, m, N, D) positions, each frame within an energy (B,): all particles advance together, as they share it.
 
         Chunks only bound the memory of interpolation.
@@ -173,12 +173,12 @@ class Advection:
         parts = [(flight.part(chunk), chunk) for chunk in chunks(flight.cells.shape[1], flight.cells.device)]
         for frame, field in enumerate(flight.fields.unbind(1)[len(path) - 1 :], start=len(path)):
             cells = path[-1]
-            moved = [self._moved(part, field, cells[:, own], velocity[:, own], frame) for part, own in parts]
+            moved = [self._advance(part, field, cells[:, own], velocity[:, own], frame) for part, own in parts]
             proposed = torch.cat(moved, dim=1) if len(moved) > 1 else moved[0]
             step = proposed - cells
             place, way, last, gravity = self.grid.isotropic_units(cells, step, before, flight.gravity)
             factor = affordable(place, way, last, gravity, flight.share, budget)
-            arrived = torch.where(factor < 1, self._confined(cells + factor * step), proposed)
+            arrived = torch.where(factor < 1, self._confine(cells + factor * step), proposed)
             velocity = before = arrived - cells
             path.append(arrived)
         return torch.stack(path[1:], dim=1)
@@ -189,9 +189,9 @@ class Advection:
             return path
         room = 1 - self.walls
         share = torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
-        return self._confined(Contact(share, self.grid).hold(flight.cells, path))
+        return self._confine(Contact(share, self.grid).hold(flight.cells, path))
 
-    def _confined(self, cells: Tensor) -> Tensor:
+    def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""
         if all(self.scene.periodic):
             return cells
@@ -205,7 +205,7 @@ class Advection:
         ]
         return torch.stack(columns, dim=-1)
 
-    def _checked(self, path: Tensor) -> Tensor:
+    def _check_bounds(self, path: Tensor) -> Tensor:
         if self.constraints.bounds == "error":
             check_within_bounds(path, self.bounds, self.scene.periodic)
         return path

@@ -52,7 +52,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
     device = emulator.input_mean.device
     windows = [window.to(device) for window in windows]
-    inputs = _combined(all_gather(_inputs(emulator, windows)))
+    inputs = _combine(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
@@ -79,7 +79,7 @@ def _shareable(values: Tensor) -> Tensor:
     return values.cpu() if rank_and_world_size()[1] > 1 else values
 
 
-def _combined(parts: Sequence[_Inputs]) -> _Inputs:
+def _combine(parts: Sequence[_Inputs]) -> _Inputs:
     """The statistics of several samples together."""
     if len(parts) == 1:
         return parts[0]
@@ -104,7 +104,7 @@ def _state(emulator: Emulator, window: Window) -> Tensor:
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
     """For each material, the part of the velocity that the network has to predict."""
-    unknown = [_unknown(emulator, window) for window in windows]
+    unknown = [_unknown_velocity(emulator, window) for window in windows]
     found = []
     for index in range(len(emulator.scene.materials)):
         chosen = [window.mask & (window.material == index) for window in windows]
@@ -123,15 +123,15 @@ def _root_mean_square(parts: Sequence[_Unknowns]) -> Tensor:
     return square.sqrt().to(some[0].square)
 
 
-def _unknown(emulator: Emulator, window: Window) -> Tensor:
+def _unknown_velocity(emulator: Emulator, window: Window) -> Tensor:
     """(B, m, N, D) true velocities less what the decoder knows, in cells per frame."""
     grid, decoder = emulator.grid, emulator.decoder
     steps = grid.to_cell_displacement(window.frames[:, 1:].diff(dim=1))[:, : emulator.frames]
     velocity = grid.to_cell_displacement(window.initial.velocity)
     gravity = grid.to_cell_displacement(window.gravity).unsqueeze(1)
-    carried = decoder.carried(velocity, velocity)
+    carried = decoder.carried_velocity(velocity, velocity)
     before = [carried, *steps.unbind(1)]
-    known = [decoder.known(carried, before[i - 1], gravity, i) for i in range(1, emulator.frames + 1)]
+    known = [decoder.known_velocity(carried, before[i - 1], gravity, i) for i in range(1, emulator.frames + 1)]
     return steps - torch.stack(known, dim=1)
 
 

@@ -199,7 +199,7 @@ class Emulator(nn.Module):
         share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
         return energy(cells, velocity, gravity, share)
 
-    def normalised(self, state: Tensor) -> Tensor:
+    def normalise(self, state: Tensor) -> Tensor:
         """The processor's input for a grid state (B, C_in, *S) in grid units."""
         # Inputs are clipped to the calibrated range: outputs for others are arbitrary and may be huge.
         clipped = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
@@ -217,7 +217,7 @@ class Emulator(nn.Module):
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self.in_cells(particles)
             state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
-            normalised = self.normalised(state)
+            normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
@@ -225,7 +225,7 @@ class Emulator(nn.Module):
             fields = output.to(self.precision) * self.output_scale
             advection = self.advection
             smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
-            carried = self.decoder.carried(velocity, smoothed)
+            carried = self.decoder.carried_velocity(velocity, smoothed)
             share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
             flight = Flight(cells, velocity, carried, gravity, particles.material, fields, share)
             if self.training:

@@ -33,7 +33,7 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
             if not remaining:
                 monitor.read()
         yield bundle
-        particles = particles.moved(bundle.position[:, -1], bundle.velocity)
+        particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:

@@ -25,13 +25,13 @@ def free_fall(scene: Scene, particles: Particles, frames: int) -> Tensor:
     gravity = particles.gravity[:, None, None]
     path = start + velocity * step + gravity * (step * (step + 1) / 2)
     columns = [
-        path[..., axis] if scene.periodic[axis] else _stopped(path[..., axis], *scene.bounds[axis])
+        path[..., axis] if scene.periodic[axis] else _stop_at_walls(path[..., axis], *scene.bounds[axis])
         for axis in range(scene.dim)
     ]
     return torch.stack(columns, dim=-1)
 
 
-def _stopped(path: Tensor, low: float, high: float) -> Tensor:
+def _stop_at_walls(path: Tensor, low: float, high: float) -> Tensor:
     """A path (B, T, N) held at the first bound it reaches; at the lower one if it reaches both at once."""
     frames = torch.arange(path.shape[1], device=path.device).view(1, -1, 1)
     below, above = _first(path <= low, frames), _first(path >= high, frames)

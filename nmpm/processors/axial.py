@@ -113,7 +113,7 @@ class Attention(nn.Module):
         rows = hidden.movedim((self.axis, 1), (-2, -1))
         query, key, value = self.project(rows).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0).transpose(-2, -3)
         angles = _angles(rows.shape[-2], query.shape[-1] // 2, self.wraps, rows.device)
-        mixed = functional.scaled_dot_product_attention(_turned(query, angles), _turned(key, angles), value)
+        mixed = functional.scaled_dot_product_attention(_rotate(query, angles), _rotate(key, angles), value)
         out: Tensor = self.out(mixed.transpose(-2, -3).flatten(-2))
         return out.movedim((-2, -1), (self.axis, 1))
 
@@ -126,7 +126,7 @@ def _angles(length: int, pairs: int, wraps: bool, device: torch.device) -> Tenso
     return place[:, None] * speed
 
 
-def _turned(rows: Tensor, angles: Tensor) -> Tensor:
+def _rotate(rows: Tensor, angles: Tensor) -> Tensor:
     """Rows (..., L, 2 P) with each pair of channels turned by its angle."""
     cos, sin = angles.cos().to(rows.dtype), angles.sin().to(rows.dtype)
     one, other = rows.chunk(2, dim=-1)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm.errors import ConfigError, DataError
 
 
@@ -63,7 +63,7 @@ def replace_picture(path: Path) -> Iterator[Path]:
         DataError: if writing fails, for example because the disk is full.
     """
     try:
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             yield temporary
     except OSError as error:
         # The encoder's message continues with its whole command line.

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 from safetensors.torch import save
 
-from nmpm._support.shipped import PACKAGE, shipped, user_zoo
+from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
 from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module
@@ -76,7 +76,7 @@ def _target(name: str, root: str | Path | None) -> Path:
     zoo = user_zoo() if root is None else Path(root)
     if zoo.resolve().is_relative_to(PACKAGE.resolve()):
         raise ZooError(f"{zoo} is part of the installed package: leave --root out to add to {user_zoo()}.")
-    taken = [zoo / name, *([shipped("zoo") / name] if root is None else [])]
+    taken = [zoo / name, *([shipped_folder("zoo") / name] if root is None else [])]
     for folder in taken:
         if (folder / "card.yaml").exists():
             raise ZooError(f"{folder} exists: choose another name, or remove it first.")

@@ -22,7 +22,7 @@ import torch
 from nmpm._support.devices import find_device
 from nmpm._support.limits import NAME_LENGTH
 from nmpm._support.messages import one_line, suggestion
-from nmpm._support.shipped import shipped, user_zoo
+from nmpm._support.shipped import shipped_folder, user_zoo
 from nmpm.errors import ZooError
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.pretrained import Pretrained
@@ -57,7 +57,7 @@ class Zoo:
         for zoo in _roots(root):
             if _exists(zoo / name / CARD):
                 return zoo / name
-        raise _unknown(name, root)
+        raise _unknown_model(name, root)
 
     @staticmethod
     def card(name: str, root: Root = None) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
     elif path.suffix == ".ckpt" or _exists(path):
         found = _load_path(path)
     else:
-        raise _unknown(name)
+        raise _unknown_model(name)
     return found.to(target)
 
 
@@ -126,7 +126,7 @@ def _load_path(path: Path) -> Pretrained:
     raise ZooError(f"{path} holds no model: neither an entry of the zoo ({CARD}) nor a run ({BEST}).")
 
 
-def _unknown(name: str, root: Root = None) -> ZooError:
+def _unknown_model(name: str, root: Root = None) -> ZooError:
     known = Zoo.list(root)
     near = suggestion(name[:NAME_LENGTH], known)
     path = " No such path exists either." if root is None else ""
@@ -152,7 +152,7 @@ def _names(root: Path) -> list[str]:
 
 def _roots(root: Root) -> tuple[Path, ...]:
     if root is None:
-        return user_zoo(), shipped("zoo")
+        return user_zoo(), shipped_folder("zoo")
     if not _exists(Path(root)) or not Path(root).is_dir():
         raise ZooError(f"There is no zoo in {one_line(root)}: it is not a folder.")
     return (Path(root),)

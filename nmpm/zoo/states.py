@@ -70,7 +70,7 @@ class StateBuilder:
         shape = (self.batch, self.count, self.scene.dim)
         if given is None:
             return torch.zeros_like(self.position)
-        return self._expanded("velocity", given, [shape[2:], shape[1:], shape], shape)
+        return self._expand("velocity", given, [shape[2:], shape[1:], shape], shape)
 
     def _material(self, given: Any) -> Tensor:
         materials, shape = self.scene.materials, (self.batch, self.count)
@@ -82,7 +82,7 @@ class StateBuilder:
             names = np.asarray(given)
             if names.dtype.kind in "UO":
                 given = np.vectorize(self._index_of, otypes=[np.int64])(names)
-        found = self._expanded("material", given, [(), shape[1:], shape], shape)
+        found = self._expand("material", given, [(), shape[1:], shape], shape)
         wrong = (found != found.round()) | (found < 0) | (found >= len(materials))
         if wrong.any():
             scene, particle = map(int, wrong.nonzero()[0])
@@ -109,7 +109,7 @@ class StateBuilder:
         found = _numbers("obstacle", given)
         count = found.shape[-2] if found.dim() > 1 else 0
         shape = (self.batch, count, dim)
-        found = self._expanded("obstacle", found, [shape[1:], shape], shape)
+        found = self._expand("obstacle", found, [shape[1:], shape], shape)
         if not found.isfinite().all():
             raise DataError("obstacle has values that are not finite.")
         return found
@@ -119,8 +119,8 @@ class StateBuilder:
         if given is None:
             if scene.gravity_varies:
                 raise DataError("gravity is needed, in length/s²: this model's scenes differ in it.")
-            return self._expanded("gravity", scene.gravity or (0.0,) * scene.dim, [shape[1:]], shape)
-        found = self._expanded("gravity", given, [shape[1:], shape], shape)
+            return self._expand("gravity", scene.gravity or (0.0,) * scene.dim, [shape[1:]], shape)
+        found = self._expand("gravity", given, [shape[1:], shape], shape)
         if not found.isfinite().all():
             raise DataError(f"gravity = {found.tolist()} must be finite.")
         if scene.gravity_varies:
@@ -187,7 +187,7 @@ class StateBuilder:
         low = torch.where(low <= -UNLIMITED / 2, -torch.inf, low)
         return low * scale, torch.where(high >= UNLIMITED / 2, torch.inf, high) * scale
 
-    def _expanded(self, name: str, given: Any, allowed: list[tuple[int, ...]], shape: tuple[int, ...]) -> Tensor:
+    def _expand(self, name: str, given: Any, allowed: list[tuple[int, ...]], shape: tuple[int, ...]) -> Tensor:
         found = _numbers(name, given)
         if tuple(found.shape) not in allowed:
             raise DataError(

@@ -5,7 +5,7 @@ import tempfile
 import numpy as np
 import pytest
 
-from nmpm._support.shipped import shipped
+from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.data.format import Split
 
@@ -18,11 +18,11 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_names_and_paths_give_the_same_rollout(folder):
-    (folder / "copy").symlink_to(shipped("zoo") / "goop")
+    (folder / "copy").symlink_to(shipped_folder("zoo") / "goop")
     few = ["--frames", "4", "--particles", "50"]
     assert main(["rollout", "goop", *few, "--out", "a.h5", "--device", "cpu"]) == 0
     assert main(["rollout", "./copy", *few, "--out", "b.h5"]) == 0
-    assert main(["rollout", "goop", "--root", str(shipped("zoo")), *few, "--out", "c.h5"]) == 0
+    assert main(["rollout", "goop", "--root", str(shipped_folder("zoo")), *few, "--out", "c.h5"]) == 0
     a, b, c = (Split(folder / f"{name}.h5").read(0).position for name in "abc")
     assert a.shape[0] == 6
     np.testing.assert_array_equal(a, b)

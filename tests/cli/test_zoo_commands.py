@@ -1,6 +1,6 @@
 import pytest
 
-from nmpm._support.shipped import shipped
+from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.zoo import Zoo
 
@@ -14,7 +14,7 @@ def home(tmp_path, monkeypatch):
 
 def copy(name, folder):
     folder.mkdir(parents=True)
-    for path in (shipped("zoo") / name).iterdir():
+    for path in (shipped_folder("zoo") / name).iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
 
 

@@ -178,7 +178,7 @@ def test_gradients_through_the_energy_limit_are_finite(monkeypatch):
     emulator.output_scale.mul_(3.0)
     for allowed in (-1e6, emulator.budget(particles)[0].item(), 1e6, float("inf")):
         position = particles.position.clone().requires_grad_()
-        state = particles.moved(position, particles.velocity)
+        state = particles.with_motion(position, particles.velocity)
         budget = torch.full((2,), allowed)
         emulator(state, RolloutContext(emulator.solid(state), budget)).position.square().sum().backward()
         assert position.grad.isfinite().all()
@@ -190,7 +190,7 @@ def test_a_particle_that_is_not_finite_disturbs_no_other_scene():
     expected = emulator(particles).position
     broken = particles.velocity.clone()
     broken[1, 3] = float("nan")
-    state = particles.moved(particles.position, broken)
+    state = particles.with_motion(particles.position, broken)
     found = emulator(state).position
     assert torch.equal(found[0], expected[0])
     assert found[1].isnan().any()
@@ -299,7 +299,7 @@ def test_a_network_is_shown_no_more_than_the_calibration_saw():
     emulator.input_low.fill_(-0.5)
     crowded = cloud(scene, count=400, speed=0.0)
     centre = torch.full_like(crowded.position, 0.505)
-    packed = crowded.moved(centre, crowded.velocity)
+    packed = crowded.with_motion(centre, crowded.velocity)
     denser = dataclasses.replace(
         packed, **{f.name: torch.cat([getattr(packed, f.name)] * 2, dim=1) for f in dataclasses.fields(packed)
                    if f.name in ("position", "velocity", "material", "mask")},
@@ -341,8 +341,8 @@ def test_energies_of_cells_that_are_not_square_are_counted_in_lengths():
     scene = box()
     square, oblong = emulator_of(scene, cells=16, energy=True), emulator_of(scene, cells=(16, 8), energy=True)
     particles = cloud(scene)
-    fall = particles.moved(particles.position - torch.tensor([0.0, 0.1]), particles.velocity)
-    along = particles.moved(particles.position - torch.tensor([0.1, 0.0]), particles.velocity)
+    fall = particles.with_motion(particles.position - torch.tensor([0.0, 0.1]), particles.velocity)
+    along = particles.with_motion(particles.position - torch.tensor([0.1, 0.0]), particles.velocity)
     gains = [(e.budget(fall) - e.budget(particles)).item() for e in (square, oblong)]
     assert gains[0] == pytest.approx(gains[1], rel=1e-4)  # both in units of the first axis' cells
     assert oblong.budget(along).item() == pytest.approx(oblong.budget(particles).item(), rel=1e-4)

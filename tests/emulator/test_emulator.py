@@ -51,7 +51,7 @@ def test_every_combination_predicts_finite_bundles_within_the_walls(transfer, de
 def test_free_fall_of_a_block_is_exact_where_gravity_is_known(transfer, decoder):
     scene = box()
     particles = cloud(scene)
-    particles = particles.moved(particles.position, torch.zeros_like(particles.velocity) + 1e-3)
+    particles = particles.with_motion(particles.position, torch.zeros_like(particles.velocity) + 1e-3)
     path = rollout(silenced(small(scene, transfer, decoder, frames=4)), particles, 20)
     steps = torch.arange(1, 21).view(1, -1, 1, 1)
     exact = particles.position[:, None] + 1e-3 * steps + particles.gravity[:, None, None] * steps * (steps + 1) / 2
@@ -113,7 +113,7 @@ def test_neither_origin_nor_unit_of_length_matters(factor, offset):
         particle_volume=scene.particle_volume * factor**2,
     )
     particles = cloud(scene)
-    there = particles.moved(particles.position.double() * factor + offset, particles.velocity.double() * factor)
+    there = particles.with_motion(particles.position.double() * factor + offset, particles.velocity.double() * factor)
     here = rollout(small(scene), particles, 6)
     back = (rollout(small(moved), there, 6).double() - offset) / factor
     torch.testing.assert_close(back.float(), here, atol=2e-5 * max(1, abs(offset)), rtol=0)
@@ -127,7 +127,7 @@ def test_float64_positions_far_from_the_origin_stay_precise():
         domain=tuple((a + 1e8, b + 1e8) for a, b in scene.domain),
     )
     particles = cloud(scene)
-    there = particles.moved(particles.position.double() + 1e8, particles.velocity.double())
+    there = particles.with_motion(particles.position.double() + 1e8, particles.velocity.double())
     back = rollout(small(far), there, 6) - 1e8
     torch.testing.assert_close(back.float(), rollout(small(scene), particles, 6), atol=1e-5, rtol=0)
 
@@ -166,7 +166,7 @@ def test_walls_fill_the_share_of_the_domain_beyond_the_bounds():
 def test_periodic_axes_wrap_and_walls_do_not():
     scene = box(boundary=("periodic", "wall"), bounds=((0.0, 1.0), (0.1, 0.9)), domain=((0.0, 1.0), (0.08, 0.92)))
     particles = cloud(scene)
-    elsewhere = particles.moved(particles.position + torch.tensor([2.0, 0.0]), particles.velocity)
+    elsewhere = particles.with_motion(particles.position + torch.tensor([2.0, 0.0]), particles.velocity)
     emulator = small(scene)
     torch.testing.assert_close(
         rollout(emulator, elsewhere, 6) - torch.tensor([2.0, 0.0]), rollout(emulator, particles, 6), atol=1e-5, rtol=0
@@ -188,7 +188,7 @@ def test_gradients_through_several_bundles_are_finite_and_reach_the_first_state(
     particles = cloud(scene)
     position = particles.position.clone().requires_grad_()
     emulator = small(scene)
-    last = list(unroll(emulator, particles.moved(position, particles.velocity), 3))[-1]
+    last = list(unroll(emulator, particles.with_motion(position, particles.velocity), 3))[-1]
     last.position.square().sum().backward()
     assert position.grad.isfinite().all()
     assert position.grad.abs().sum() > 0
@@ -260,7 +260,7 @@ def test_over_a_wider_box_what_is_far_from_the_walls_moves_as_before(dim):
     other = emulator.over(wide)
     assert other.grid.shape == (32,) + (16,) * (dim - 1)
     torch.testing.assert_close(rollout(other, particles, 5), rollout(emulator, particles, 5), atol=1e-6, rtol=0)
-    shifted = particles.moved(particles.position + torch.tensor([0.84] + [0.0] * (dim - 1)), particles.velocity)
+    shifted = particles.with_motion(particles.position + torch.tensor([0.84] + [0.0] * (dim - 1)), particles.velocity)
     moved = rollout(other, shifted, 5) - torch.tensor([0.84] + [0.0] * (dim - 1))
     torch.testing.assert_close(moved, rollout(emulator, particles, 5), atol=1e-5, rtol=0)
 

@@ -133,7 +133,7 @@ def test_an_origin_far_away_costs_nothing_in_float64():
 def test_an_origin_too_far_for_float32_is_refused_by_name():
     scene = far_away(1e8)
     particles = cloud(box(gravity=None))
-    particles = particles.moved(particles.position + 1e8, particles.velocity)
+    particles = particles.with_motion(particles.position + 1e8, particles.velocity)
     with pytest.raises(DataError, match=r"float32 numbers have a spacing of 8 near 1e\+08.*give positions in float64"):
         rollout(emulator_of(scene), particles, 2)
 
@@ -147,7 +147,7 @@ def test_gradients_are_finite_beside_empty_cells_and_walls(transfer):
     leaf = position.requires_grad_()
     velocity = particles.velocity.clone().requires_grad_()
     emulator = emulator_of(scene, transfer)
-    moved = particles.moved(leaf, velocity)
+    moved = particles.with_motion(leaf, velocity)
     bundle = emulator(moved)
     bundle.position.square().sum().backward()
     for tensor in (leaf.grad, velocity.grad, *(p.grad for p in emulator.parameters())):
@@ -200,7 +200,7 @@ class TestPoison:
         position = particles.position.clone()
         position[0, 5, 1] = 1.5
         with pytest.raises(DataError, match=r"particle 5: it is at .* outside of the domain .* \(1 particles are\)"):
-            rollout(emulator_of(scene), particles.moved(position, particles.velocity), 2)
+            rollout(emulator_of(scene), particles.with_motion(position, particles.velocity), 2)
 
     def test_padding_may_hold_anything(self):
         scene = box()

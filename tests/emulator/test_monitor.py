@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.data.initial_states import lattice, resting
+from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Flip
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
@@ -68,8 +68,8 @@ def test_record_is_silent():
 def test_crowding_is_the_fullest_cell():
     scene = box(particle_volume=0.01**2)
     emulator = emulator_of(scene, 1e-6)
-    state = resting(scene, lattice(((0.3, 0.6), (0.3, 0.6)), 0.01))
-    packed = state.moved(0.45 + 0.5 * (state.position - 0.45), state.velocity)
+    state = state_at_rest(scene, lattice(((0.3, 0.6), (0.3, 0.6)), 0.01))
+    packed = state.with_motion(0.45 + 0.5 * (state.position - 0.45), state.velocity)
     for start, expected in ((state, 1.0), (packed, 4.0)):
         monitor = Monitor(Policy.RECORD, crowding=2.0)
         rollout(emulator, start, 4, monitor)
@@ -188,7 +188,7 @@ class TestBounds:
         )
         emulator.output_scale.fill_(1e-9)
         particles = cloud(scene, speed=0.0)
-        particles = particles.moved(particles.position, torch.tensor([0.0, -0.03]).expand_as(particles.position))
+        particles = particles.with_motion(particles.position, torch.tensor([0.0, -0.03]).expand_as(particles.position))
         return rollout(emulator, particles, 24)
 
     def test_stop(self):
@@ -207,7 +207,7 @@ class TestBounds:
             scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds="error")
         ).build()
         particles = cloud(scene)
-        fast = particles.moved(particles.position, torch.full_like(particles.position, 0.5))
+        fast = particles.with_motion(particles.position, torch.full_like(particles.position, 0.5))
         with pytest.raises(ValueError, match=r"particle 0: predicted at .* more than one beyond"):
             rollout(emulator.eval(), fast, 4)
 
@@ -224,7 +224,7 @@ class TestBounds:
         velocity[1, 23] = 0.7
         emulator.output_scale.fill_(1e-9)
         with pytest.raises(ValueError, match=r"Scene 1 of the batch, particle 23: .* in frame 1 of the bundle"):
-            rollout(emulator.eval(), particles.moved(particles.position, velocity), 4)
+            rollout(emulator.eval(), particles.with_motion(particles.position, velocity), 4)
 
     @pytest.mark.parametrize("rule", ["stop", "reflect", "error"])
     def test_periodic_axes_have_no_bounds(self, rule):
@@ -233,7 +233,7 @@ class TestBounds:
         emulator = EmulatorRecipe(scene, (16, 16), 4, **parts).build().eval()
         emulator.output_scale.fill_(1e-9)
         particles = cloud(scene, speed=0.0)
-        state = particles.moved(particles.position, torch.tensor([0.5, 0.0]).expand_as(particles.velocity))
+        state = particles.with_motion(particles.position, torch.tensor([0.5, 0.0]).expand_as(particles.velocity))
         moved = rollout(emulator, state, 4)[:, -1] - particles.position
         torch.testing.assert_close(moved[..., 0], torch.full((1, 30), 2.0), rtol=1e-5, atol=0)
 

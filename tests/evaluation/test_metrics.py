@@ -108,7 +108,7 @@ def test_free_fall_is_the_parabola_and_stops_at_the_first_wall():
     fallen = particles.position[:, None, :, 1] + particles.gravity[0, 1] * early * (early + 1) / 2
     torch.testing.assert_close(path[:, :10, :, 1], fallen, atol=1e-6, rtol=0)
     torch.testing.assert_close(path[:, -1, :, 1], torch.full((1, 30), 0.1))
-    thrown = particles.moved(particles.position, torch.tensor([0.0, 0.02]).expand_as(particles.position))
+    thrown = particles.with_motion(particles.position, torch.tensor([0.0, 0.02]).expand_as(particles.position))
     assert (free_fall(scene, thrown, 400)[:, -1, :, 1] == torch.tensor(0.9)).all()
 
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 import yaml
 
-from nmpm._support.shipped import shipped
+from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import DataError, ZooError
 from nmpm.training.checkpoints import load_module
@@ -142,7 +142,7 @@ class TestZoo:
     def root(self, tmp_path) -> Path:
         target = tmp_path / "zoo" / "goop"
         target.mkdir(parents=True)
-        for path in (shipped("zoo") / "goop").iterdir():
+        for path in (shipped_folder("zoo") / "goop").iterdir():
             (target / path.name).write_bytes(path.read_bytes())
         return tmp_path / "zoo"
 

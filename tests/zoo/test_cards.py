@@ -5,7 +5,7 @@ import pytest
 import torch
 import yaml
 
-from nmpm._support.shipped import PACKAGE, shipped
+from nmpm._support.shipped import PACKAGE, shipped_folder
 from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo import Zoo
@@ -85,7 +85,7 @@ def test_names_that_are_taken_and_folders_that_cannot_be_written(run, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ZooError, match="cannot be written"):
         add(run, "mine", tmp_path / "file")
-    assert sorted(path.name for path in shipped("zoo").glob(".adding-*")) == []
+    assert sorted(path.name for path in shipped_folder("zoo").glob(".adding-*")) == []
 
 
 @pytest.mark.parametrize("file", ["report.json", "stress.json"])

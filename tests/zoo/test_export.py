@@ -14,7 +14,7 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm._support.shipped import shipped
+from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
@@ -262,7 +262,7 @@ def test_a_zoo_model_from_the_command_line(tmp_path, monkeypatch, capsys):
 
 def test_a_model_by_its_path_is_named_after_its_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(shipped("zoo") / "goop", tmp_path / "models" / "mine")
+    shutil.copytree(shipped_folder("zoo") / "goop", tmp_path / "models" / "mine")
     assert main(["export", str(tmp_path / "models" / "mine"), "--processor"]) == 0
     assert (tmp_path / "mine-processor.onnx").is_file()
 

@@ -4,7 +4,7 @@ import sys
 import pytest
 import torch
 
-from nmpm._support.shipped import shipped
+from nmpm._support.shipped import shipped_folder
 from nmpm.errors import ConfigError, DataError, ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo.registry import Zoo, load_model
@@ -119,7 +119,7 @@ class TestDevices:
             for values in (module._parameters, module._buffers, vars(module)):
                 yield from (value for value in values.values() if isinstance(value, torch.Tensor))
 
-    @pytest.mark.parametrize("name", Zoo.list(shipped("zoo")))
+    @pytest.mark.parametrize("name", Zoo.list(shipped_folder("zoo")))
     def test_weights_and_buffers_move_and_the_first_model_stays(self, name):
         model = Zoo.load(name)
         moved = model.to("meta")

@@ -3,7 +3,7 @@ import pytest
 import torch
 import yaml
 
-from nmpm._support.shipped import shipped
+from nmpm._support.shipped import shipped_folder
 from nmpm._support.specs import from_spec
 from nmpm.cli import main
 from nmpm.data.format import Split
@@ -107,7 +107,7 @@ def test_a_shipped_model_rolls_out_and_renders_from_the_shell(tmp_path, monkeypa
     assert main(["rollout", names[0], "--data", "out.h5", "--frames", "3", "--out", "again.h5"]) == 1
 
 
-@pytest.mark.parametrize("name", Zoo.list(shipped("zoo")))
+@pytest.mark.parametrize("name", Zoo.list(shipped_folder("zoo")))
 def test_shipped_models_keep_particles_in_the_box_and_beat_the_trivial_predictors(name):
     model = Zoo.load(name)
     positions = model.rollout(model.example(count=300), 100)
@@ -117,7 +117,7 @@ def test_shipped_models_keep_particles_in_the_box_and_beat_the_trivial_predictor
     assert (positions <= high + 1e-5).all()
     test = model.card["test"]
     assert test["mse"] < min(test["still/mse"], test["free_fall/mse"])
-    assert (shipped("zoo") / name / "README.md").is_file()
+    assert (shipped_folder("zoo") / name / "README.md").is_file()
 
 
 @pytest.mark.parametrize(

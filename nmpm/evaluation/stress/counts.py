@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from nmpm.data.initial_states import lattice, resting, thrown_blocks
+from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
 from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject
@@ -48,7 +48,7 @@ def _with_density(subject: Subject, factor: float, size: Size) -> Line:
     centre = (state.position * real).sum(1, keepdim=True) / real.sum(1, keepdim=True)
     low, high = state.position.new_tensor(scene.bounds).T
     position = (centre + (state.position - centre) * factor ** (-1 / scene.dim)).clamp(low, high)
-    trace = trace_rollout(subject.emulator.over(scene), state.moved(position, state.velocity), subject.horizon)
+    trace = trace_rollout(subject.emulator.over(scene), state.with_motion(position, state.velocity), subject.horizon)
     return Line(_GROUP, f"density × {factor:g}", trace.valid, trace.figures(), INVARIANTS)
 
 
@@ -70,7 +70,7 @@ def _full_box(subject: Subject, size: Size) -> Line:
     """A box full of particles, which can hardly move; coarser ones where too many would be needed."""
     scene = subject.emulator.scene
     scene = dataclasses.replace(scene, particle_volume=max(scene.particle_volume, scene.volume / size.particles))
-    state = resting(scene, lattice(scene.bounds, scene.particle_spacing)).to(subject.device)
+    state = state_at_rest(scene, lattice(scene.bounds, scene.particle_spacing)).to(subject.device)
     trace = trace_rollout(subject.emulator.over(scene), state, 4 * subject.horizon)
     moved = rms_distance(subject.emulator.grid, state.mask, state.position.unsqueeze(1), trace.last.unsqueeze(1))
     figures = trace.figures() | {"moved_cells": float(moved)}

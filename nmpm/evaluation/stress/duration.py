@@ -36,7 +36,7 @@ def duration(subject: Subject, size: Size) -> Iterator[Line]:
     yield failure(long)
     far = trace_rollout(subject.emulator, state.scenes(slice(1)), size.far)
     yield Line(_GROUP, f"{size.far:,} frames", far.valid, far.figures(), INVARIANTS)
-    yield from settled(subject, long, state, size)
+    yield from settled_lines(subject, long, state, size)
 
 
 def failure(trace: Trace) -> Line:
@@ -46,7 +46,7 @@ def failure(trace: Trace) -> Line:
     return Line(_GROUP, "steps to failure (one more than all: none)", None, {k: float(v) for k, v in figures.items()})
 
 
-def settled(subject: Subject, trace: Trace, state: Particles, size: Size) -> Iterator[Line]:
+def settled_lines(subject: Subject, trace: Trace, state: Particles, size: Size) -> Iterator[Line]:
     """Material that has settled, in the simulator where there is one, stays where it is and keeps its volume.
 
     The rest constraint alone can make these lines pass; `settling` tests how material comes to rest.
@@ -61,7 +61,7 @@ def settled(subject: Subject, trace: Trace, state: Particles, size: Size) -> Ite
         before = {"simulator_change_percent": _change(subject, state, earlier, last)}
     else:
         last = trace.last
-    rest = state.moved(last, torch.zeros_like(last))
+    rest = state.with_motion(last, torch.zeros_like(last))
     own = filled_volume(subject.emulator, rest, rest.position).unsqueeze(1)
     long = trace_rollout(subject.emulator, rest, size.settled, every=max(1, size.settled // 20))
     ratio = long.filled / own - 1

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from nmpm.data.initial_states import lattice, resting
+from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
 from nmpm.evaluation.stress.lines import Line, Size
@@ -40,7 +40,7 @@ def obstacles(subject: Subject, size: Size) -> Iterator[Line]:
             yield _floor(emulator, f"a floor {cells} cells thick", cells, 0.0, bundles)
         yield _floor(emulator, "2 cells per frame against one cell", 1, 2.0, bundles)
         yield _hole(emulator, bundles)
-        yield _moving(emulator, bundles)
+        yield _moving_bar(emulator, bundles)
     yield _inlet(subject.emulator, bundles)
 
 
@@ -75,20 +75,20 @@ def _hole(emulator: Emulator, bundles: int) -> Line:
     return Line(_GROUP, "a hole in the floor", most == 0, _floats(figures), "no particle half a cell deep in the floor")
 
 
-def _moving(emulator: Emulator, bundles: int) -> Line:
+def _moving_bar(emulator: Emulator, bundles: int) -> Line:
     """A bar three cells thick and half as high as the box sweeps from the left, 0.4 cells per bundle."""
     scene, h = emulator.scene, emulator.grid.spacing[0]
     (left, right), (low, high), *rest = scene.bounds
     first = (left, left + 3 * h)
     still = bar(scene, (first, (low, (low + high) / 2), *rest))
     block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), scene.particle_spacing)
-    state = resting(scene, block, still).to(emulator.device)
+    state = state_at_rest(scene, block, still).to(emulator.device)
     still = state.obstacle[0]
 
     def place(bundle: int) -> float:
         return min(0.4 * bundle * h, (right - left) / 2)
 
-    def swept(state: Particles, bundle: int) -> Particles:
+    def sweep(state: Particles, bundle: int) -> Particles:
         shift = still.new_tensor([place(bundle)] + [0.0] * (scene.dim - 1))
         return dataclasses.replace(state, obstacle=(still + shift)[None])
 
@@ -96,7 +96,7 @@ def _moving(emulator: Emulator, bundles: int) -> Line:
         along = (position[:, 0] - place(bundle) - sum(first) / 2).abs() < (1.5 - 2 * _DEEP) * h
         return along & (position[:, 1] < (low + high) / 2 - h)
 
-    most = _max_violations(emulator, state, bundles, within, swept)
+    most = _max_violations(emulator, state, bundles, within, sweep)
     figures = {"in_the_bar": most, "of": state.position.shape[1]}
     return Line(_GROUP, "a bar that moves", most == 0, _floats(figures), "no particle a cell deep in it")
 
@@ -110,12 +110,12 @@ def _inlet(emulator: Emulator, bundles: int) -> Line:
     ]
     if scene.dim > 1:
         sides[1] = (scene.bounds[1][1] - 8 * h[1], scene.bounds[1][1] - 2 * h[1])
-    fresh = resting(scene, lattice(tuple(sides), scene.particle_spacing)).to(emulator.device)
+    fresh = state_at_rest(scene, lattice(tuple(sides), scene.particle_spacing)).to(emulator.device)
 
-    def fed(state: Particles, bundle: int) -> Particles:
+    def feed(state: Particles, bundle: int) -> Particles:
         return concatenate_particles(state, fresh) if bundle % 5 == 0 and bundle else state
 
-    most = _max_violations(emulator, fresh, bundles, lambda position, _: is_lost(scene, position), fed)
+    most = _max_violations(emulator, fresh, bundles, lambda position, _: is_lost(scene, position), feed)
     return Line(_GROUP, "an inlet", most == 0, {"lost": float(most)}, "no particle lost")
 
 
@@ -143,7 +143,7 @@ def _max_violations(
             for position in made.position[0]:
                 bad = forbidden(position, bundle) | ~position.isfinite().all(-1)
                 most = max(most, int(bad.sum()))
-            state = state.moved(made.position[:, -1], made.velocity)
+            state = state.with_motion(made.position[:, -1], made.velocity)
     return most
 
 
@@ -159,9 +159,9 @@ def _block(emulator: Emulator, slab: tuple[Interval, ...], speed: float, solid: 
     scene, h = emulator.scene, emulator.grid.spacing
     box = [(low + (high - low) / 3, high - (high - low) / 3) for low, high in scene.bounds]
     box[1] = (slab[1][1] + 2 * h[1], slab[1][1] + 16 * h[1])
-    state = resting(scene, lattice(tuple(box), scene.particle_spacing), solid).to(emulator.device)
+    state = state_at_rest(scene, lattice(tuple(box), scene.particle_spacing), solid).to(emulator.device)
     down = state.velocity.new_tensor([0.0, -speed * h[1]] + [0.0] * (scene.dim - 2))
-    return state.moved(state.position, state.velocity + down)
+    return state.with_motion(state.position, state.velocity + down)
 
 
 def _floats(figures: dict[str, int]) -> dict[str, float]:

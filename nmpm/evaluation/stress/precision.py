@@ -69,7 +69,7 @@ def nudge(subject: Subject, state: Particles) -> Particles:
     side = max(high - low for low, high in subject.emulator.scene.domain)
     noise = torch.randn(state.position.shape, generator=generator).to(state.position)
     low, high = state.position.new_tensor(subject.emulator.scene.bounds).T
-    return state.moved((state.position + NUDGE * side * noise).clamp(low, high), state.velocity)
+    return state.with_motion((state.position + NUDGE * side * noise).clamp(low, high), state.velocity)
 
 
 def growth(distance: Tensor) -> float:
@@ -99,7 +99,7 @@ def _gradients(emulator: Emulator, state: Particles, most: int) -> dict[int, flo
     for bundles in (2**power for power in range(most.bit_length()) if 2**power <= most):
         velocity = state.velocity.clone().requires_grad_()
         with torch.enable_grad():
-            *_, last = unroll(emulator, state.moved(state.position, velocity), bundles)
+            *_, last = unroll(emulator, state.with_motion(state.position, velocity), bundles)
             (gradient,) = torch.autograd.grad(last.position[:, -1].mean(), velocity)
         norms[bundles] = float(gradient.norm())
     return norms

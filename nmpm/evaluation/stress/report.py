@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.table import Table
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm.evaluation.stress.lines import Line
 
 VERDICTS = {True: "pass", False: "FAIL", None: "–"}
@@ -61,9 +61,9 @@ def write(folder: Path, text: str, lines: Sequence[Line], stem: str = "stress") 
     """Write `<stem>.json`, `<stem>.md` and `<stem>.png` into a folder, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{stem}.{suffix}" for suffix in ("json", "md", "png")]
-    with replacing(paths[0]) as part:
+    with atomic_write(paths[0]) as part:
         part.write_text(text + "\n", encoding="utf-8")
-    with replacing(paths[1]) as part:
+    with atomic_write(paths[1]) as part:
         part.write_text(_markdown(lines), encoding="utf-8")
     _draw(paths[2], lines)
     return paths
@@ -86,5 +86,5 @@ def _draw(path: Path, lines: Sequence[Line]) -> None:
         panel.plot([frames * (index + 1) / len(values) for index in range(len(values))], values, lw=1.2)
         panel.axhline(0, color="0.7", lw=0.8)
         panel.set(title=title, ylabel=name, xlabel="frame")
-    with replacing(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, dpi=110, format="png")

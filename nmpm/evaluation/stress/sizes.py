@@ -78,18 +78,18 @@ def _symmetries(subject: Subject, size: Size) -> Iterator[Line]:
     mirror = centre.new_ones(scene.dim)
     mirror[0] = -1
 
-    def mirrored(values: Tensor) -> Tensor:
+    def mirror_first_axis(values: Tensor) -> Tensor:
         return values * mirror
 
-    def turned(values: Tensor) -> Tensor:
+    def turn(values: Tensor) -> Tensor:
         return torch.stack([-values[..., 1], values[..., 0], *values.unbind(-1)[2:]], dim=-1)
 
     def back(values: Tensor) -> Tensor:
         return torch.stack([values[..., 1], -values[..., 0], *values.unbind(-1)[2:]], dim=-1)
 
-    moves = {"reflection": (mirrored, mirrored)}
+    moves = {"reflection": (mirror_first_axis, mirror_first_axis)}
     if scene.dim > 1 and scene.bounds[0] == scene.bounds[1] and grid.shape[0] == grid.shape[1]:
-        moves["a quarter turn, gravity with it"] = (turned, back)
+        moves["a quarter turn, gravity with it"] = (turn, back)
     for name, (there, home) in moves.items():
         moved = dataclasses.replace(
             state,
@@ -100,10 +100,10 @@ def _symmetries(subject: Subject, size: Size) -> Iterator[Line]:
         )
         other = centre + home(rollout(subject.emulator, moved, frames) - centre)
         yield _difference(subject, name, state, straight, other)
-    yield _shifted(subject, state, straight)
+    yield _shift_line(subject, state, straight)
 
 
-def _shifted(subject: Subject, state: Particles, straight: Tensor) -> Line:
+def _shift_line(subject: Subject, state: Particles, straight: Tensor) -> Line:
     """Box and particles moved by half a cell over the same grid."""
     scene = subject.emulator.scene
     by = 0.5 * subject.emulator.grid.spacing[0]

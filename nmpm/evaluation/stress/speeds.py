@@ -51,7 +51,7 @@ def _with_speed(subject: Subject, factor: float, size: Size) -> Window:
     if subject.preset is not None:
         return simulate_window(subject, subject.preset.varied(speed=factor), size.scenes, size.compared)
     state = subject.starts(size.scenes)
-    return Window.of(state.moved(state.position, factor * state.velocity))
+    return Window.of(state.with_motion(state.position, factor * state.velocity))
 
 
 def _with_gravity(subject: Subject, factor: float, size: Size) -> Window:

@@ -40,7 +40,7 @@ class DivergenceGuard(Callback):
         broken = isinstance(loss, Tensor) and not bool(torch.isfinite(loss).all())
         # All ranks stop together: one that raised alone would leave the others waiting in their next collective.
         if any_rank(broken, trainer.strategy.root_device):
-            raise self._diverged(
+            raise self._diverged_error(
                 trainer, f"the loss is {float(loss)}" if broken else "the loss of another rank is not finite"
             )
 
@@ -59,9 +59,9 @@ class DivergenceGuard(Callback):
         """Called on all ranks; a rank that holds no weights, as under sharding, has nothing to report."""
         broken = next((name for name, values in weights if not torch.isfinite(values).all()), None)
         if any_rank(broken is not None, trainer.strategy.root_device):
-            raise self._diverged(trainer, f"the weights {broken or 'of another rank'} are not finite")
+            raise self._diverged_error(trainer, f"the weights {broken or 'of another rank'} are not finite")
 
-    def _diverged(self, trainer: Trainer, what: str) -> DivergedError:
+    def _diverged_error(self, trainer: Trainer, what: str) -> DivergedError:
         good = [
             Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}"
             for saver in trainer.checkpoint_callbacks

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm._support.version import __version__
 from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
 from nmpm.metrics import MSE
@@ -88,7 +88,7 @@ class ReportWriter(Callback):
         folder = Path(trainer.default_root_dir)
         folder.mkdir(parents=True, exist_ok=True)
         figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in errors.items()})
-        with replacing(folder / "report.json") as part:
+        with atomic_write(folder / "report.json") as part:
             part.write_text(json.dumps(figures, indent=1) + "\n")
         _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()})
         if self._first_rollout is not None:
@@ -166,7 +166,7 @@ def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
     frames = min(len(curve) for rows in curves.values() for curve in rows)
     means = torch.stack([torch.stack([curve[:frames] for curve in rows]).mean(0) for rows in curves.values()], dim=1)
     lines = [["frame", *curves], *([str(frame), *map(str, row)] for frame, row in enumerate(means.tolist(), 1))]
-    with replacing(path) as part:
+    with atomic_write(path) as part:
         part.write_text("".join(",".join(line) + "\n" for line in lines))
 
 

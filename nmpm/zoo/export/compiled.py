@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm.errors import ConfigError
 from nmpm.zoo.export.parts import Part
 from nmpm.zoo.export.program import first_line, program
@@ -34,7 +34,7 @@ def write_compiled(part: Part, metadata: Mapping[str, str], path: Path) -> None:
     check_compiler()
     exported = program(part)
     settings = {"aot_inductor.metadata": dict(metadata)}
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         try:
             with torch.no_grad():
                 _inductor.aoti_compile_and_package(exported, package_path=str(temporary), inductor_configs=settings)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.export import ExportedProgram
 
-from nmpm._support.atomic import replacing
+from nmpm._support.atomic import atomic_write
 from nmpm.errors import ConfigError
 from nmpm.zoo.export.parts import Part, Value
 from nmpm.zoo.export.program import first_line, program
@@ -38,10 +38,10 @@ def write_onnx(part: Part, metadata: Mapping[str, str], path: Path) -> None:
     check_installed()
     import onnx
 
-    model = _translated(part, program(part))
+    model = _translate(part, program(part))
     _describe(model, part)
     onnx.helper.set_model_props(model, dict(metadata))
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         onnx.save(model, temporary)
 
 
@@ -73,7 +73,7 @@ def check_installed() -> None:
         raise ConfigError(f"ONNX needs a package that is not installed: pip install nmpm[export] ({error}).") from error
 
 
-def _translated(part: Part, exported: ExportedProgram) -> ModelProto:
+def _translate(part: Part, exported: ExportedProgram) -> ModelProto:
     try:
         with _quiet():
             written: Any = torch.onnx.export(
@@ -120,7 +120,7 @@ def _reason(error: BaseException) -> str:
 def _describe(model: ModelProto, part: Part) -> None:
     """Name the open sizes as the part does, and describe inputs and outputs."""
     renamed: dict[str, str] = {}
-    for info, value in _paired(model, part):
+    for info, value in _pair_infos(model, part):
         info.doc_string = f"{value.shape} {value.description}"
         for place, size in zip(info.type.tensor_type.shape.dim, value.shape, strict=True):
             if isinstance(size, str):
@@ -131,6 +131,6 @@ def _describe(model: ModelProto, part: Part) -> None:
                 place.dim_param = renamed[place.dim_param]
 
 
-def _paired(model: ModelProto, part: Part) -> list[tuple[ValueInfoProto, Value]]:
+def _pair_infos(model: ModelProto, part: Part) -> list[tuple[ValueInfoProto, Value]]:
     infos = [*model.graph.input, *model.graph.output]
     return list(zip(infos, (*part.inputs, *part.outputs), strict=True))

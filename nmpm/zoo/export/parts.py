@@ -175,7 +175,7 @@ class Network(Part):
 
     def forward(self, grid: Tensor) -> tuple[Tensor]:
         """(B, C_in, *S) → (B, m, C_out, *S)."""
-        fields: Tensor = self.emulator.processor(self.emulator.normalised(grid)) * self.emulator.output_scale
+        fields: Tensor = self.emulator.processor(self.emulator.normalise(grid)) * self.emulator.output_scale
         return (fields,)
 
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:  # noqa: ARG002 (no particles here)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.data.initial_states import lattice, resting, thrown_blocks
+from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
@@ -87,7 +87,7 @@ def test_a_course_knows_gains_losses_and_first_failures():
     scene = box(gravity=(0.0, 0.0))
     emulator = emulator_of(scene)
     start = cloud(scene, count=4, batch=2, speed=0.0)
-    start = start.moved(start.position, torch.full_like(start.position, 1e-3))
+    start = start.with_motion(start.position, torch.full_like(start.position, 1e-3))
     steps = torch.full((2, 6, 4, 2), 1e-3)
     steps[0, 3:] = 2e-3  # four times the energy from the fourth frame on
     path = start.position.unsqueeze(1) + steps.cumsum(1)
@@ -110,7 +110,7 @@ def test_who_is_outside_or_nowhere_is_lost():
 
 def test_energy_is_that_of_a_stone():
     scene = box()
-    state = resting(scene, torch.tensor([[0.5, 0.6], [0.5, 0.2]]))
+    state = state_at_rest(scene, torch.tensor([[0.5, 0.6], [0.5, 0.2]]))
     values = energy_above_lowest(scene, state, state.position[:, None], torch.full((1, 1, 2, 2), 0.001))
     expected = 0.001**2 + 9.81 * 0.0025**2 * (0.5 + 0.1) / 2
     assert values.item() == pytest.approx(expected, rel=1e-5)
@@ -119,7 +119,7 @@ def test_energy_is_that_of_a_stone():
 def test_clumped_particles_fill_less():
     scene = box(particle_volume=0.01**2)
     emulator = emulator_of(scene)
-    state = resting(scene, lattice(((0.3, 0.6), (0.3, 0.6)), 0.01))
+    state = state_at_rest(scene, lattice(((0.3, 0.6), (0.3, 0.6)), 0.01))
     apart = filled_volume(emulator, state, state.position).item()
     together = filled_volume(emulator, state, 0.45 + 0.5 * (state.position - 0.45)).item()
     assert apart == pytest.approx(1.0, abs=0.05)
