@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -14,6 +15,8 @@ CONSTRAINTS = {
     "bounds": "bounds = {value} (no particle leaves the scene's bounds)",
 }
 """What each constraint enforces, by its key in `card.yaml`."""
+NAMED = 4
+"""Failed stress tests that a README names; more are counted by group."""
 
 
 def stress_digest(report: Mapping[str, Any]) -> dict[str, Any]:
@@ -98,5 +101,7 @@ def _stress_outcome(digest: Mapping[str, Any] | None) -> str:
     if digest is None:
         return "not run"
     failed = digest["failed"]
-    names = f" (failed: {'; '.join(failed)})" if failed else ""
+    groups = Counter(name.partition(":")[0] for name in failed)
+    counted = [f"{count} of {group}" for group, count in groups.items()]
+    names = f" (failed: {'; '.join(failed if len(failed) <= NAMED else counted)})" if failed else ""
     return f"{digest['passed']} of {digest['passed'] + len(failed)} lines passed, {digest['size']}{names}"
