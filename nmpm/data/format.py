@@ -229,8 +229,11 @@ def _check_arrays(position: Any, particle_type: Any, where: str) -> None:
     if position.shape[2] > 3:
         raise DataError(f"{where}: position has {position.shape[2]} dimensions; 1, 2 or 3 are possible.")
     if position.shape[1] != particle_type.shape[0]:
+        swapped = position.shape[0] == particle_type.shape[0]
+        mend = " Are its axes swapped? It should be (T, N, D), frames first: np.swapaxes(position, 0, 1)."
         raise DataError(
             f"{where}: position has {position.shape[1]} particles but particle_type has {particle_type.shape[0]}."
+            f"{mend if swapped else ''}"
         )
 
 
