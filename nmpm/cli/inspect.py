@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.options import add_data_options, check_at_least, check_picture, data_options
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError, NmpmError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
@@ -76,7 +76,7 @@ def _inspect(origin: FolderSource, chosen: argparse.Namespace) -> None:
         return
     try:
         _draw(origin, inspection, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
-    except DataError as error:
+    except (NmpmError, OSError) as error:
         sys.stdout.write(f"\nno picture: {error}\n")
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
     Raises:
         DataError: if a write fails, e.g. because the disk is full; `path` is then as it was.
     """
-    with replacing(path) as part, part.open("w+b", buffering=0) as raw:
+    with _replacing(path) as raw:
         target = _NeverFailingFile(raw.fileno())
 
         def check() -> None:
@@ -87,6 +88,20 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
         with h5py.File(target, "w", **options) as file:
             yield file, check
         check()
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[FileIO]:
+    """Opens a temporary file that replaces `path` on success."""
+    with ExitStack() as stack:
+        try:
+            part = stack.enter_context(replacing(path))
+            raw = stack.enter_context(part.open("w+b", buffering=0))
+        except OSError as error:
+            raise DataError(
+                f"{path}: cannot be written ({error.strerror}). Correct the permissions, or choose another folder."
+            ) from error
+        yield raw
 
 
 def _write_error(path: Path, error: OSError, missing: int) -> DataError:

@@ -23,7 +23,6 @@ from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene
 
-
 _GENERATE = frozenset(inspect.signature(catalog.ensure).parameters) - {"name"}
 
 
