@@ -98,7 +98,7 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
         ConfigError: if there is no such family.
     """
     path = Path(folder) / METADATA_FILE
-    return metadata_from_dict(_load_json(path), path, family)
+    return metadata_from_dict(load_json(path), path, family)
 
 
 def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None = None) -> Metadata:
@@ -165,7 +165,12 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         ) from error
 
 
-def _load_json(path: Path) -> dict[str, Any]:
+def load_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a dataset's `metadata.json`, not validated.
+
+    Raises:
+        DataError: if the file is missing, too large or too deep, or not a JSON object.
+    """
     if not path.parent.is_dir():
         raise DataError(f"{path.parent}: no such folder. Give the folder that contains {METADATA_FILE}.")
     if not path.exists():

@@ -5,6 +5,8 @@ import pytest
 from PIL import Image
 
 from nmpm.cli import main
+from nmpm.data.convert.cache import native_folder
+from nmpm.errors import DataError
 from tests.data.convert import records
 from tests.data.convert.test_deepmind import METADATA, made
 
@@ -79,5 +81,7 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "file"))
     records.write_records(tmp_path / "ramps" / "train.tfrecord", records.trajectory_record(*made()))
     (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
-    assert main(["inspect", str(tmp_path / "ramps"), "--no-picture"]) == 1
-    assert re.search(r"file.*: cannot be written \(.*NMPM_HOME", capsys.readouterr().err)
+    assert main(["inspect", str(tmp_path / "ramps"), "--json"]) == 0
+    assert re.search(r"file.*: cannot be written \(.*NMPM_HOME", json.loads(capsys.readouterr().out)["findings"][0])
+    with pytest.raises(DataError, match="NMPM_HOME"):
+        native_folder(tmp_path / "ramps")
