@@ -29,7 +29,9 @@ METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 6, "dim": 2, 
 def positions(frames: int = 6, particles: int = 5, dim: int = 2) -> np.ndarray:
     rng = np.random.default_rng(0)
     start = rng.uniform(0.3, 0.7, (1, particles, dim))
-    return (start + 1e-3 * rng.random((frames, particles, dim)).cumsum(axis=0)).astype(np.float32)
+    drift = 1e-3 * rng.random((frames, particles, dim)).cumsum(axis=0)
+    drift[:, -1] = 0  # the last is a boundary particle
+    return (start + drift).astype(np.float32)
 
 
 TYPES = np.array([5, 5, 5, 5, 3])

@@ -11,7 +11,7 @@ import math
 import pickle
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -127,6 +127,11 @@ class _ArraysOnly(pickle._Unpickler):
     Args:
         data: The pickle.
     """
+
+    stack: list[Any]
+    append: Callable[[Any], None]
+    read: Callable[[int], bytes]
+    pop_mark: Callable[[], list[Any]]
 
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data))
