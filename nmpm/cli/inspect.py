@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.options import add_data_options, check_at_least, check_picture, data_options
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
@@ -53,21 +53,17 @@ def run(words: list[str]) -> None:
     if not chosen.path.exists():
         raise ConfigError(f"{chosen.path}: there is no such file or folder.")
     options = data_options(chosen)
-    if chosen.format is None:
-        _inspect(_origin(chosen.path, options), chosen)
-        return
-    from nmpm.data.convert import Options, convert
-
     with tempfile.TemporaryDirectory() as folder:
-        native = Path(folder) / chosen.path.resolve().stem
-        convert(chosen.path, native, chosen.format, options)
-        _inspect(_origin(native, Options()), chosen)
+        native = Path(folder) / (chosen.path.resolve().stem or "dataset")
+        _inspect(*_origin(chosen.path, chosen.format, options, native), chosen)
 
 
-def _inspect(origin: FolderSource, chosen: argparse.Namespace) -> None:
+def _inspect(origin: FolderSource, damage: list[str], chosen: argparse.Namespace) -> None:
     from nmpm.data.inspection import inspect
+    from nmpm.data.inspection.tolerance import with_guessed_family
 
-    inspection = replace(inspect(origin, chosen.trajectories), path=str(chosen.path))
+    inspection = inspect(origin, chosen.trajectories)
+    inspection = replace(inspection, path=str(chosen.path), findings=(*damage, *inspection.findings))
     if chosen.json:
         sys.stdout.write(json.dumps(inspection.to_dict(), indent=1) + "\n")
         return
@@ -75,18 +71,42 @@ def _inspect(origin: FolderSource, chosen: argparse.Namespace) -> None:
     if chosen.no_picture:
         return
     try:
-        _draw(origin, inspection, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
-    except DataError as error:
+        _draw(with_guessed_family(origin), inspection, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
+    except (NmpmError, OSError) as error:
         sys.stdout.write(f"\nno picture: {error}\n")
 
 
-def _origin(path: Path, options: Options) -> FolderSource:
+def _origin(path: Path, format_name: str | None, options: Options, native: Path) -> tuple[FolderSource, list[str]]:
+    """The dataset, converted where it is foreign, and what could not be converted.
+
+    Args:
+        path: Of the dataset.
+        format_name: Its format; detected when left out.
+        options: What the user states.
+        native: A folder for conversions that are not kept.
+    """
+    from nmpm.data.convert import convert
     from nmpm.data.convert.cache import native_folder
-    from nmpm.data.loading.sources import FolderSource, StatedFacts
+    from nmpm.data.format import split_paths
+    from nmpm.data.inspection.tolerance import convert_readable
+    from nmpm.data.loading.sources import FolderSource
 
     path = path.parent if path.suffix == ".h5" and path.is_file() else path
-    if options.types or options.static is not None or options.dt is not None:
-        return FolderSource(native_folder(path, options))
+    changed = options.types or options.static is not None or options.dt is not None
+    if split_paths(path) and not changed and format_name is None:
+        return _native_origin(path, options), []
+    try:
+        if format_name is None:
+            return FolderSource(native_folder(path, options)), []
+        convert(path, native, format_name, options)
+        return FolderSource(native), []
+    except DataError as error:
+        return FolderSource(native), convert_readable(path, native, format_name, options) or [str(error)]
+
+
+def _native_origin(path: Path, options: Options) -> FolderSource:
+    from nmpm.data.loading.sources import FolderSource, StatedFacts
+
     boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
     return FolderSource(path, StatedFacts(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]  # (argparse gives plain lists)
 

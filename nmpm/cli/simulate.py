@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from nmpm.sim import Preset
 
+_INTERRUPTED = 130  # as shells report SIGINT
+
 _EXAMPLES = """\
 examples:
   nmpm simulate --list                                   the shipped scenes
@@ -28,7 +30,11 @@ that the data are simulated by nmpm.
 
 
 def run(words: list[str]) -> None:
-    """Run the command, e.g. ["simulate", "waterramps", "--out", "ramps"]."""
+    """Run the command, e.g. ["simulate", "waterramps", "--out", "ramps"].
+
+    Raises:
+        SystemExit: with status 130 after Ctrl-C.
+    """
     parser = argparse.ArgumentParser(
         prog="nmpm simulate",
         description="Simulate a dataset of a shipped scene or your own, ready for training.",
@@ -53,8 +59,13 @@ def run(words: list[str]) -> None:
         parser.error("name a scene, or use --list")
     if chosen.show:
         _show(chosen.name)
-    else:
+        return
+    try:
         _simulate(chosen)
+    except KeyboardInterrupt:
+        mend = "nothing was written" if chosen.preview else "the same command continues after the finished trajectories"
+        sys.stderr.write(f"nmpm simulate: interrupted; {mend}.\n")
+        raise SystemExit(_INTERRUPTED) from None
 
 
 def _simulate(chosen: argparse.Namespace) -> None:

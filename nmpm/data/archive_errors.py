@@ -20,5 +20,7 @@ NPZ_ERRORS: tuple[type[Exception], ...] = (
     *ZIP_ERRORS,
     KeyError,  # a listed array is missing
     ValueError,
+    TypeError,
+    MemoryError,  # too large, or a header with too many brackets
     tokenize.TokenError,  # from an array's header, which is a Python literal
 )

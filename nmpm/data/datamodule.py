@@ -21,6 +21,7 @@ from nmpm.scene import Boundary, Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
 
+_OPEN = "???"  # what OmegaConf calls a value that is still to be given
 _GPU_SHARE = 0.25  # of the free GPU memory that the buffer may use; the rest is for the model
 
 
@@ -43,7 +44,8 @@ class TrajectoryDataModule(LightningDataModule):
 
     Args:
         path: A dataset: a folder in the native layout, or anything that `nmpm convert` reads, converted on first use.
-        name: EmbeddedSource dataset, simulated on first use; give either this or `path`.
+        name: Embedded dataset, simulated on first use. Ignored where `path` is given, so that `--data.path` on the
+            command line replaces the `name` of a configuration.
         source: "disk"; or "simulate" to train on new trajectories of `name` from the simulator, which are not written
             and used in one buffer only; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
         horizon: Frames to predict in a training window: frames per bundle times bundles unrolled.
@@ -55,15 +57,15 @@ class TrajectoryDataModule(LightningDataModule):
         seed: Seed of the order of the training windows.
         family: Meaning of the type ids in recorded data where its metadata does not state it: "deepmind",
             "lagrangebench", "jax-sph".
-        gravity: Acceleration in length/s² per axis, instead of that in the metadata of recorded data.
-        boundary: "wall" or "periodic" per axis, likewise.
+        gravity: Acceleration in length/s² per axis, where recorded data do not state it.
+        boundary: "wall" or "periodic" per axis, instead of that in the metadata of recorded data.
         bounds: (lower, upper) per axis, likewise.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
 
     Raises:
-        ConfigError: if not exactly one of `path` and `name` is given, or a number is not positive.
+        ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.
     """
 
     def __init__(
@@ -86,6 +88,7 @@ class TrajectoryDataModule(LightningDataModule):
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
+        path = None if path == _OPEN and name is not None else path
         stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds}
         _check_source(path, name, source, stated, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
@@ -247,9 +250,12 @@ def _make_source(
 def _check_source(
     path: str | None, name: str | None, source: str, stated: Mapping[str, Any], generate: Mapping[str, Any] | None
 ) -> None:
-    if (path is None) == (name is None):
+    if path == _OPEN:
+        raise ConfigError("data.path is not set, the configuration leaves it open (???): give --data.path FOLDER.")
+    if path is None and name is None:
         raise ConfigError(
-            f"Give either a dataset's `path` or the `name` of an embedded one; got path = {path}, name = {name}."
+            "Neither data.path nor data.name is set: give --data.path FOLDER, or --data.name and an embedded dataset"
+            " (nmpm simulate --list)."
         )
     if source not in get_args(SourceName):
         raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")

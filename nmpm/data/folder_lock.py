@@ -7,6 +7,9 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
+
+from nmpm.errors import DataError
 
 _log = logging.getLogger(__name__)
 
@@ -16,12 +19,25 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """Locks a folder against other processes and threads, waiting until it is free; creates the folder if missing.
 
     The lock is the operating system's, so that it is released however the process ends.
+
+    Raises:
+        DataError: if the folder cannot be created or written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
+    with _open_lock(folder) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             _log.warning("Another process works in %s; waiting for it to finish.", folder)
             fcntl.flock(file, fcntl.LOCK_EX)
         yield
+
+
+def _open_lock(folder: Path) -> TextIO:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return (folder / ".lock").open("w")
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error.strerror}). Correct the permissions, or choose another folder; the"
+            " environment variable NMPM_HOME sets the folder of all that nmpm keeps."
+        ) from error

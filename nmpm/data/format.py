@@ -17,7 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm.data.hdf5 import check_self_contained, open_hdf5, writable_hdf5
+from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5, writable_hdf5
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
 from nmpm.data.metadata import read_metadata as read_metadata
@@ -91,7 +91,12 @@ def _write_trajectory(group: Any, trajectory: Trajectory) -> None:
         values = np.asarray(trajectory.fields[name])
         group.create_dataset(name, data=values, **(packed if values.size > 1 else {}))
     for name in sorted(trajectory.attributes):
-        group.attrs[name] = trajectory.attributes[name]
+        try:
+            group.attrs[name] = trajectory.attributes[name]
+        except (OSError, RuntimeError, TypeError, ValueError) as error:
+            raise DataError(
+                f"the attribute {name[:40]!r} = {str(trajectory.attributes[name])[:40]} cannot be stored ({error})."
+            ) from error
 
 
 @dataclass(frozen=True)
@@ -167,8 +172,9 @@ class Split:
             group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
             for name in names:
                 if name not in _CORE:
-                    found[name] = group[name][()]
-                    _check_field(name, found[name], self.where(index))
+                    _check_field(name, group[name], self.where(index))
+                    check_stored_size(group[name], f"{self.where(index)}: {name}")
+                    found[name] = np.asarray(group[name][()])
         return found
 
     def read_with_fields(self, index: int) -> Trajectory:
@@ -215,6 +221,8 @@ def _entry(group: Any, name: str, path: Path) -> _Entry:
         found = ", ".join(group) or "nothing"
         raise DataError(f"{where}: the key {' and '.join(map(repr, missing))} is missing (found: {found}); {_LAYOUT}.")
     _check_arrays(group["position"], group["particle_type"], where)
+    for key in _CORE:
+        check_stored_size(group[key], f"{where}: {key}")
     frames, particles, dim = group["position"].shape
     return _Entry(name, frames, particles, dim)
 
@@ -229,8 +237,11 @@ def _check_arrays(position: Any, particle_type: Any, where: str) -> None:
     if position.shape[2] > 3:
         raise DataError(f"{where}: position has {position.shape[2]} dimensions; 1, 2 or 3 are possible.")
     if position.shape[1] != particle_type.shape[0]:
+        swapped = position.shape[0] == particle_type.shape[0]
+        mend = " Are its axes swapped? It should be (T, N, D), frames first: np.swapaxes(position, 0, 1)."
         raise DataError(
             f"{where}: position has {position.shape[1]} particles but particle_type has {particle_type.shape[0]}."
+            f"{mend if swapped else ''}"
         )
 
 

@@ -12,8 +12,9 @@ import json
 import logging
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -197,18 +198,29 @@ def _simulate_parts(request: SimulationRequest, folder: Path, workers: int) -> N
     total = sum(request.counts.values())
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
     # Threads suffice, as the simulators' compiled loops release the GIL.
-    pool = ThreadPoolExecutor(min(workers, len(missing)))
+    pool, interrupted = ThreadPoolExecutor(min(workers, len(missing))), threading.Event()
     try:
         with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
-            for future in as_completed([pool.submit(_simulate_part, request, folder, s, i) for s, i in missing]):
+            for future in as_completed(
+                [pool.submit(_simulate_part, request, folder, s, i, interrupted) for s, i in missing]
+            ):
                 future.result()
                 advance()
+    except KeyboardInterrupt:
+        interrupted.set()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _simulate_part(request: SimulationRequest, folder: Path, split: str, index: int) -> None:
-    run = request.preset.simulate(request.trajectory_seed(split, index))
+def _simulate_part(
+    request: SimulationRequest, folder: Path, split: str, index: int, interrupted: threading.Event
+) -> None:
+    def stop_if_interrupted(_: int) -> None:
+        if interrupted.is_set():
+            raise CancelledError
+
+    run = request.preset.simulate(request.trajectory_seed(split, index), stop_if_interrupted)
     with atomic_write(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
         np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)
 

@@ -7,18 +7,24 @@ file would be read as positions; `check_self_contained` refuses these. HDF5 cras
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import h5py
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.limits import HDF5_DEPTH, HDF5_OBJECTS, expansion_limit
 from nmpm.data.regular_files import check_regular
-from nmpm.errors import DataError
+from nmpm.errors import DataError, NmpmError
+
+_ERRORS = (OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError, MemoryError)
+"""What h5py raises on damaged files."""
 
 
 @contextmanager
@@ -32,7 +38,9 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, RuntimeError, KeyError) as error:
+    except NmpmError:
+        raise
+    except _ERRORS as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(
             f"{path}: cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again."
@@ -40,27 +48,58 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
 
 def check_self_contained(file: Any, path: Path) -> None:
-    """Raises an error if an open HDF5 file takes content from other files.
+    """Raises an error if an open HDF5 file takes content from other files, or has too many or too deep groups.
 
     Raises:
-        DataError: names the file and the link or dataset.
+        DataError: names the file and the link, group or dataset.
     """
+    # By hand: h5py's `visititems` recurses in C, and crashes the process in deep groups.
+    pending, count = [("", file, 0)], 0
+    while pending:
+        place, group, depth = pending.pop()
+        for name in group:
+            count += 1
+            where = f"{place}{name}"
+            if count > HDF5_OBJECTS:
+                raise DataError(f"{path}: has more than {HDF5_OBJECTS:,} groups and datasets.")
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                raise _elsewhere_error(path, f"{where!r} is an external link to {link.filename!r}")
+            # A soft link leads to an object that is visited by its other name, or nowhere.
+            item = group[name] if isinstance(link, h5py.HardLink) else None
+            if isinstance(item, h5py.Group):
+                if depth >= HDF5_DEPTH:
+                    raise DataError(f"{path}: {where[:100]!r} is nested more than {HDF5_DEPTH} groups deep.")
+                pending.append((f"{where}/", item, depth + 1))
+            elif isinstance(item, h5py.Dataset):
+                _check_stored_here(item, where, path)
 
-    def link_elsewhere(name: str, link: Any) -> str | None:
-        return f"{name!r} is an external link to {link.filename!r}" if isinstance(link, h5py.ExternalLink) else None
 
-    def dataset_elsewhere(name: str, item: Any) -> str | None:
-        if not isinstance(item, h5py.Dataset):
-            return None
-        if item.external:
-            return f"{name!r} is stored in another file, {item.external[0][0]!r}"
-        return f"{name!r} is a virtual dataset" if item.is_virtual else None
+def _check_stored_here(dataset: Any, name: str, path: Path) -> None:
+    if dataset.external:
+        raise _elsewhere_error(path, f"{name!r} is stored in another file, {dataset.external[0][0]!r}")
+    if dataset.is_virtual:
+        raise _elsewhere_error(path, f"{name!r} is a virtual dataset")
 
-    # The callbacks return what they find, as h5py loses exceptions that they raise. Links come first: they are not
-    # followed, and without external ones nothing opens another file.
-    found = file.visititems_links(link_elsewhere) or file.visititems(dataset_elsewhere)
-    if found is not None:
-        raise DataError(f"{path}: {found}; content of other files is not read. Copy it into this file.")
+
+def _elsewhere_error(path: Path, found: str) -> DataError:
+    return DataError(f"{path}: {found}; content of other files is not read. Copy it into this file.")
+
+
+def check_stored_size(dataset: Any, where: str) -> None:
+    """Refuses a dataset that declares far more than its file stores, before anything of its size is allocated.
+
+    Raises:
+        DataError: naming `where` and both sizes.
+    """
+    declared = math.prod(dataset.shape) * dataset.dtype.itemsize
+    chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    stored = int(dataset.id.get_storage_size())
+    if max(declared, chunk) > expansion_limit(stored):
+        raise DataError(
+            f"{where}: has the shape {dataset.shape}, {max(declared, chunk):,} bytes, but only {stored:,} bytes are"
+            " stored. Is the file complete? Copy, download or generate it again."
+        )
 
 
 @contextmanager
@@ -77,7 +116,7 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
     Raises:
         DataError: if a write fails, e.g. because the disk is full; `path` is then as it was.
     """
-    with atomic_write(path) as part, part.open("w+b", buffering=0) as raw:
+    with _open_atomically(path) as raw:
         target = _NeverFailingFile(raw.fileno())
 
         def check() -> None:
@@ -87,6 +126,20 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
         with h5py.File(target, "w", **options) as file:
             yield file, check
         check()
+
+
+@contextmanager
+def _open_atomically(path: Path) -> Iterator[FileIO]:
+    """Opens a temporary file that replaces `path` on success."""
+    with ExitStack() as stack:
+        try:
+            part = stack.enter_context(atomic_write(path))
+            raw = stack.enter_context(part.open("w+b", buffering=0))
+        except OSError as error:
+            raise DataError(
+                f"{path}: cannot be written ({error.strerror}). Correct the permissions, or choose another folder."
+            ) from error
+        yield raw
 
 
 def _write_error(path: Path, error: OSError, missing: int) -> DataError:

@@ -7,6 +7,7 @@ import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from nmpm._support.limits import EXPANSION, expansion_limit
 from nmpm.data.archive_errors import ZIP_ERRORS
 from nmpm.data.catalog import dataset_home
 from nmpm.data.folder_lock import lock_folder
@@ -104,6 +105,9 @@ def _unpack(downloaded: Path, archives: list[Path], target: Path) -> None:
 
 def _unpack_one(archive: Path, target: Path) -> None:
     with zipfile.ZipFile(archive) as file:
+        unpacked = sum(item.file_size for item in file.infolist())
+        if unpacked > expansion_limit(archive.stat().st_size):
+            raise DataError(f"{archive}: unpacks to {unpacked:,} bytes, more than {EXPANSION} times its size.")
         for item in file.infolist():
             path = PurePosixPath(item.filename)
             if item.is_dir() or path.suffix not in _DATA or "__MACOSX" in path.parts:

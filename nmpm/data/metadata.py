@@ -18,9 +18,12 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.bounded_files import read_bounded
+from nmpm._support.limits import METADATA_BYTES, TEXT_DEPTH, WHOLE
+from nmpm._support.messages import one_line
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
 from nmpm.data.regular_files import check_regular
-from nmpm.errors import DataError
+from nmpm.errors import DataError, NmpmError
 from nmpm.scene import Interval
 
 METADATA_FILE = "metadata.json"
@@ -98,7 +101,7 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
         ConfigError: if there is no such family.
     """
     path = Path(folder) / METADATA_FILE
-    return metadata_from_dict(_load_json(path), path, family)
+    return metadata_from_dict(load_json(path), path, family)
 
 
 def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None = None) -> Metadata:
@@ -165,19 +168,37 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         ) from error
 
 
-def _load_json(path: Path) -> dict[str, Any]:
+def load_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a dataset's `metadata.json`, not validated.
+
+    Raises:
+        DataError: if the file is missing, too large or too deep, or not a JSON object.
+    """
     if not path.parent.is_dir():
         raise DataError(f"{path.parent}: no such folder. Give the folder that contains {METADATA_FILE}.")
     if not path.exists():
         raise DataError(f"{path}: no such file. A dataset needs this file, with bounds, dt, dim and sequence_length.")
     check_regular(path)
     try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({error}).") from error
+        plain = json.loads(read_bounded(path, METADATA_BYTES).decode("utf-8"))
+    except NmpmError:
+        raise
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)}).") from error
     if not isinstance(plain, dict):
         raise DataError(f"{path}: expected a JSON object, found {type(plain).__name__}.")
+    _check_depth(plain, path)
     return plain
+
+
+def _check_depth(plain: Any, path: Path) -> None:
+    level = [plain]
+    for _ in range(TEXT_DEPTH):
+        containers = [value for value in level if isinstance(value, list | dict)]
+        level = [item for value in containers for item in (value.values() if isinstance(value, dict) else value)]
+        if not level:
+            return
+    raise DataError(f"{path}: lists and objects are nested more than {TEXT_DEPTH} deep.")
 
 
 class _Keys:
@@ -190,7 +211,7 @@ class _Keys:
         self.left = plain
 
     def error(self, key: str, value: Any, wanted: str) -> DataError:
-        return DataError(f"{self.path}: {key} = {json.dumps(value)[:80]} should be {wanted}.")
+        return DataError(f"{self.path}: {key} = {one_line(_repr(value), 80)} should be {wanted}.")
 
     def peek(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
         if self.left.get(key) is None:
@@ -199,13 +220,20 @@ class _Keys:
             return default
         try:
             return parse(self.left[key])
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise self.error(key, self.left[key], str(error)) from error
 
     def take(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
         value = self.peek(key, parse, default)
         self.left.pop(key, None)
         return value
+
+
+def _repr(value: Any) -> str:
+    try:
+        return json.dumps(value)
+    except (TypeError, ValueError):
+        return type(value).__name__
 
 
 def _types(keys: _Keys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
@@ -227,7 +255,7 @@ def _sequence_length(keys: _Keys) -> int:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
         raise ValueError("a finite number")
     return float(value)
 
@@ -245,13 +273,15 @@ def _densities(value: Any) -> dict[str, float]:
 
 
 def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError("a positive integer")
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < WHOLE:
+        raise ValueError(f"a positive integer below {WHOLE}")
     return value
 
 
 def _ids(value: Any) -> frozenset[int]:
-    if not isinstance(value, list) or any(isinstance(i, bool) or not isinstance(i, int) for i in value):
+    if not isinstance(value, list) or any(
+        isinstance(i, bool) or not isinstance(i, int) or abs(i) > WHOLE for i in value
+    ):
         raise ValueError("a list of type ids")
     return frozenset(value)
 
@@ -263,6 +293,8 @@ def _names(value: Any) -> dict[int, str]:
         types = {int(i): name for i, name in value.items()}
     except ValueError as error:
         raise ValueError('an object whose keys are integers, e.g. {"7": "goop"}') from error
+    if any(abs(i) > WHOLE for i in types):
+        raise ValueError(f"an object whose keys are at most {WHOLE}")
     return types
 
 

@@ -38,16 +38,19 @@ def infer_scene(
     Args:
         folder: The dataset's folder.
         family: Meaning of the type ids where the metadata does not state it.
-        gravity: Acceleration in length/s², instead of the metadata's.
+        gravity: Acceleration in length/s², where the files do not state it.
         boundary: "wall" or "periodic" per axis, instead of the metadata's.
         bounds: (lower, upper) per axis, instead of the metadata's.
 
     Raises:
         DataError: if files are missing or wrong, or a position lies outside the domain that the metadata states.
-        ConfigError: if an argument does not match the number of axes, or is invalid.
+        ConfigError: if an argument does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
     folder = Path(folder)
-    metadata = _override(read_metadata(folder, family), gravity, boundary, bounds)
+    stated = read_metadata(folder, family)
+    metadata = _override(stated, gravity, boundary, bounds)
+    if gravity is not None:
+        _check_gravity(metadata.gravity, stated.gravity, folder / METADATA_FILE)
     split = _reference_split(folder)
     if split.dim != metadata.dim:
         raise DataError(
@@ -57,6 +60,9 @@ def infer_scene(
     observed = _observe(split, metadata)
     widened, domain = _extents(metadata, observed, folder)
     gravities = _gravities(split, metadata)
+    if gravity is not None:
+        for found in gravities:
+            _check_gravity(metadata.gravity, found, split.path)
     materials = _materials(types, metadata, split)
     return Scene(
         bounds=widened,
@@ -90,6 +96,15 @@ def _override(
     if bounds is not None:
         metadata = replace(metadata, bounds=tuple((float(low), float(high)) for low, high in bounds), domain=None)
     return metadata
+
+
+def _check_gravity(given: tuple[float, ...] | None, stated: tuple[float, ...] | None, path: Path) -> None:
+    if stated is not None and not (len(given or ()) == len(stated) and np.allclose(given or (), stated, atol=1e-6)):
+        raise ConfigError(
+            f"gravity = {list(given or ())} contradicts {path}, which states gravity {list(stated)}. Leave the option"
+            " out to use the file's; if the file is wrong, write a corrected copy with nmpm convert FOLDER NEW"
+            f" --gravity={','.join(f'{value:g}' for value in given or ())}."
+        )
 
 
 def _reference_split(folder: Path) -> Split:

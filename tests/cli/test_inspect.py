@@ -1,9 +1,12 @@
 import json
+import re
 
 import pytest
 from PIL import Image
 
 from nmpm.cli import main
+from nmpm.data.convert.cache import native_folder
+from nmpm.errors import DataError
 from tests.data.convert import records
 from tests.data.convert.test_deepmind import METADATA, made
 
@@ -45,6 +48,8 @@ def test_one_split_stands_for_its_dataset(dataset, capsys):
         (["nowhere"], "nowhere"),
         ([".", "--trajectories", "0"], "--trajectories 0"),
         ([".", "--gravity", "down"], "--gravity down"),
+        ([".", "--out", "missing/look.png"], "the folder missing does not exist"),
+        ([".", "--out", "look.jpg"], "end the name in .png"),
     ],
 )
 def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
@@ -69,3 +74,14 @@ def test_the_format_can_be_named(tmp_path, monkeypatch, capsys):
     assert json.loads(capsys.readouterr().out)["path"] == path
     assert main(["inspect", path, "--format", "nothing"]) == 1
     assert "No format is called 'nothing'" in capsys.readouterr().err
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "file"))
+    records.write_records(tmp_path / "ramps" / "train.tfrecord", records.trajectory_record(*made()))
+    (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
+    assert main(["inspect", str(tmp_path / "ramps"), "--json"]) == 0
+    assert re.search(r"file.*: cannot be written \(.*NMPM_HOME", json.loads(capsys.readouterr().out)["findings"][0])
+    with pytest.raises(DataError, match="NMPM_HOME"):
+        native_folder(tmp_path / "ramps")

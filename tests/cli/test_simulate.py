@@ -1,3 +1,8 @@
+import signal
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -61,6 +66,8 @@ def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):
         (["goop", "--workers", "0"], "--workers 0"),
         (["goop", "--train", "-1"], "--train -1: it must be at least 0"),
         (["goop", "--frames", "0"], "--frames 0: it must be at least 1"),
+        (["goop", "--preview", "missing/look.png"], "the folder missing does not exist"),
+        (["goop", "--preview", "look.jpg"], "end the name in .png"),
     ],
 )
 def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
@@ -68,3 +75,23 @@ def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
     assert main(["simulate", *words]) == 1
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interruption_says_how_to_go_on(tmp_path):
+    """The trajectories that run are stopped: one of them would take minutes."""
+    words = ["simulate", "goop", "--train", "2", "--valid", "0", "--test", "0", "--frames", "100000"]
+    call = [sys.executable, "-c", "import sys; from nmpm.cli import main; sys.exit(main())", *words]
+    process = subprocess.Popen([*call, "--out", str(tmp_path / "a")], stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / "a" / ".parts").is_dir():
+        time.sleep(0.1)
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    assert "the same command continues after the finished trajectories" in process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+
+
+def test_folders_that_cannot_be_written_are_named(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    words = ["simulate", "goop", "--train", "1", "--valid", "0", "--test", "0", "--frames", "1"]
+    assert main([*words, "--out", str(tmp_path / "file" / "out")]) == 1
+    assert "is a file, not a folder" in capsys.readouterr().err

@@ -225,6 +225,10 @@ class TestEmbedded:
         assert len(model.seen) == 2
         assert len(module.data_source.recordings("train")) == 2
 
+    def test_counts_outside_of_counts(self):
+        with pytest.raises(ConfigError, match=r"'train' is not an option.*generate: {counts: {train: 4, "):
+            TrajectoryDataModule(name="goop", generate={"train": 4}).prepare_data()
+
     def test_unknown_option(self):
         with pytest.raises(ConfigError, match="'count'"):
             TrajectoryDataModule(name="goop", generate={"count": 3}).prepare_data()
@@ -289,16 +293,16 @@ class TestModule:
         assert torch.equal(next(iter(loader)).frames, window.frames)
 
     def test_scene_and_description(self, make_dataset):
-        module = module_of(make_dataset(), boundary=["periodic", "wall"], gravity=[0, -1])
-        assert module.scene.gravity == (0, -1)
+        module = module_of(make_dataset(), boundary=["periodic", "wall"], gravity=[0, -9.81])
+        assert module.scene.gravity == (0, -9.81)
         assert module.scene.periodic == (True, False)
         assert "horizon=3" in str(module)
 
     @pytest.mark.parametrize(
         ("options", "named"),
         [
-            ({}, "either"),
-            ({"path": "a", "name": "goop"}, "either"),
+            ({}, "Neither data.path nor data.name"),
+            ({"path": "???"}, "data.path is not set.*give --data.path FOLDER"),
             ({"path": "a", "horizon": 0}, "horizon = 0"),
             ({"path": "a", "limit_eval": 0}, "limit_eval = 0"),
             ({"path": "a", "generate": {"frames": 3}}, "generate cannot be combined with recorded data"),
@@ -308,6 +312,12 @@ class TestModule:
     def test_contradictory_options_are_refused(self, options, named):
         with pytest.raises(ConfigError, match=named):
             TrajectoryDataModule(**options)
+
+    def test_a_path_replaces_a_name(self, make_dataset):
+        module = module_of(make_dataset(), name="waterramps")
+        assert module.description == "dataset"
+        assert module.scene.materials == ("goop",)
+        assert TrajectoryDataModule(path="???", name="goop").description == "goop, simulated by nmpm"
 
     def test_missing_split(self, make_dataset):
         module = module_of(make_dataset(valid=()))

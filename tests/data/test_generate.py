@@ -123,11 +123,11 @@ def interrupted(folder: Path, monkeypatch, seed: int = 0) -> None:
     simulated: list[int] = []
     simulate = MpmPreset.simulate
 
-    def stops_at_the_fifth(preset, trajectory_seed):
+    def stops_at_the_fifth(preset, trajectory_seed, *progress):
         if len(simulated) == 4:
             raise KeyboardInterrupt
         simulated.append(trajectory_seed)
-        return simulate(preset, trajectory_seed)
+        return simulate(preset, trajectory_seed, *progress)
 
     with monkeypatch.context() as patch:
         patch.setattr(MpmPreset, "simulate", stops_at_the_fifth)
@@ -140,7 +140,7 @@ def test_resumes_with_the_existing_parts(tmp_path, monkeypatch):
     assert len(list(tmp_path.glob(".parts/*.npz"))) == 4
     simulated: list[int] = []
     simulate = MpmPreset.simulate
-    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed: simulated.append(seed) or simulate(preset, seed))
+    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: simulated.append(seed) or simulate(preset, seed))
     generate(TINY, tmp_path, COUNTS, workers=1)
     assert len(simulated) == 3
 

@@ -163,6 +163,16 @@ class TestGravity:
         assert scene.gravity == (0, -9.81)
         assert scene.gravity_varies
 
+    def test_a_gravity_that_contradicts_the_files_is_refused(self, scene_of):
+        known = replace(BOX, gravity=(0.0, -9.81))
+        assert scene_of(run(lattice(0.01)), metadata=known, gravity=[0, -9.81]).gravity == (0, -9.81)
+        with pytest.raises(ConfigError, match=r"gravity = \[0.0, -1.0\] contradicts .*metadata.json.*\[0.0, -9.81\]"):
+            scene_of(run(lattice(0.01)), metadata=known, gravity=[0, -1])
+        heavy = run(lattice(0.01), gravity=np.array([0, -2], np.float32))
+        assert scene_of(heavy, gravity=[0, -2]).gravity == (0, -2)
+        with pytest.raises(ConfigError, match=r"contradicts .*train.h5.*\[0.0, -2.0\].*nmpm convert.*--gravity=0,-1"):
+            scene_of(heavy, gravity=[0, -1])
+
 
 class TestRecorded:
     def test_waterdrop(self, recorded):

@@ -8,6 +8,7 @@ A file is one trajectory: a MessagePack array of maps with `pos` and `vel` (N, D
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,16 +16,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from nmpm._support.limits import EXPANSION, MESSAGE_BYTES, MESSAGE_CONTAINERS, MESSAGE_ITEMS, expansion_limit
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.data.regular_files import check_regular
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError, DataError, NmpmError
 
 _SUFFIX = ".msgpack.zst"
 _FLUID, _WALL = 0, 1
 _DT, _GRAVITY = 0.02, -9.81
-_MOST_BYTES = 2**31  # of one frame
+_KIND = re.compile(rb"[<>|=]?[biuf]\d{1,2}")
 
 
 class Dmcf(DatasetFormat):
@@ -74,12 +76,57 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
     check_regular(path)
     try:
         with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
-            reader = msgpack.Unpacker(stream, raw=True, max_buffer_size=_MOST_BYTES)
+            containers = _ContainerCount()
+            reader = msgpack.Unpacker(
+                _BoundedStream(stream, expansion_limit(path.stat().st_size)),
+                raw=True,
+                strict_map_key=True,
+                max_buffer_size=MESSAGE_BYTES,
+                max_array_len=MESSAGE_ITEMS,
+                max_map_len=MESSAGE_ITEMS,
+                list_hook=containers.add,
+                object_hook=containers.add,
+            )
             for index in range(reader.read_array_header()):
+                containers.number = 0
                 yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
+    except NmpmError:
+        raise
     except (zstandard.ZstdError, msgpack.UnpackException, ValueError, OSError, RecursionError, MemoryError) as error:
         reason = str(error)[:200] or type(error).__name__
         raise DataError(f"{path}: cannot be read ({reason}). Is it complete? Copy or download it again.") from error
+
+
+class _BoundedStream:
+    """A stream that raises an error where it unpacks to more than it should.
+
+    Args:
+        stream: Of unpacked bytes.
+        limit: Bytes.
+    """
+
+    def __init__(self, stream: Any, limit: int) -> None:
+        self._stream, self._left, self._limit = stream, limit, limit
+
+    def read(self, count: int) -> bytes:
+        content: bytes = self._stream.read(count)
+        self._left -= len(content)
+        if self._left < 0:
+            raise ValueError(f"it unpacks to more than {self._limit:,} bytes, {EXPANSION} times its size")
+        return content
+
+
+class _ContainerCount:
+    """Raises an error where a frame has more lists and maps than `MESSAGE_CONTAINERS`."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def add(self, container: Any) -> Any:
+        self.number += 1
+        if self.number > MESSAGE_CONTAINERS:
+            raise ValueError(f"a frame has more than {MESSAGE_CONTAINERS} lists and maps")
+        return container
 
 
 def _decode_frame(frame: Any, where: str) -> dict[str, Any]:
@@ -93,11 +140,14 @@ def _value(value: Any, where: str) -> Any:
     if not isinstance(value, dict) or b"nd" not in value:
         return value
     try:
-        kind = np.dtype(bytes(value[b"type"]).decode("ascii"))
-        if kind.kind not in "biuf":
-            raise ValueError(f"expected numbers, found {kind}")
+        code, shape = value[b"type"], value[b"shape"] if value[b"nd"] else []
+        if not isinstance(code, bytes) or not _KIND.fullmatch(code):
+            raise ValueError(f"expected numbers, found the type {str(code)[:40]}")
+        if not isinstance(shape, list) or not all(isinstance(side, int) and side >= 0 for side in shape):
+            raise ValueError(f"its shape is {str(shape)[:40]}")
+        kind = np.dtype(code.decode("ascii"))
         flat = np.frombuffer(value[b"data"], kind)
-        return flat.reshape([int(side) for side in value[b"shape"]]) if value[b"nd"] else flat.reshape(())
+        return flat.reshape(shape)
     except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:
         raise DataError(f"{where}: not an array as msgpack-numpy writes it ({str(error)[:100]}).") from error
 

@@ -7,6 +7,7 @@ per trajectory. NumPy stores objects as a pickle, which is read by the restricte
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 from collections.abc import Iterator
@@ -16,12 +17,13 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
+from nmpm._support.limits import ARRAY_NAME, EXPANSION, expansion_limit
 from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
 from nmpm.data.regular_files import check_regular
-from nmpm.errors import DataError
+from nmpm.errors import DataError, NmpmError
 
 _SUFFIX = ".npz"
 _ALL = "gns_data"
@@ -62,11 +64,17 @@ def _members(path: Path) -> tuple[str, ...]:
     check_regular(path)
     try:
         with zipfile.ZipFile(path) as file:
-            names = [name.removesuffix(".npy") for name in file.namelist() if name.endswith(".npy")]
+            items = [item for item in file.infolist() if item.filename.endswith(".npy")]
+            unpacked = sum(item.file_size for item in items)
     except NPZ_ERRORS as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
+    names = [item.filename.removesuffix(".npy") for item in items]
     if not names:
         raise DataError(f"{path}: the file has no array.")
+    if max(map(len, names)) > ARRAY_NAME:
+        raise DataError(f"{path}: the name of an array has more than {ARRAY_NAME} characters.")
+    if unpacked > expansion_limit(path.stat().st_size):
+        raise DataError(f"{path}: unpacks to {unpacked:,} bytes, more than {EXPANSION} times its size.")
     return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d+", name)]))
 
 
@@ -86,13 +94,15 @@ def _array(path: Path, name: str) -> Any:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
             shape, fortran, kind = _header(file)
             data = file.read()
+        if kind.hasobject:
+            return load_pickled(data, where)
+        if len(data) != math.prod(shape) * kind.itemsize:
+            raise ValueError(f"{len(data)} bytes are not those of an array of {kind} and shape {shape}")
+        return np.frombuffer(data, kind).reshape(shape, order="F" if fortran else "C")
+    except NmpmError:
+        raise
     except NPZ_ERRORS as error:
         raise DataError(f"{where}: cannot be read ({str(error)[:200]}). Copy or download the file again.") from error
-    if kind.hasobject:
-        return load_pickled(data, where)
-    if len(data) != int(np.prod(shape)) * kind.itemsize:
-        raise DataError(f"{where}: has {len(data)} bytes, not those of an array of {kind} and shape {shape}.")
-    return np.frombuffer(data, kind).reshape(shape, order="F" if fortran else "C")
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -20,7 +20,7 @@ import numpy as np
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
-from nmpm.data.hdf5 import check_self_contained, open_hdf5
+from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
@@ -154,6 +154,7 @@ def _trajectories(files: tuple[Path, ...], material: int | None) -> Iterator[Tra
 def _values(file: Any, name: str, path: Path) -> np.ndarray:
     if not isinstance(file[name], h5py.Dataset) or file[name].dtype.kind not in "biuf":
         raise DataError(f"{path}: {name} must be an array of numbers.")
+    check_stored_size(file[name], f"{path}: {name}")
     return np.asarray(file[name][()])
 
 

@@ -10,15 +10,19 @@ import io
 import math
 import pickle
 import re
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
+from nmpm._support.limits import PICKLE_BYTES, PICKLE_DEPTH, PICKLE_ITEMS, PICKLE_STEPS
 from nmpm.errors import DataError
 
 _NDARRAY = "numpy.ndarray"
 """Stand-in for the class: calling it would let a pickle allocate any amount of memory."""
+
+_BLOCK = 64  # bytes
 
 _KINDS = re.compile(r"[biuf][1248]|c8|c16|O8|O4|[SU]\d{1,4}")
 
@@ -101,27 +105,148 @@ _ALLOWED: Mapping[tuple[str, str], Any] = _BASICS | {
 }
 
 
-class _ArraysOnly(pickle.Unpickler):
+class _CountedSteps(dict[int, Any]):
+    """The functions that execute a pickle's instructions, which raise an error after too many."""
+
+    def __init__(self, functions: Mapping[int, Any]) -> None:
+        super().__init__(functions)
+        self.left = PICKLE_STEPS
+
+    def __getitem__(self, code: int) -> Any:
+        self.left -= 1
+        if self.left < 0:
+            raise pickle.UnpicklingError(f"more than {PICKLE_STEPS:,} instructions")
+        if code not in self:
+            raise pickle.UnpicklingError(f"the instruction {code:#x}, which arrays do not need")
+        return super().__getitem__(code)
+
+
+class _ArraysOnly(pickle._Unpickler):
+    """Python's unpickler, as that in C allocates what an instruction asks for and hashes whatever becomes a key.
+
+    Args:
+        data: The pickle.
+    """
+
+    stack: list[Any]
+    append: Callable[[Any], None]
+    read: Callable[[int], bytes]
+    pop_mark: Callable[[], list[Any]]
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(io.BytesIO(data))
+        self.dispatch = _CountedSteps(_instructions())  # type: ignore[misc]  # (counts for this pickle alone)
+        self._size, self._encoded = len(data), 0
+
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it requests {module}.{name}, which arrays do not need and which is not run")
-        return _ALLOWED[module, name]
+        return self._encode if name == "encode" else _ALLOWED[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError(f"it refers to an external object ({pid!r})")
+        raise pickle.UnpicklingError(f"it refers to an external object ({str(pid)[:40]!r})")
+
+    def _encode(self, text: str, encoding: str) -> bytes:
+        self._encoded += len(text)
+        if self._encoded > self._size:
+            raise pickle.UnpicklingError("the same text several times")
+        return _encode(text, encoding)
+
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        if not isinstance(self.stack[-1], _Kind | _Array):
+            raise pickle.UnpicklingError("a state of something that is not an array")
+        self.stack[-1].__setstate__(state)
+
+    def load_bytearray8(self) -> None:
+        (size,) = struct.unpack("<Q", self.read(8))
+        if size > self._size:
+            raise pickle.UnpicklingError(f"{size} bytes, more than the pickle has")
+        self.append(bytearray(self.read(size)))
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._update([key, value])
+
+    def load_setitems(self) -> None:
+        self._update(self.pop_mark())
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.append({})
+        self._update(items)
+
+    def _update(self, items: list[Any]) -> None:
+        """Adds keys and values, in turns, to the mapping on top of the stack."""
+        keys = items[::2]
+        if not isinstance(self.stack[-1], dict) or not all(isinstance(key, str | bytes | int | float) for key in keys):
+            raise pickle.UnpicklingError("a mapping whose keys are neither text nor numbers")
+        self.stack[-1].update(zip(keys, items[1::2], strict=True))
+
+
+def _instructions() -> dict[int, Any]:
+    """The function that executes each instruction that arrays need."""
+    unused = (
+        *(pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER),
+        *(pickle.INST, pickle.OBJ, pickle.NEWOBJ, pickle.NEWOBJ_EX, pickle.EXT1, pickle.EXT2, pickle.EXT4),
+    )
+    checked = {
+        pickle.BUILD[0]: _ArraysOnly.load_build,
+        pickle.BYTEARRAY8[0]: _ArraysOnly.load_bytearray8,
+        pickle.SETITEM[0]: _ArraysOnly.load_setitem,
+        pickle.SETITEMS[0]: _ArraysOnly.load_setitems,
+        pickle.DICT[0]: _ArraysOnly.load_dict,
+    }
+    codes = {code: function for code, function in pickle._Unpickler.dispatch.items() if bytes([code]) not in unused}
+    return {**codes, **checked}
 
 
 def load_pickled(data: bytes, where: str) -> Any:
     """Reads a pickle of arrays, numbers, strings and containers of them.
 
     Raises:
-        DataError: if it is damaged, or requests anything but the constructors of arrays.
+        DataError: if it is damaged, requests anything but the constructors of arrays, or exceeds the limits of
+            `nmpm._support.limits`.
     """
     try:
-        return _resolve(_ArraysOnly(io.BytesIO(data)).load(), {})
-    except Exception as error:
+        if len(data) > PICKLE_BYTES:
+            raise pickle.UnpicklingError(f"more than {PICKLE_BYTES:,} bytes")
+        content = _ArraysOnly(data).load()
+        _check_amount(content, len(data))
+        return _resolve(content, {})
+    except (Exception, MemoryError) as error:
         reason = str(error)[:200] or type(error).__name__
         raise DataError(f"{where}: cannot be read as pickled arrays: {reason}.") from error
+
+
+def _check_amount(content: Any, stored: int) -> None:
+    """Refuses content that is much larger than its pickle, as what occurs several times is stored once.
+
+    Raises:
+        UnpicklingError: if there are too many objects, or they are nested too deep.
+    """
+    limit, done = PICKLE_ITEMS + 2 * stored // _BLOCK, dict[int, int]()
+
+    def amount(value: Any, depth: int) -> int:
+        """Objects, and blocks of numbers and text; each occurrence counts, but is walked once."""
+        if depth > PICKLE_DEPTH:
+            raise pickle.UnpicklingError(f"containers nested more than {PICKLE_DEPTH} deep")
+        value = value.value if isinstance(value, _Array) else value
+        if isinstance(value, np.ndarray):
+            return 1 + value.nbytes // _BLOCK
+        if isinstance(value, str | bytes | bytearray):
+            return 1 + len(value) // _BLOCK
+        if not isinstance(value, dict | list | tuple):
+            return 1
+        if id(value) not in done:
+            items = value.values() if isinstance(value, dict) else value
+            found = 1 + sum(amount(item, depth + 1) for item in items)
+            if found > limit:
+                raise pickle.UnpicklingError("the same objects are repeated too often")
+            done[id(value)] = found
+        return done[id(value)]
+
+    amount(content, 0)
 
 
 def _resolve(value: Any, done: dict[int, Any]) -> Any:

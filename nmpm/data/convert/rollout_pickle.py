@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from nmpm._support.bounded_files import read_bounded
+from nmpm._support.limits import PICKLE_BYTES
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import Metadata, Trajectory
@@ -51,7 +53,7 @@ def _files(path: Path) -> tuple[Path, ...]:
 
 def _content(path: Path) -> dict[str, Any]:
     check_regular(path)
-    content = load_pickled(path.read_bytes(), str(path))
+    content = load_pickled(read_bounded(path, PICKLE_BYTES), str(path))
     needed = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
     if not isinstance(content, dict) or not all(key in content for key in needed):
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
@@ -86,5 +88,5 @@ def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
             whole: dict[str, np.ndarray] = {key: np.concatenate([initial, part]) for key, part in parts.items()}
             types = number_array(content["particle_types"], f"{path}: particle_types")
             yield Trajectory(whole.pop("ground_truth_rollout"), types, {}, whole)
-        except (DataError, ValueError) as error:
+        except (ValueError, TypeError, MemoryError) as error:
             raise DataError(f"{path}: {error}") from error

@@ -17,6 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.limits import RECORD_FIELDS
 from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
@@ -81,8 +82,8 @@ def read_record(path: Path, offset: int, index: int) -> SequenceExample:
     if masked_crc(payload) != struct.unpack("<I", checksum)[0]:
         raise _damage_error(path, index, offset, "its checksum does not match its content")
     try:
-        return _sequence_example(payload)
-    except (ValueError, IndexError, struct.error) as error:
+        return _sequence_example(payload, _Budget())
+    except (ValueError, IndexError, struct.error, MemoryError) as error:
         raise _damage_error(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
 
 
@@ -134,53 +135,67 @@ def _damage_error(path: Path, index: int, offset: int, why: str) -> DataError:
     )
 
 
-def _sequence_example(payload: bytes) -> SequenceExample:
+class _Budget:
+    """Raises an error after too many fields and integers of a record."""
+
+    def __init__(self) -> None:
+        self.left = RECORD_FIELDS
+
+    def spend(self) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise ValueError(f"more than {RECORD_FIELDS:,} fields")
+
+
+def _sequence_example(payload: bytes, budget: _Budget) -> SequenceExample:
     context: dict[str, Feature] = {}
     steps: dict[str, list[Feature]] = {}
-    for number, value in _fields(payload):
-        for inner, entry in _fields(_bytes(value)):
+    for number, value in _fields(payload, budget):
+        for inner, entry in _fields(_bytes(value), budget):
             if inner != 1:
                 continue
-            name, content = _entry(_bytes(entry))
+            name, content = _entry(_bytes(entry), budget)
             if number == 1:
-                context[name] = _feature(content)
+                context[name] = _feature(content, budget)
             elif number == 2:
-                steps[name] = [_feature(_bytes(step)) for field, step in _fields(content) if field == 1]
+                steps[name] = [_feature(_bytes(step), budget) for field, step in _fields(content, budget) if field == 1]
     return SequenceExample(context, steps)
 
 
-def _entry(message: bytes) -> tuple[str, bytes]:
+def _entry(message: bytes, budget: _Budget) -> tuple[str, bytes]:
     """Key and value of a map's entry."""
-    parts = dict(_fields(message))
+    parts = dict(_fields(message, budget))
     return _bytes(parts.get(1, b"")).decode("utf-8"), _bytes(parts.get(2, b""))
 
 
-def _feature(message: bytes) -> Feature:
-    for kind, content in _fields(message):
-        values = [value for number, value in _fields(_bytes(content)) if number == 1]
+def _feature(message: bytes, budget: _Budget) -> Feature:
+    for kind, content in _fields(message, budget):
+        values = [value for number, value in _fields(_bytes(content), budget) if number == 1]
         if kind == _BYTES:
             return [_bytes(value) for value in values]
         if kind == _FLOATS:
             return np.frombuffer(b"".join(map(_bytes, values)), "<f4")
         if kind == _INTEGERS:
-            return np.array([number for value in values for number in _integers(value)], np.int64)
+            return np.array([number for value in values for number in _integers(value, budget)], np.int64)
     return []
 
 
-def _integers(value: int | bytes) -> Iterator[int]:
+def _integers(value: int | bytes, budget: _Budget) -> Iterator[int]:
     """Yields one integer, or several packed into bytes; 64 bits in two's complement."""
     place = 0
     while isinstance(value, bytes) and place < len(value):
+        budget.spend()
         number, place = _varint(value, place)
         yield number - (1 << 64) if number >> 63 else number
     if isinstance(value, int):
         yield value - (1 << 64) if value >> 63 else value
 
 
-def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
+def _fields(message: bytes, budget: _Budget) -> Iterator[tuple[int, int | bytes]]:
     """Yields number and value of each field: an integer, or bytes where it has a length or a fixed width."""
     place = 0
     while place < len(message):
+        budget.spend()
         key, place = _varint(message, place)
         number, wire = key >> 3, key & 7
         if wire == 0:

@@ -8,14 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from nmpm.data.format import Metadata, Split, split_paths
+from nmpm.data.format import Metadata, Split
 from nmpm.data.inspection.anomalies import find_anomalies
 from nmpm.data.inspection.facts import Inspection, Range, SplitFacts
 from nmpm.data.inspection.survey import Survey
+from nmpm.data.inspection.tolerance import open_splits, tolerant_metadata, with_guessed_family
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.progress import progress_bar
-from nmpm.data.statistics import find_disagreements
-from nmpm.errors import DataError
+from nmpm.data.statistics import MotionStatistics, find_disagreements
+from nmpm.errors import DataError, NmpmError
 from nmpm.scene import Scene
 
 _BYTES = 2**28  # of positions per split that are read by default
@@ -34,7 +35,7 @@ class _Tally:
 
 
 def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection:
-    """Inspects a dataset, with a progress bar.
+    """Inspects a dataset, with a progress bar; what `nmpm fit` would refuse becomes a finding.
 
     Args:
         origin: The dataset, and what the user states about it.
@@ -43,20 +44,22 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
     Raises:
         DataError: if there is no dataset, or no trajectory can be read.
     """
-    metadata = origin.metadata
-    findings: list[str] = []
-    splits = {name: Split(path) for name, path in split_paths(origin.folder).items()}
-    if not splits:
-        raise DataError(f"{origin.folder}: no train.h5, valid.h5 or test.h5 there.")
+    path = origin.path
+    splits, findings = open_splits(origin.folder)
+    family, origin = origin.stated.family, with_guessed_family(origin)
+    metadata, wrong = tolerant_metadata(origin, splits)
+    findings += wrong
     scene: Scene | None = None
     try:
         scene = origin.scene
-    except DataError as error:
-        findings.append(str(error))
+    except NmpmError as error:
+        if not wrong:
+            findings.append(str(error))
     tally = _tally(splits, metadata)
     domain = scene.domain if scene else metadata.domain or metadata.bounds
-    survey = Survey(metadata, domain)
+    survey, first = Survey(metadata, domain), next(iter(splits))
     chosen = {name: _spread_evenly(split, trajectories) for name, split in splits.items()}
+    statistics = MotionStatistics(metadata)
     spacing = _spacing(splits, chosen, metadata)
     fields: dict[str, tuple[int, ...]] = {}
     with progress_bar("Inspecting", sum(map(len, chosen.values()))) as advance:
@@ -66,18 +69,21 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
                 fields = fields or {key: values.shape for key, values in split.fields(index).items()}
                 findings += find_anomalies(trajectory, metadata, spacing, where)
                 survey.add(trajectory)
+                if split is splits[first]:
+                    statistics.add(trajectory)
             except DataError as error:
                 findings.append(str(error))
             advance()
     if not np.isfinite(survey.observed).all():
         raise DataError(f"{origin.folder}: none of its trajectories could be read. {findings[0]}")
-    findings += find_disagreements(survey.statistics.result(), metadata.extra)
+    if len(chosen[first]) == len(splits[first]):  # stated are those of the whole first split
+        findings += find_disagreements(statistics.result(), metadata.extra)
     findings += _lengths(tally, metadata)
     occupied, each = survey.occupied()
     fall = np.median(survey.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
     rests = [rest for rest in survey.rests if rest is not None]
     return Inspection(
-        path=str(origin.path),
+        path=str(path),
         dim=metadata.dim,
         dt=metadata.dt,
         splits={name: _split_facts(name, tally, len(chosen[name])) for name in splits},
@@ -97,7 +103,11 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
         occupied_each=each,
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
         restless=len(survey.rests) - len(rests),
-        notes=(*_out_of_bounds_notes(survey, metadata), *metadata.extra.get("conversion", ())),
+        notes=(
+            *_family_notes(origin, family),
+            *_out_of_bounds_notes(survey, metadata),
+            *_conversion_notes(metadata),
+        ),
         findings=_truncate(findings),
     )
 
@@ -128,7 +138,7 @@ def _tally(splits: Mapping[str, Split], metadata: Metadata) -> _Tally:
                 material = metadata.particle_types.get(number, f"type {number}")
                 tally.materials.setdefault(material, []).append(int((types == number).sum()))
             gravity = split.attributes(index).get("gravity")
-            tally.gravities.add(None if gravity is None else tuple(np.atleast_1d(gravity).tolist()))
+            tally.gravities.add(None if gravity is None else tuple(np.ravel(gravity).tolist()))
     return tally
 
 
@@ -184,6 +194,21 @@ def _lengths(tally: _Tally, metadata: Metadata) -> list[str]:
         return []
     lengths_found = f"{min(unexpected)}" if len(unexpected) == 1 else f"{min(unexpected)} to {max(unexpected)}"
     return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {lengths_found} frames."]
+
+
+def _family_notes(origin: FolderSource, stated: str | None) -> list[str]:
+    family = origin.stated.family
+    if family == stated:
+        return []
+    return [
+        f"The metadata do not state what the particle types mean; they are read as those of the {family} family, by"
+        f" the ids that occur. If that is right, add --family {family}; nmpm fit needs --data.family {family}."
+    ]
+
+
+def _conversion_notes(metadata: Metadata) -> list[str]:
+    notes = metadata.extra.get("conversion")
+    return [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
 
 
 def _out_of_bounds_notes(survey: Survey, metadata: Metadata) -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.inspection.anomalies import displacements
 from nmpm.data.inspection.facts import GridFacts
-from nmpm.data.statistics import MotionStatistics
 from nmpm.scene import Interval
 
 CANDIDATES = (16, 32, 64, 128, 256, 512)
@@ -36,7 +35,6 @@ class Survey:
 
     def __init__(self, metadata: Metadata, domain: Sequence[Interval]) -> None:
         self.metadata = metadata
-        self.statistics = MotionStatistics(metadata)
         self.low, high = np.asarray(domain).T
         self.extent = high - self.low
         self.longest = float(self.extent.max())
@@ -58,11 +56,12 @@ class Survey:
         types, position = trajectory.particle_type, trajectory.position
         moving = np.isin(types, self.metadata.moving_types)
         present = moving | np.isin(types, list(self.metadata.static_types))
+        if not present.any():
+            return
         self.observed[0] = np.minimum(self.observed[0], position[:, present].min(axis=(0, 1)))
         self.observed[1] = np.maximum(self.observed[1], position[:, present].max(axis=(0, 1)))
         if not moving.any():
             return
-        self.statistics.add(trajectory)
         step = displacements(position[:, moving], self.metadata)
         speed = np.linalg.norm(step, axis=-1)
         self._add_speeds(speed)

@@ -13,7 +13,7 @@ from typing import Any
 from nmpm.data import catalog
 from nmpm.data.convert import Options
 from nmpm.data.convert.cache import native_folder
-from nmpm.data.format import Metadata, Split, read_metadata, split_paths
+from nmpm.data.format import SPLITS, Metadata, Split, read_metadata, split_paths
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
@@ -22,6 +22,8 @@ from nmpm.data.loading.window_plan import EndlessWindowPlan, WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene
+
+_GENERATE = frozenset(inspect.signature(catalog.ensure).parameters) - {"name"}
 
 
 @dataclass(frozen=True)
@@ -165,10 +167,17 @@ class EmbeddedSource(DataSource):
         return catalog.scene(self.name)
 
     def _check_options(self) -> dict[str, Any]:
-        try:
-            inspect.signature(catalog.ensure).bind(self.name, **self.generate)
-        except TypeError as error:
-            raise ConfigError(f"generate = {self.generate}: {error}.") from error
+        unknown = sorted(set(self.generate) - _GENERATE)
+        if unknown:
+            mend = (
+                " Trajectories per split belong under counts: generate: {counts: {train: 4, valid: 1, test: 1}}."
+                if set(unknown) & set(SPLITS)
+                else ""
+            )
+            raise ConfigError(
+                f"generate = {self.generate}: {', '.join(map(repr, unknown))} is not an option; there are"
+                f" {', '.join(sorted(_GENERATE))}.{mend}"
+            )
         return self.generate
 
 

@@ -68,6 +68,26 @@ def test_trajectories_that_do_not_fit_the_scene_are_refused_and_nothing_is_writt
     assert not list(tmp_path.iterdir())
 
 
+def test_swapped_axes_are_refused(tmp_path):
+    position = runs()[0].position
+    with pytest.raises(DataError, match=r"7 particles but particle_type has 5\. Are its axes swapped\?.*swapaxes"):
+        nmpm.Trajectory(position.swapaxes(0, 1), np.zeros(5, int))
+    for bare in (position, position[:5], position[:1]):
+        nmpm.write_trajectories(tmp_path / "right" / "train.h5", [bare], ONE)
+    for bare in (position, position[:5]):
+        with pytest.raises(DataError, match=r"trajectory 0: the axes of positions \(5, \d, 2\) look swapped.*swapaxes"):
+            nmpm.write_trajectories(tmp_path / "train.h5", [bare.swapaxes(0, 1)], ONE)
+    square = nmpm.Trajectory(position[:5].swapaxes(0, 1), np.zeros(5, int))
+    with pytest.raises(DataError, match="look swapped"):
+        nmpm.write_trajectories(tmp_path / "train.h5", [square], ONE)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"file/train.h5: cannot be written \("):
+        nmpm.write_trajectories(tmp_path / "file" / "train.h5", [np.zeros((3, 2, 2))], ONE)
+
+
 def test_splits_of_different_scenes_do_not_mix(tmp_path):
     nmpm.write_trajectories(tmp_path / "train.h5", runs(), SCENE)
     with pytest.raises(DataError, match="states another scene"):

@@ -16,6 +16,7 @@ def test_crc32c_of_the_standard_check_string():
 
 
 @given(st.binary(max_size=300))
+@settings(deadline=None)  # the first call compiles
 def test_checksums_equal_those_computed_bit_by_bit(data):
     assert crc32c(data) == records.crc32c(data)
     assert struct.pack("<I", masked_crc(data)) == records.masked(data)

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
@@ -28,6 +28,7 @@ strains = st.tuples(st.floats(0.8, 1.1), st.floats(-0.2, 0.2), st.floats(0.8, 1.
 
 
 @given(gradients, strains, st.floats(0, 60))
+@settings(deadline=None)  # the first call compiles
 def test_shear_stress_is_bounded_by_friction_and_sand_never_pulls(gradient, strain, angle):
     after, stress = respond(Sand(1000.0, 3.5e5, 0.3, angle), gradient, strain)
     pressure = -(stress[0] + stress[2]) / 2
