@@ -9,8 +9,7 @@ stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `d
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,20 @@ import numpy as np
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import read_bounded
-from nmpm._support.limits import METADATA_BYTES, TEXT_DEPTH, WHOLE
+from nmpm._support.limits import METADATA_BYTES, TEXT_DEPTH
 from nmpm._support.messages import one_line
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
+from nmpm.data.json_keys import (
+    JsonKeys,
+    flags_parser,
+    intervals_parser,
+    parse_densities,
+    parse_ids,
+    parse_names,
+    parse_positive,
+    parse_whole,
+    vector_parser,
+)
 from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError, NmpmError
 from nmpm.scene import Interval
@@ -116,23 +126,23 @@ def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None
         DataError: if a key is missing or has a wrong value.
         ConfigError: if there is no such family.
     """
-    keys = _Keys(where, dict(plain))
-    dim = keys.take("dim", _whole)
+    keys = JsonKeys(where, dict(plain))
+    dim = keys.take("dim", parse_whole)
     if dim not in (1, 2, 3):
         raise keys.error("dim", dim, "1, 2 or 3")
     types, static = _types(keys, family)
     return Metadata(
-        bounds=keys.take("bounds", _intervals(dim)),
-        dt=keys.take("dt", _positive) * keys.peek("write_every", _positive, 1.0),
+        bounds=keys.take("bounds", intervals_parser(dim)),
+        dt=keys.take("dt", parse_positive) * keys.peek("write_every", parse_positive, 1.0),
         dim=dim,
         sequence_length=_sequence_length(keys),
         particle_types=types,
         static_types=static,
-        periodic=keys.take("periodic_boundary_conditions", _flags(dim), (False,) * dim),
-        domain=keys.take("domain", _intervals(dim), None),
-        gravity=keys.take("gravity", _vector(dim), None),
-        particle_volume=keys.take("particle_volume", _positive, None),
-        densities=keys.take("densities", _densities, {}),
+        periodic=keys.take("periodic_boundary_conditions", flags_parser(dim), (False,) * dim),
+        domain=keys.take("domain", intervals_parser(dim), None),
+        gravity=keys.take("gravity", vector_parser(dim), None),
+        particle_volume=keys.take("particle_volume", parse_positive, None),
+        densities=keys.take("densities", parse_densities, {}),
         extra=keys.left,
     )
 
@@ -201,131 +211,19 @@ def _check_depth(plain: Any, path: Path) -> None:
     raise DataError(f"{path}: lists and objects are nested more than {TEXT_DEPTH} deep.")
 
 
-class _Keys:
-    """Validates and removes the keys of a JSON object one by one; errors name the file and the key."""
-
-    _REQUIRED = object()
-
-    def __init__(self, path: Path, plain: dict[str, Any]) -> None:
-        self.path = path
-        self.left = plain
-
-    def error(self, key: str, value: Any, wanted: str) -> DataError:
-        return DataError(f"{self.path}: {key} = {one_line(_repr(value), 80)} should be {wanted}.")
-
-    def peek(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
-        if self.left.get(key) is None:
-            if default is self._REQUIRED:
-                raise DataError(f"{self.path}: the key {key!r} is missing.")
-            return default
-        try:
-            return parse(self.left[key])
-        except (TypeError, ValueError, OverflowError) as error:
-            raise self.error(key, self.left[key], str(error)) from error
-
-    def take(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
-        value = self.peek(key, parse, default)
-        self.left.pop(key, None)
-        return value
-
-
-def _repr(value: Any) -> str:
-    try:
-        return json.dumps(value)
-    except (TypeError, ValueError):
-        return type(value).__name__
-
-
-def _types(keys: _Keys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
+def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
     fallback = find_family(family) if family is not None else None
-    types = keys.take("particle_types", _names, dict(fallback.types) if fallback else None)
+    types = keys.take("particle_types", parse_names, dict(fallback.types) if fallback else None)
     if types is None:
         raise DataError(
             f"{keys.path}: the key 'particle_types' is missing, so the type ids have no meaning. Add it, e.g."
             f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
         )
     walls = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
-    return types, keys.take("static_types", _ids, fallback.static if fallback else walls)
+    return types, keys.take("static_types", parse_ids, fallback.static if fallback else walls)
 
 
-def _sequence_length(keys: _Keys) -> int:
+def _sequence_length(keys: JsonKeys) -> int:
     key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
-    length: int = keys.take(key, _whole) if key == _LENGTH_KEYS[0] else keys.peek(key, _whole)
+    length: int = keys.take(key, parse_whole) if key == _LENGTH_KEYS[0] else keys.peek(key, parse_whole)
     return length
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
-        raise ValueError("a finite number")
-    return float(value)
-
-
-def _positive(value: Any) -> float:
-    if _number(value) <= 0:
-        raise ValueError("a positive number")
-    return float(value)
-
-
-def _densities(value: Any) -> dict[str, float]:
-    if not isinstance(value, Mapping):
-        raise TypeError('positive numbers by material, e.g. {"water": 1000}')
-    return {str(name): _positive(density) for name, density in value.items()}
-
-
-def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < WHOLE:
-        raise ValueError(f"a positive integer below {WHOLE}")
-    return value
-
-
-def _ids(value: Any) -> frozenset[int]:
-    if not isinstance(value, list) or any(
-        isinstance(i, bool) or not isinstance(i, int) or abs(i) > WHOLE for i in value
-    ):
-        raise ValueError("a list of type ids")
-    return frozenset(value)
-
-
-def _names(value: Any) -> dict[int, str]:
-    if not isinstance(value, Mapping) or not value or not all(isinstance(name, str) for name in value.values()):
-        raise ValueError('an object that maps ids to names, e.g. {"7": "goop"}')
-    try:
-        types = {int(i): name for i, name in value.items()}
-    except ValueError as error:
-        raise ValueError('an object whose keys are integers, e.g. {"7": "goop"}') from error
-    if any(abs(i) > WHOLE for i in types):
-        raise ValueError(f"an object whose keys are at most {WHOLE}")
-    return types
-
-
-def _vector(dim: int) -> Callable[[Any], tuple[float, ...]]:
-    def parse(value: Any) -> tuple[float, ...]:
-        if not isinstance(value, list) or len(value) != dim:
-            raise ValueError(f"a list of {dim} numbers, one per axis")
-        return tuple(_number(item) for item in value)
-
-    return parse
-
-
-def _intervals(dim: int) -> Callable[[Any], tuple[Interval, ...]]:
-    wanted = f"a list of {dim} pairs [lower, upper] with lower < upper, one per axis"
-
-    def parse(value: Any) -> tuple[Interval, ...]:
-        if not isinstance(value, list) or len(value) != dim:
-            raise ValueError(wanted)
-        pairs = [_vector(2)(pair) for pair in value]
-        if any(low >= high for low, high in pairs):
-            raise ValueError(wanted)
-        return tuple((low, high) for low, high in pairs)
-
-    return parse
-
-
-def _flags(dim: int) -> Callable[[Any], tuple[bool, ...]]:
-    def parse(value: Any) -> tuple[bool, ...]:
-        # LagrangeBench gives three flags to two-dimensional scenes as well.
-        if not isinstance(value, list) or len(value) < dim or not all(isinstance(flag, bool) for flag in value):
-            raise ValueError(f"a list of at least {dim} booleans, one per axis")
-        return tuple(value[:dim])
-
-    return parse
