@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from nmpm.errors import DataError
+from nmpm._support.messages import one_line
+from nmpm.errors import DataError, NmpmError
 from nmpm.training.module import EmulatorModule
 
 FORMER_ARGUMENTS = frozenset({"horizons", "emd"})
@@ -25,8 +25,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: there is no such checkpoint.")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
-        reason = str(error).strip().split("\n")[0]
+    except Exception as error:  # torch's readers raise many types on damaged files
+        reason = f"{type(error).__name__}: {one_line(error)}"
         raise DataError(
             f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain data, which"
             f" is never executed. Use another, such as best.ckpt or last.ckpt beside it. ({reason})"
@@ -45,11 +45,16 @@ def load_module(path: Path) -> EmulatorModule:
     """
     content = read_checkpoint(path)
     stored = content.get("hyper_parameters", {})
+    if not isinstance(stored, dict):
+        raise DataError(f"{path} is not a checkpoint of an emulator: its hyperparameters are not named values.")
     arguments = {key: value for key, value in stored.items() if key not in FORMER_ARGUMENTS}
     try:
         module = EmulatorModule(**arguments)
         module.on_load_checkpoint(content)
         module.load_state_dict(content["state_dict"])
-    except (RuntimeError, TypeError, KeyError) as error:
-        raise DataError(f"{path} is not a checkpoint of an emulator of this version: {error}") from error
+    except NmpmError:
+        raise
+    except Exception as error:  # hyperparameters of a foreign or damaged file may have any type and value
+        reason = f"{type(error).__name__}: {one_line(error)}"
+        raise DataError(f"{path} is not a checkpoint of an emulator of this version ({reason}).") from error
     return module

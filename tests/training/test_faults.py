@@ -176,3 +176,20 @@ class TestZoo:
     def test_names_that_lead_elsewhere_are_refused(self, root, name):
         with pytest.raises(ZooError):
             Zoo.load(name, root)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"state_dict": {}},
+        {"state_dict": {}, "hyper_parameters": []},
+        {"state_dict": {}, "hyper_parameters": {"scene": 7}},
+        {"state_dict": {}, "hyper_parameters": {"unroll": "many"}},
+        {"state_dict": [1, 2], "hyper_parameters": {}},
+    ],
+)
+def test_checkpoints_of_something_else_are_rejected_in_one_line(content, tmp_path):
+    torch.save(content, tmp_path / "other.ckpt")
+    with pytest.raises(DataError, match=r"other\.ckpt") as error:
+        load_module(tmp_path / "other.ckpt")
+    assert "\n" not in str(error.value)
