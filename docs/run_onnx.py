@@ -5,6 +5,8 @@ import sys
 import numpy as np
 import onnxruntime
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 block = np.stack(np.meshgrid(np.linspace(0.4, 0.6, 28), np.linspace(0.4, 0.6, 28)), axis=-1).reshape(1, -1, 2)
 state = {"position": block.astype("float32"), "velocity": np.zeros_like(block, "float32")}  # length, length per frame

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, NmpmError
 from nmpm.training.module import EmulatorModule
@@ -33,7 +35,21 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or "state_dict" not in content:
         raise DataError(f"{path} is not a checkpoint of a training: it has no state_dict.")
+    _check_digest(content, path)
     return content
+
+
+def _check_digest(content: dict[str, Any], path: Path) -> None:
+    """Make sure that the weights are those that were saved; checkpoints of version 0.1.0 state no digest."""
+    stated, weights = content.get("nmpm_digest"), content["state_dict"]
+    if stated is None:
+        return
+    whole = isinstance(weights, dict) and all(isinstance(values, Tensor) for values in weights.values())
+    if not whole or weights_digest(weights) != stated:
+        raise DataError(
+            f"{path} is damaged: its weights are not those that were saved. Use another checkpoint, such as best.ckpt"
+            " or last.ckpt beside it."
+        )
 
 
 def load_module(path: Path) -> EmulatorModule:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.collectives import global_mean, normal_like, rank_slice
+from nmpm._support.digests import weights_digest
 from nmpm._support.specs import class_path
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
@@ -142,8 +143,9 @@ class EmulatorModule(LightningModule):
             compile_network(self.emulator.processor, example)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """State the format of the hyperparameters, and which optimizer the stored state belongs to."""
+        """State the format, the digest of the weights, and which optimizer the stored state belongs to."""
         checkpoint["nmpm_format"] = FORMAT
+        checkpoint["nmpm_digest"] = weights_digest(checkpoint["state_dict"])
         if self.trainer.optimizers:
             checkpoint["nmpm_optimizer"] = class_path(type(self.trainer.optimizers[0]))
 

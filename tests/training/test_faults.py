@@ -12,13 +12,17 @@ import sys
 import time
 from pathlib import Path
 
+import lightning
 import pytest
 import torch
 import yaml
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
+from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import DataError, ZooError
+from nmpm.processors import UNet
+from nmpm.training import EmulatorModule
 from nmpm.training.checkpoints import load_module
 from nmpm.zoo import Zoo
 
@@ -193,3 +197,17 @@ def test_checkpoints_of_something_else_are_rejected_in_one_line(content, tmp_pat
     with pytest.raises(DataError, match=r"other\.ckpt") as error:
         load_module(tmp_path / "other.ckpt")
     assert "\n" not in str(error.value)
+
+
+def test_changed_weights_are_noticed(make_dataset, tmp_path):
+    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, batch_size=2)
+    model = EmulatorModule(data.scene, cells=8, frames=2, processor=UNet(width=4, depth=1, perceptron=(4,)))
+    lightning.Trainer(max_steps=1, logger=False, enable_checkpointing=False, accelerator="cpu").fit(model, data)
+    model.trainer.save_checkpoint(tmp_path / "sound.ckpt")
+    content = torch.load(tmp_path / "sound.ckpt", weights_only=True)
+    load_module(tmp_path / "sound.ckpt")
+    name = next(name for name in content["state_dict"] if name.endswith("weight"))
+    content["state_dict"][name].view(-1)[0] += 1e-3
+    torch.save(content, tmp_path / "changed.ckpt")
+    with pytest.raises(DataError, match=r"changed\.ckpt is damaged: its weights are not those that were saved"):
+        load_module(tmp_path / "changed.ckpt")
