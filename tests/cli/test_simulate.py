@@ -1,3 +1,4 @@
+import functools
 import signal
 import subprocess
 import sys
@@ -81,12 +82,19 @@ def test_an_interruption_says_how_to_go_on(tmp_path):
     """The trajectories that run are stopped: one of them would take minutes."""
     words = ["simulate", "goop", "--train", "2", "--valid", "0", "--test", "0", "--frames", "100000"]
     call = [sys.executable, "-c", "import sys; from nmpm.cli import main; sys.exit(main())", *words]
-    process = subprocess.Popen([*call, "--out", str(tmp_path / "a")], stderr=subprocess.PIPE, text=True)
-    while not (tmp_path / "a" / ".parts").is_dir():
-        time.sleep(0.1)
-    time.sleep(1)
-    process.send_signal(signal.SIGINT)
-    assert "the same command continues after the finished trajectories" in process.communicate(timeout=60)[1]
+    # Children of a job in the background, as tests may be, ignore SIGINT otherwise.
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(
+        [*call, "--out", str(tmp_path / "a")], stderr=subprocess.PIPE, text=True, preexec_fn=heed
+    ) as process:
+        try:
+            while not (tmp_path / "a" / ".parts").is_dir() and process.poll() is None:
+                time.sleep(0.1)
+            time.sleep(1)
+            process.send_signal(signal.SIGINT)
+            assert "the same command continues after the finished trajectories" in process.communicate(timeout=60)[1]
+        finally:
+            process.kill()
     assert process.returncode == 130
 
 
