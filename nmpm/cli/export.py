@@ -1,8 +1,4 @@
-"""`nmpm export MODEL --format onnx`.
-
-There is no `--device`: files are written from a copy of the model on the CPU, on which they also run, and are compared
-with that copy. A comparison with the model on a GPU would measure the GPU's rounding, not the file.
-"""
+"""`nmpm export MODEL --format onnx`."""
 
 from __future__ import annotations
 
@@ -12,16 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nmpm.cli.options import add_model_options, check_output
+from nmpm.cli.options import add_device_option, add_model_options, check_device, check_output
 from nmpm.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from nmpm.zoo.export import Part
 
 DESCRIPTION = """Write a trained model as a file that runs without nmpm: ONNX, for ONNX Runtime, without torch; or
-a package of AOTInductor (.pt2), machine code for the CPU that compiles it, for torch in Python or C++. The numbers of
-scenes and particles stay open. The file's metadata describe its inputs and outputs with their units. After writing, its
-outputs are compared with the model's; if they differ, the file is deleted."""
+a package of AOTInductor (.pt2), machine code for the device that --device names, for torch in Python or C++. The
+numbers of scenes and particles stay open. The file's metadata describe its inputs and outputs with their units. After
+writing, its outputs are compared with the model's; if they differ, the file is deleted."""
 TOLERANCE = 1e-3
 """Largest difference, in cells, that a file may have from its model over one call."""
 
@@ -33,12 +29,19 @@ def run(words: list[str]) -> None:
     if out.suffix != f".{chosen.format}":
         raise ConfigError(f"--out {out}: for --format {chosen.format} its name must end in .{chosen.format}.")
     check_output("--out", out)
+    check_device(chosen.device)
+    if chosen.format == "onnx" and chosen.device != "cpu":
+        raise ConfigError(
+            f"--device {chosen.device}: ONNX files run on any device, which ONNX Runtime's providers decide; leave the"
+            " option out, or take --format pt2, whose machine code is for one device."
+        )
     _export(chosen, out)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="nmpm export", description=DESCRIPTION)
     add_model_options(parser)
+    add_device_option(parser)
     parser.add_argument("--format", choices=["onnx", "pt2"], default="onnx", help="of the file (default: onnx)")
     parts = parser.add_mutually_exclusive_group()
     parts.add_argument(
@@ -62,12 +65,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _export(chosen: argparse.Namespace, out: Path) -> None:
+    from nmpm._support.devices import find_device
     from nmpm.zoo import export, load_model
 
     model = load_model(chosen.model, root=chosen.root)
     emulator = model.emulator.unconstrained() if chosen.free else model.emulator
     kinds: Mapping[str, type[Part]] = {kind.__name__: kind for kind in (export.Step, export.Network, export.Solid)}
-    part = kinds[chosen.part](emulator)
+    part = kinds[chosen.part](emulator).to(find_device(chosen.device))
     form = export.FORMATS[chosen.format]
     form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
     difference = form.difference(part, out, batch=1, count=300)

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -289,3 +290,20 @@ def test_a_file_that_differs_from_its_model_is_deleted(tmp_path, monkeypatch, ca
 def test_a_wrong_call_is_said(words, message, capsys):
     assert main(words) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", [Step, Network])
+def test_a_part_computes_on_the_device_that_it_is_moved_to(kind, monkeypatch):
+    """On torch's meta device, which raises where devices are mixed."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
+    part = kind(emulator_of(box(materials=("water", "sand")), Constraints(energy=True, solids=False))).to("meta")
+    outputs = part(**part.draw_inputs(2, 7))
+    assert {output.device.type for output in outputs} == {"meta"}
+    assert [output.shape[0] for output in outputs] == [2] * len(part.outputs)
+
+
+def test_onnx_files_are_for_no_device(monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    assert main(["export", "goop", "--device", "cuda"]) == 1
+    assert "ONNX files run on any device" in capsys.readouterr().err

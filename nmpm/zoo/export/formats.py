@@ -42,11 +42,11 @@ class Format:
         Returns:
             The difference in cells for the step, else in the output's own units; inf where either is NaN.
         """
-        inputs = part.example(batch, count, seed)
+        inputs = part.draw_inputs(batch, count, seed)
         actual, expected = self.run(path, inputs), part(**inputs)
         worst = 0.0
         for value, one, other in zip(part.outputs, actual, expected, strict=True):
-            gap = (one - other).abs().nan_to_num(nan=float("inf")).max().item() if other.numel() else 0.0
+            gap = (one.cpu() - other.cpu()).abs().nan_to_num(nan=float("inf")).max().item() if other.numel() else 0.0
             worst = max(worst, gap / part.scale(value.name))
         return worst
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from nmpm.emulator import Emulator, RolloutContext
+from nmpm.emulator.rasterise import wall_fraction
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
@@ -40,7 +41,7 @@ class Value:
 
 
 class Part(nn.Module, ABC):
-    """An exportable function of named float32 tensors, with a copy of the emulator on the CPU.
+    """An exportable function of named float32 tensors, with a copy of the emulator on the CPU; `to` moves it.
 
     Args:
         emulator: On any device; it is left there.
@@ -53,9 +54,18 @@ class Part(nn.Module, ABC):
         super().__init__()
         self.emulator = copy.deepcopy(emulator).cpu().float().eval().requires_grad_(False)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the part computes."""
+        return self.emulator.device
+
+    def draw_inputs(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
+        """The inputs of `example` on the part's device."""
+        return {name: values.to(self.device) for name, values in self.example(batch, count, seed).items()}
+
     @abstractmethod
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
-        """Random inputs, for tracing and for comparing programs with the emulator.
+        """Random inputs on the CPU, for tracing and for comparing programs with the emulator.
 
         Args:
             batch: Scenes.
@@ -149,8 +159,8 @@ class Step(Part):
             "position": low + (high - low) * torch.rand(batch, count, scene.dim, generator=random),
             "velocity": spread * torch.randn(batch, count, scene.dim, generator=random),
             "material": torch.randint(len(scene.materials), (batch, count), generator=random),
-            "gravity": self.known_gravity.repeat(batch, 1),
-            "solid": self.emulator.walls.expand(batch, 1, *grid.shape).clone(),
+            "gravity": (torch.tensor(scene.gravity or (0.0,) * scene.dim) * scene.dt**2).repeat(batch, 1),
+            "solid": wall_fraction(scene, grid).expand(batch, 1, *grid.shape).clone(),
             "budget": torch.full((batch,), float("nan")),
         }
         return {value.name: values[value.name] for value in self.inputs}
@@ -182,7 +192,12 @@ class Network(Part):
         emulator = self.emulator
         shape = (batch, len(emulator.scene.input_channels), *emulator.grid.shape)
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-        return {"grid": emulator.input_mean + emulator.input_std * noise}
+        return {"grid": noise}
+
+    def draw_inputs(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
+        """Grid states with the mean and standard deviation of the emulator's inputs."""
+        noise = super().draw_inputs(batch, count, seed)["grid"]
+        return {"grid": self.emulator.input_mean + self.emulator.input_std * noise}
 
 
 class Solid(Part):

@@ -18,7 +18,7 @@ def program(part: Part) -> ExportedProgram:
     """
     sizes = {name: Dim(name, min=1) for name in VARYING}
     shapes = {value.name: _open(value, sizes) for value in part.inputs}
-    example = part.example(VARYING["B"], VARYING["N"])
+    example = part.draw_inputs(VARYING["B"], VARYING["N"])
     try:
         with torch.no_grad(), using("native"):
             return torch.export.export(part, (), example, dynamic_shapes=shapes)
