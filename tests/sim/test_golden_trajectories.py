@@ -1,6 +1,6 @@
 """Shipped presets against trajectories recorded once: numbers change only together with the solver's revision.
 
-`python tests/sim/test_golden.py` records them anew, for a new revision.
+`python tests/sim/test_golden_trajectories.py` records them anew, for a new revision.
 """
 
 import hashlib
