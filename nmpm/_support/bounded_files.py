@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import yaml
 
 from nmpm._support.limits import DIGITS, TEXT_BYTES, TEXT_DEPTH
 from nmpm._support.messages import one_line
+from nmpm._support.regular_files import check_mode
 from nmpm.errors import DataError
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -28,8 +28,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
     try:
         # Before opening, as that would block on a named pipe.
         status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):
-            raise DataError(f"{path} cannot be read: it is not a regular file.")
+        check_mode(path, status.st_mode)
         if status.st_size > limit:
             raise DataError(f"{path} cannot be read: it has more than {limit:,} bytes.")
         with path.open("rb") as file:

@@ -18,6 +18,15 @@ def check_regular(path: Path) -> None:
         mode = path.stat().st_mode
     except OSError as error:
         raise DataError(f"{path}: cannot be opened ({error.strerror}).") from error
+    check_mode(path, mode)
+
+
+def check_mode(path: Path, mode: int) -> None:
+    """Raises an error unless the mode of a path's `stat` is that of a regular file.
+
+    Raises:
+        DataError: naming what it is, such as a FIFO or a device.
+    """
     if not stat.S_ISREG(mode):
         raise DataError(f"{path}: is {_kind(mode)}, not a regular file. Give a file, or the folder that holds it.")
 

@@ -17,10 +17,14 @@ def shipped_folder(folder: str) -> Path:
     return installed if installed.is_dir() else PACKAGE.parent / folder
 
 
+def user_home() -> Path:
+    """The user's folder of datasets and models: the environment variable `NMPM_HOME`, else `~/.cache/nmpm`."""
+    return Path(os.environ.get("NMPM_HOME") or Path.home() / ".cache" / "nmpm").expanduser()
+
+
 def user_zoo() -> Path:
-    """The folder of the user's own models: `zoo` in the environment variable `NMPM_HOME`, else in `~/.cache/nmpm`."""
-    home = os.environ.get("NMPM_HOME") or Path.home() / ".cache" / "nmpm"
-    return Path(home).expanduser() / "zoo"
+    """The folder of the user's own models."""
+    return user_home() / "zoo"
 
 
 def config_names() -> list[str]:

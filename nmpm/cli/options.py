@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nmpm._support.writable import file_obstacle, folder_obstacle
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -57,11 +57,7 @@ def check_output(option: str, path: Path) -> None:
     Raises:
         ConfigError: if the path is a folder, or its folder does not exist or is not writable.
     """
-    if path.is_dir():
-        raise ConfigError(f"{option} {path}: it is a folder; name a file.")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{option} {path}: the folder {path.parent} does not exist; create it first.")
-    _check_writable(option, path, path.parent)
+    _refuse(option, path, file_obstacle(path))
 
 
 def check_picture(option: str, path: Path) -> None:
@@ -86,7 +82,7 @@ def check_folder(option: str, path: Path) -> None:
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ConfigError(f"{option} {path}: {existing} is a file, not a folder.")
-    _check_writable(option, path, existing)
+    _refuse(option, path, folder_obstacle(existing))
 
 
 def check_input(option: str, path: Path) -> None:
@@ -145,13 +141,9 @@ def new_ids(text: str | None) -> dict[int, int] | None:
     return pairs
 
 
-def _check_writable(option: str, path: Path, folder: Path) -> None:
-    try:
-        # Unlike the permission bits, this also finds read-only and full file systems.
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ConfigError(f"{option} {path}: the folder {folder} is not writable ({error.strerror}).") from error
+def _refuse(option: str, path: Path, obstacle: str) -> None:
+    if obstacle:
+        raise ConfigError(f"{option} {path}: {obstacle}")
 
 
 def _pairs(text: str) -> dict[int, int]:

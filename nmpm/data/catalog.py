@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
+from nmpm._support.shipped import user_home
 from nmpm.data.generate import SimulationRequest, generate
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -60,8 +60,8 @@ def _entries() -> Mapping[str, CatalogEntry]:
 
 
 def dataset_home() -> Path:
-    """The cache folder: the environment variable `NMPM_HOME`, else `~/.cache/nmpm`."""
-    return Path(os.environ.get("NMPM_HOME") or Path.home() / ".cache" / "nmpm").expanduser()
+    """The cache folder of datasets."""
+    return user_home()
 
 
 def catalog() -> tuple[str, ...]:

@@ -20,7 +20,7 @@ import h5py
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.limits import HDF5_DEPTH, HDF5_OBJECTS, expansion_limit
-from nmpm.data.regular_files import check_regular
+from nmpm._support.regular_files import check_regular
 from nmpm.errors import DataError, NmpmError
 
 _ERRORS = (OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError, MemoryError)

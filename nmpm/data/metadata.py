@@ -32,7 +32,6 @@ from nmpm.data.json_keys import (
     parse_whole,
     vector_parser,
 )
-from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError, NmpmError
 from nmpm.scene import Interval
 
@@ -188,7 +187,6 @@ def load_json(path: Path) -> dict[str, Any]:
         raise DataError(f"{path.parent}: no such folder. Give the folder that contains {METADATA_FILE}.")
     if not path.exists():
         raise DataError(f"{path}: no such file. A dataset needs this file, with bounds, dt, dim and sequence_length.")
-    check_regular(path)
     try:
         plain = json.loads(read_bounded(path, METADATA_BYTES).decode("utf-8"))
     except NmpmError:

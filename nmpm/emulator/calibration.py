@@ -19,7 +19,7 @@ _MARGIN = 0.5
 
 @dataclass(frozen=True)
 class _Inputs:
-    """Statistics of a sample's grid states, on the CPU: the number of cells, and (C,) figures of their values."""
+    """Statistics of a sample's grid states: the number of cells, and (C,) figures of their values."""
 
     cells: int
     mean: Tensor
@@ -30,7 +30,7 @@ class _Inputs:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """What the decoder leaves of one material's true velocities, on the CPU: (m, D) mean square over particles."""
+    """What the decoder leaves of one material's true velocities: (m, D) mean square over particles."""
 
     particles: int
     square: Tensor
@@ -50,8 +50,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     """
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
-    device = emulator.input_mean.device
-    windows = [window.to(device) for window in windows]
+    windows = [window.to(emulator.device) for window in windows]
     inputs = _combine(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))

@@ -136,8 +136,7 @@ class EmulatorModule(LightningModule):
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
         if not self.emulator.calibrated:
             loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]  # (Lightning sets it)
-            windows = [window.to(self.device) for window in islice(loader, CALIBRATION_BATCHES)]
-            calibrate(self.emulator, windows)
+            calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
         if self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
             compile_network(self.emulator.processor, example)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.writable import file_obstacle
 from nmpm.errors import ConfigError, DataError
 
 
@@ -32,16 +32,9 @@ def check_output(path: Path) -> None:
     """
     if path.suffix.lower() == ".mp4":
         _check_encoder()
-    if path.is_dir():
-        raise DataError(f"Cannot write {path}: it is a folder.")
-    if not path.parent.is_dir():
-        raise DataError(f"Cannot write {path}: the folder {path.parent} does not exist; create it first.")
-    try:
-        # Unlike a look at the permission bits, this also finds read-only and full file systems.
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise DataError(f"Cannot write {path}: the folder {path.parent} is not writable ({error.strerror}).") from error
+    obstacle = file_obstacle(path)
+    if obstacle:
+        raise DataError(f"Cannot write {path}: {obstacle}")
 
 
 def _check_encoder() -> None:

@@ -7,10 +7,10 @@ import h5py
 import numpy as np
 import pytest
 
+from nmpm._support.regular_files import check_regular
 from nmpm.data.convert import FORMATS, Options
 from nmpm.data.format import METADATA_FILE, Split, Trajectory, read_metadata, write_split
 from nmpm.data.hdf5 import check_self_contained, open_hdf5, writable_hdf5
-from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 from tests.conftest import made_up_trajectory
 

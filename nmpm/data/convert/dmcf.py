@@ -17,10 +17,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.limits import EXPANSION, MESSAGE_BYTES, MESSAGE_CONTAINERS, MESSAGE_ITEMS, expansion_limit
+from nmpm._support.regular_files import check_regular
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
-from nmpm.data.regular_files import check_regular
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 _SUFFIX = ".msgpack.zst"

@@ -18,11 +18,11 @@ from typing import IO, Any, ClassVar
 import numpy as np
 
 from nmpm._support.limits import ARRAY_NAME, EXPANSION, expansion_limit
+from nmpm._support.regular_files import check_regular
 from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
-from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError, NmpmError
 
 _SUFFIX = ".npz"

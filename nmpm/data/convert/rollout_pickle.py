@@ -15,7 +15,6 @@ from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rerea
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import metadata_from_dict
-from nmpm.data.regular_files import check_regular
 from nmpm.errors import DataError
 
 
@@ -52,7 +51,6 @@ def _files(path: Path) -> tuple[Path, ...]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    check_regular(path)
     content = load_pickled(read_bounded(path, PICKLE_BYTES), str(path))
     needed = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
     if not isinstance(content, dict) or not all(key in content for key in needed):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.limits import RECORD_FIELDS
-from nmpm.data.regular_files import check_regular
+from nmpm._support.regular_files import check_regular
 from nmpm.errors import DataError
 
 _MASK_DELTA = 0xA282EAD8
