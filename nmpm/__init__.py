@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from nmpm.particles import Particles as Particles
     from nmpm.scene import Scene as Scene
     from nmpm.training.module import EmulatorModule as EmulatorModule
+    from nmpm.viz.viewer import view as view
     from nmpm.zoo.registry import Zoo as Zoo
 
 _MODULE_OF = {
@@ -30,6 +31,7 @@ _MODULE_OF = {
     "TrajectoryDataModule": "nmpm.data.datamodule",
     "Zoo": "nmpm.zoo",
     "rollout": "nmpm.emulator",
+    "view": "nmpm.viz.viewer",
     "write_trajectories": "nmpm.data.convert.arrays",
 }
 
@@ -44,6 +46,7 @@ __all__ = [
     "Zoo",
     "__version__",
     "rollout",
+    "view",
     "write_trajectories",
 ]
 

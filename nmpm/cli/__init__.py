@@ -22,7 +22,8 @@ COMMANDS = {
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
     "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
-    "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
+    "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF or MP4."),
+    "view": ("nmpm.cli.view", "Write a page that plays trajectories in a browser."),
 }
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]
@@ -40,6 +41,7 @@ first steps:
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
   nmpm render out.h5                           draw the rollout
+  nmpm view out.h5                             play it in a browser
   nmpm stress goop                             test it at the extremes
 
 Add --help to any command for its options; fit --print_config prints a whole configuration.
