@@ -30,7 +30,7 @@ def description(page) -> dict:
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(1, 9), st.sampled_from([2, 3]))
 def test_positions_come_back_within_half_a_step(seed, frames, count, dim):
     rng = np.random.default_rng(seed)
-    low, high = np.sort(rng.normal(scale=10, size=(2, dim)), axis=0) + [[-1e-3], [1e-3]]
+    low, high = np.sort(rng.normal(scale=10, size=(2, dim)), axis=0) + np.array([[-1e-3], [1e-3]])
     position = rng.uniform(low, high, size=(frames, count, dim))
     steps = unpack(pack_positions(quantize(position, low, high)), position.shape)
     assert np.all(np.abs(low + steps * (high - low) / STEPS - position) <= 0.5001 * (high - low) / STEPS)
