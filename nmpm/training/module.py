@@ -13,7 +13,6 @@ from lightning.pytorch import LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.collectives import global_mean, normal_like, rank_slice
 from nmpm._support.digests import weights_digest
@@ -21,6 +20,7 @@ from nmpm._support.specs import class_path
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
+from nmpm.emulator.gradients import recomputing_unroll
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
@@ -254,14 +254,7 @@ class EmulatorModule(LightningModule):
         return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
 
     def _unroll(self, particles: Particles, count: int) -> Iterator[Bundle]:
-        if not self.recompute:
-            yield from unroll(self.emulator, particles, count)
-            return
-        context = self.emulator.context(particles)
-        for _ in range(count):
-            bundle: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
-            yield bundle
-            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        return (recomputing_unroll if self.recompute else unroll)(self.emulator, particles, count)
 
     def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:

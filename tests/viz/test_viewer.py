@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm import view
@@ -27,6 +27,7 @@ def description(page) -> dict:
     return json.loads(re.search(r'type="application/json">(.*?)</script>', page.html, re.DOTALL)[1])
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(1, 9), st.sampled_from([2, 3]))
 def test_positions_come_back_within_half_a_step(seed, frames, count, dim):
     rng = np.random.default_rng(seed)
