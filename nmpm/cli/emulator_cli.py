@@ -44,7 +44,7 @@ BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": Fa
 # does not change.
 LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
 
-START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint; its parts must be equal."
+START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
 class EmulatorCLI(LightningCLI):
