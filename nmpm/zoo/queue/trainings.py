@@ -89,7 +89,10 @@ class Training:
         return int(record.get("training", record).get("steps", record.get("trained_steps", 0)))
 
     def precision(self) -> str:
-        """Of the training, as its configuration states it."""
+        """Of the training, as its command or else its configuration states it."""
+        words = self._words()
+        if "--trainer.precision" in words:
+            return words[words.index("--trainer.precision") + 1]
         return str(read_yaml(self.folder / CONFIG).get("trainer", {}).get("precision", "32-true"))
 
     def _words(self) -> list[str]:
