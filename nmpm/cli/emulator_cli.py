@@ -35,12 +35,16 @@ from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
+from nmpm.training.parts import check_same_recipe
 from nmpm.training.run_folder import RunFolder
+from nmpm.zoo.registry import load_model
 
 BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
 # A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best
 # does not change.
 LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
+
+START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
 class EmulatorCLI(LightningCLI):
@@ -72,6 +76,8 @@ class EmulatorCLI(LightningCLI):
         parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
         parser.add_lightning_class_args(ModelCheckpoint, "resume")
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
+        if self.words[0] == "fit":
+            parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
@@ -131,6 +137,8 @@ class EmulatorCLI(LightningCLI):
         resumed = self._load_checkpoint()
         if resumed is not None:
             self.model.check_optimizer(resumed)
+        elif self.config_init[self.subcommand].get("start_from"):
+            self._load_initial_weights(str(self.config_init[self.subcommand]["start_from"]))
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         self.locks.append(self.run_folder.lock())
@@ -152,6 +160,17 @@ class EmulatorCLI(LightningCLI):
 
     def before_predict(self) -> None:
         self._load_checkpoint()
+
+    def _load_initial_weights(self, name: str) -> None:
+        """Give the model the weights and statistics of another one, over the data's scene.
+
+        Raises:
+            ConfigError: naming the parts in which the two differ.
+        """
+        own = self.model.emulator
+        found = load_model(name).emulator.over(own.scene)
+        check_same_recipe(found.recipe.to_dict(), own.recipe)
+        own.load_state_dict(found.state_dict())
 
     def _load_checkpoint(self) -> dict[str, Any] | None:
         """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""

@@ -21,6 +21,8 @@ from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
 
 TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']
+SLOW = ("dambreak2d.yaml", "waterdrop3d.yaml", "wbcsph.yaml")
+"""Configurations of data whose simulation, or network in three dimensions, takes long."""
 TINY = [
     *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
     *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
@@ -45,7 +47,9 @@ def source(config: str, make_dataset) -> list[str]:
     return ["--data.path", str(make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),)))]
 
 
-@pytest.mark.parametrize("config", config_names())
+@pytest.mark.parametrize(
+    "config", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in config_names()]
+)
 def test_every_shipped_configuration_runs_to_its_report(config, make_dataset, capsys):
     data = [*source(config, make_dataset), "--trainer.default_root_dir", "run"]
     assert main(["fit", "--config", config, *TINY, *data]) == 0

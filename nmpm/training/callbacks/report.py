@@ -25,7 +25,7 @@ from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
 
 
 class ReportWriter(Callback):
-    """Measures the time that training takes, and writes the report when a test ends.
+    """Measures the time that training takes and the errors on the way, and writes the report when a test ends.
 
     Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions), `errors.csv`
     (error against frame), `rollout.png` and `rollout.gif` (the first test trajectory beside its prediction).
@@ -34,6 +34,7 @@ class ReportWriter(Callback):
     def __init__(self) -> None:
         self.trained_seconds = 0.0
         self.trained_steps = 0
+        self.curve: list[list[float]] = []  # seconds of training, steps and MSE of each validation
         self._since: float | None = None
         self._trained = False
         self._first_rollout: tuple[Window, Tensor] | None = None
@@ -43,13 +44,14 @@ class ReportWriter(Callback):
         return "Report"  # its name in checkpoints of earlier versions
 
     def state_dict(self) -> dict[str, Any]:
-        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps}
+        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps, "curve": list(self.curve)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if self._trained:
             return  # the test after a fit loads the best checkpoint, which is often older than the training's end
         self.trained_seconds = float(state_dict["trained_seconds"])
         self.trained_steps = int(state_dict.get("trained_steps", 0))
+        self.curve = list(state_dict.get("curve", []))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self._since, self._trained = time.monotonic(), True
@@ -63,6 +65,11 @@ class ReportWriter(Callback):
         batch_idx: int,  # noqa: ARG002
     ) -> None:
         self.trained_steps = trainer.global_step
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        mse = trainer.callback_metrics.get("valid/mse")
+        if self._trained and not trainer.sanity_checking and mse is not None:
+            self.curve.append([round(self._elapsed(), 1), self.trained_steps, float(mse)])
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self.trained_seconds, self._since = self._elapsed(), None
@@ -118,6 +125,7 @@ class ReportWriter(Callback):
                 "hardware": device_name(trainer.strategy.root_device),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
+            "curve": self.curve,
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
         }
 
