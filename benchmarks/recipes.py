@@ -21,8 +21,6 @@ only if the checkpoint has changed or with `--fresh`; times are measured in ever
 
 from __future__ import annotations
 
-import csv
-import itertools
 import json
 import re
 import statistics
@@ -221,13 +219,24 @@ def mean_over_seeds(rows: Sequence[Mapping[str, Any]], metric: str) -> dict[str,
     return {name: np.mean([row[name] for row in found], axis=0).tolist() for name in found[0] if name != "settings"}
 
 
-def summarise(runs: Sequence[Run], rows: Sequence[Mapping[str, Any]], baseline: Mapping[str, Any]) -> dict[str, str]:
+def group_seeds(runs: Mapping[Path, Run], paths: Sequence[Path]) -> list[list[Path]]:
+    """The paths of each recipe's seeds, recipes in the order of their first run."""
+    groups: dict[str, list[Path]] = {}
+    for path in paths:
+        groups.setdefault(runs[path].recipe, []).append(path)
+    return list(groups.values())
+
+
+def summarise(
+    found: Mapping[Path, Run], figures: Mapping[Path, Any], seeds: Sequence[Path], baseline: Mapping[str, Any]
+) -> dict[str, str]:
     """A table's line for the seeds of one recipe."""
+    runs, rows = [found[path] for path in seeds], [figures[path] for path in seeds]
     line = {"recipe": runs[0].recipe, "seeds": str(len(runs))}
     costs = [run.cost() for run in runs]
     for name, digits in (("steps", 0), ("ms_per_step", 0), ("minutes", 1)):
-        found = [cost[name] for cost in costs if cost]
-        line[name.replace("_", " ")] = f"{statistics.fmean(found):.{digits}f}" if found else "–"
+        known = [cost[name] for cost in costs if cost]
+        line[name.replace("_", " ")] = f"{statistics.fmean(known):.{digits}f}" if known else "–"
     errors = mean_over_seeds(rows, "errors")
     for name, label in [*((f"mse@{h}", f"MSE@{h}") for h in HORIZONS), ("mse", "full"), ("emd", "late EMD")]:
         line[label] = format_error(errors.get(name), baseline.get(name)) if errors else "–"
@@ -272,14 +281,6 @@ def format_markdown(lines: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
 
 
-def write_csv(path: Path, lines: Sequence[Mapping[str, str]]) -> None:
-    """The same table as comma-separated values."""
-    with atomic_write(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
-        writer.writeheader()
-        writer.writerows(lines)
-
-
 def measure_all(runs: Mapping[Path, Run], chosen: Namespace) -> dict[Path, dict[str, Any]]:
     """Figures of each run, new or kept."""
     figures = {path: Figures(run, chosen.fresh) for path, run in runs.items()}
@@ -307,23 +308,16 @@ def main() -> None:
     parser.add_argument("--shape-scenes", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=7, help="of timed rollouts")
     parser.add_argument("--fresh", action="store_true", help="measure again what was measured before")
-    parser.add_argument("--csv", type=Path, help="write the table to this file")
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     runs = {path: Run(path.resolve()) for path in dict.fromkeys([*chosen.baseline, *chosen.runs])}
     figures = measure_all(runs, chosen)
     first = mean_over_seeds([figures[path] for path in chosen.baseline], "errors") if chosen.baseline else {}
-    groups = itertools.groupby(sorted(runs, key=lambda path: (path not in chosen.baseline, runs[path].recipe)),
-                               key=lambda path: (path not in chosen.baseline, runs[path].recipe))  # fmt: skip
-    lines = []
-    for (compared, _), paths in groups:
-        members = list(paths)
-        reference = first if compared else {}
-        lines.append(summarise([runs[p] for p in members], [figures[p] for p in members], reference))
+    others = [path for path in runs if path not in chosen.baseline]
+    lines = [summarise(runs, figures, group, {}) for group in group_seeds(runs, chosen.baseline)]
+    lines += [summarise(runs, figures, group, first) for group in group_seeds(runs, others)]
     sys.stdout.write(format_markdown(lines))
-    if chosen.csv:
-        write_csv(chosen.csv, lines)
     write_json(chosen.json, {str(path): rows for path, rows in figures.items()})
 
 

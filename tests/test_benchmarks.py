@@ -176,6 +176,45 @@ def test_a_zoo_model_agrees_with_itself_on_the_same_device():
     assert 0 < figures["cpu"]["errors"]["mse"] < figures["cpu"]["errors"]["still/mse"]
 
 
+# ---- trained runs side by side
+
+
+def test_ratio_of_scaled_errors_has_no_spread_and_that_of_noise_contains_one():
+    import recipes
+
+    theirs = [1.0, 5.0, 2.0, 0.1]
+    assert recipes.ratio_interval([value / 2 for value in theirs], theirs) == pytest.approx((0.5, 0.5, 0.5))
+    _, low, high = recipes.ratio_interval(theirs[::-1], theirs)
+    assert low < 1 < high
+
+
+def test_seeds_are_averaged_scene_by_scene():
+    import recipes
+
+    rows = [{"errors": {"settings": "", "mse": [1.0, 3.0]}}, {"errors": {"settings": "", "mse": [2.0, 5.0]}}]
+    assert recipes.mean_over_seeds(rows, "errors") == {"mse": [1.5, 4.0]}
+    assert recipes.mean_over_seeds([*rows, {}], "errors") == {}
+    assert {recipes.Run(Path(name)).recipe for name in ("goop-0", "goop-12")} == {"goop"}
+
+
+def test_figures_of_a_run_are_kept_until_its_checkpoint_or_the_settings_change(tmp_path):
+    import recipes
+
+    checkpoint = tmp_path / "checkpoints" / "best.ckpt"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"one")
+    values = iter(range(10))
+
+    def measured(settings="", fresh=False):
+        figures = recipes.Figures(recipes.Run(tmp_path), fresh)
+        figures.measure("errors", settings, lambda: {"mse": next(values)})
+        return figures.rows["errors"]["mse"]
+
+    assert [measured(), measured(), measured("other"), measured("other", fresh=True)] == [0, 0, 1, 2]
+    checkpoint.write_bytes(b"another")
+    assert measured("other") == 3
+
+
 # ---- the script that runs everything on a machine with a GPU
 
 

@@ -66,7 +66,8 @@ class PatchedNetwork(GridProcessor):
     def forward(self, grid: Tensor) -> Tensor:
         coarse = cells_to_channels(pad_to_multiple(grid, self.patch), self.patch)
         fields = channels_to_cells(self.network(coarse).flatten(0, 1), self.patch)
-        return crop(fields.unflatten(0, (grid.shape[0], -1)), grid.shape[2:], first=3)
+        out: Tensor = fields.unflatten(0, (grid.shape[0], -1))
+        return crop(out, grid.shape[2:], first=3)
 
 
 def cells_to_channels(grid: Tensor, patch: int) -> Tensor:
@@ -74,7 +75,8 @@ def cells_to_channels(grid: Tensor, patch: int) -> Tensor:
     dim = grid.dim() - 2
     for axis in range(dim + 1, 1, -1):
         grid = grid.unflatten(axis, (-1, patch))
-    return grid.permute(0, 1, *range(3, 2 * dim + 2, 2), *range(2, 2 * dim + 2, 2)).flatten(1, dim + 1)
+    within, across = range(3, 2 * dim + 2, 2), range(2, 2 * dim + 2, 2)
+    return grid.permute(0, 1, *within, *across).flatten(1, dim + 1)
 
 
 def channels_to_cells(fields: Tensor, patch: int) -> Tensor:
