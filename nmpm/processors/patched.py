@@ -76,7 +76,8 @@ def cells_to_channels(grid: Tensor, patch: int) -> Tensor:
     for axis in range(dim + 1, 1, -1):
         grid = grid.unflatten(axis, (-1, patch))
     within, across = range(3, 2 * dim + 2, 2), range(2, 2 * dim + 2, 2)
-    return grid.permute(0, 1, *within, *across).flatten(1, dim + 1)
+    coarse: Tensor = grid.permute(0, 1, *within, *across).flatten(1, dim + 1)
+    return coarse
 
 
 def channels_to_cells(fields: Tensor, patch: int) -> Tensor:
@@ -84,7 +85,7 @@ def channels_to_cells(fields: Tensor, patch: int) -> Tensor:
     dim = fields.dim() - 2
     split = fields.unflatten(1, (-1, *(patch,) * dim))
     order = [place for axis in range(dim) for place in (2 + dim + axis, 2 + axis)]
-    joined = split.permute(0, 1, *order)
+    joined: Tensor = split.permute(0, 1, *order)
     for axis in range(2, dim + 2):
         joined = joined.flatten(axis, axis + 1)
     return joined
