@@ -130,7 +130,7 @@ class EmulatorCLI(LightningCLI):
         check_endless_batches(self.trainer)
         resumed = self._load_checkpoint()
         if resumed is not None:
-            self.model.check_optimizer(resumed)
+            self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         self.locks.append(self.run_folder.lock())
