@@ -22,7 +22,7 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "gallery"} | {
-    "against_recordings", "calibration", "dam_break", "simulators", "stable_substeps",
+    "against_recordings", "calibration", "dam_break", "kills", "simulators", "stable_substeps",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes on one thread, and the simulators."""
 
