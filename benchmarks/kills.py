@@ -127,8 +127,10 @@ def killed_after(seconds: float, words: Sequence[str]) -> bool:
 
 
 def run(words: Sequence[str]) -> None:
-    """Run nmpm to its end."""
-    subprocess.run(nmpm(words), check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+    """Run nmpm to its end; its errors are shown if it fails."""
+    ended = subprocess.run(nmpm(words), check=False, capture_output=True, text=True)  # noqa: S603
+    if ended.returncode:
+        raise SystemExit(f"nmpm {' '.join(words)} ended with status {ended.returncode}:\n{ended.stderr}")
 
 
 def nmpm(words: Sequence[str]) -> list[str]:

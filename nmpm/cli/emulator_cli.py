@@ -23,6 +23,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
+from nmpm.cli.options import check_folder
 from nmpm.cli.typos import BriefParser, UsageError
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
@@ -76,11 +77,24 @@ class EmulatorCLI(LightningCLI):
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
     def before_instantiate_classes(self) -> None:
-        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""
+        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder.
+
+        Raises:
+            ConfigError: if a model that was not trained is to be judged, or the learning rate is not positive.
+        """
         config = self.config[self.subcommand]
         config["weights_only"] = True
         trainer = config["trainer"]
         trainer["default_root_dir"] = trainer["default_root_dir"] or "runs/default"
+        check_folder("--trainer.default_root_dir", Path(trainer["default_root_dir"]))
+        if self.subcommand != "fit":
+            if not config["ckpt_path"]:
+                raise ConfigError(
+                    "--ckpt_path is missing, so the model would be an untrained one: give best or last, of"
+                    f" {trainer['default_root_dir']}, or a checkpoint's file."
+                )
+            if config.get("verbose"):
+                config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
         for saver in ("checkpoint", "resume"):
             folder = Path(trainer["default_root_dir"]) / "checkpoints"
@@ -136,22 +150,25 @@ class EmulatorCLI(LightningCLI):
         self.locks.append(self.run_folder.lock())
         if resumed is None:
             self.run_folder.check_new()
+        self._print_start()
+        sys.stdout.write(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
+        sys.stdout.flush()
+
+    def _print_start(self) -> None:
+        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
+            return
         weights = sum(parameter.numel() for parameter in self.model.emulator.parameters())
         sys.stdout.write(
             f"Data: {self.datamodule.description}. Model: {type(self.model.emulator.recipe.processor).__name__},"
             f" {weights:,} parameters, on {device_name(self.trainer.strategy.root_device)}.\n"
-            f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n"
         )
         sys.stdout.flush()
 
     def before_validate(self) -> None:
         self._load_checkpoint()
+        self._print_start()
 
-    def before_test(self) -> None:
-        self._load_checkpoint()
-
-    def before_predict(self) -> None:
-        self._load_checkpoint()
+    before_test = before_predict = before_validate
 
     def _load_checkpoint(self) -> dict[str, Any] | None:
         """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""

@@ -77,7 +77,11 @@ def test_a_training_goes_on_with_the_arguments_that_it_is_given(begun, tmp_path,
     assert line.startswith("Going on from step 2 with changed arguments: ")
     rate = was["optimizer_states"][0]["param_groups"][0]["initial_lr"]
     assert f"model.optimizer.lr = 1e-05 (was {rate})" in line
-    for found in ("betas = (0.5, 0.9) (was (0.9, 0.999))", "density_weight = 0.5 (was 0.0)", "schedule.warmup = 1 (was"):
+    for found in (
+        "betas = (0.5, 0.9) (was (0.9, 0.999))",
+        "density_weight = 0.5 (was 0.0)",
+        "schedule.warmup = 1 (was",
+    ):
         assert found in line
     ended = torch.load(tmp_path / "more" / "last.ckpt", weights_only=True)
     group = ended["optimizer_states"][0]["param_groups"][0]
