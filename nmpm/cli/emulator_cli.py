@@ -24,7 +24,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
 from nmpm.cli.options import check_folder
-from nmpm.cli.typos import BriefParser, UsageError
+from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
 from nmpm.training.budget import check_endless_batches
@@ -227,9 +227,10 @@ def run_command(words: list[str], found: list[str]) -> int:
         found: The same with the configuration files' paths.
 
     Returns:
-        The exit status: 2 for an option or key that cannot be.
+        The exit status.
 
     Raises:
+        UsageError: for an option or key that cannot be.
         ConfigError: if Lightning refuses the configuration.
         KeyboardInterrupt: at SIGINT and SIGTERM, saying how to go on.
     """
@@ -247,9 +248,6 @@ def run_command(words: list[str], found: list[str]) -> int:
                 parser_kwargs={"parser_mode": "omegaconf+"},
                 save_config_kwargs={"overwrite": True},
             )
-    except UsageError as error:
-        sys.stderr.write(f"nmpm {words[0]}: {error}\n")
-        return 2
     except MisconfigurationException as error:
         raise ConfigError(" ".join(str(error).split())) from error
     except SystemExit as ended:

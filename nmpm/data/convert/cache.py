@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from nmpm.data.catalog import dataset_home
+from nmpm._support.shipped import user_home
 from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import METADATA_FILE
@@ -32,7 +32,7 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
     """
     path, options = Path(path).resolve(), options or Options()
     _check_stated_gravity(path, options)
-    cache = dataset_home() / "converted"
+    cache = user_home() / "converted"
     folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
     with lock_folder(cache):
         if not (folder / METADATA_FILE).is_file():
