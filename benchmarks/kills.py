@@ -2,29 +2,34 @@
 
 python benchmarks/kills.py --rounds 20
 
-A round starts a tiny run in a new folder, kills the process and its workers at a moment drawn uniformly from the
-duration of an uninterrupted run, and runs the command again until it ends by itself; a fit goes on with
+A round starts a tiny run in a new folder, kills its process at a moment drawn uniformly from the duration of an
+uninterrupted run, and runs the command again until it ends by itself; a fit goes on with
 `--ckpt_path last` where there is such a checkpoint, and starts over where there is none. Then all files of a dataset
 must have the same bytes, and the best and last checkpoints of a fit the same weights, as those of the uninterrupted
-run. Kills that come too late are drawn again. The exit status is 1 if a round differs.
+run. Kills that come too late are drawn again. Processes are forked after the imports, so that no kill falls into those.
+The exit status is 1 if a round differs.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import multiprocessing
 import os
 import random
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import torch
+
+from nmpm.cli import main as main_of_nmpm
 
 SIMULATE = (
     *("simulate", "goop", "--train", "6", "--valid", "1", "--test", "1", "--frames", "80"),
@@ -114,28 +119,36 @@ def kill_rounds(name: str, task: Task, root: Path, rounds: int, draw: random.Ran
 
 
 def killed_after(seconds: float, words: Sequence[str]) -> bool:
-    """Start nmpm and kill it with its workers; False if it had ended before."""
-    silent = subprocess.DEVNULL
-    process = subprocess.Popen(nmpm(words), stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
-    try:
-        process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return True
-    return False
+    """Start nmpm and kill it; False if it had ended before."""
+    process = start(words)
+    process.join(seconds)
+    process.kill()
+    process.join()
+    return process.exitcode == -signal.SIGKILL
 
 
 def run(words: Sequence[str]) -> None:
-    """Run nmpm to its end; its errors are shown if it fails."""
-    ended = subprocess.run(nmpm(words), check=False, capture_output=True, text=True)  # noqa: S603
-    if ended.returncode:
-        raise SystemExit(f"nmpm {' '.join(words)} ended with status {ended.returncode}:\n{ended.stderr}")
+    """Run nmpm to its end."""
+    process = start(words)
+    process.join()
+    if process.exitcode:
+        raise SystemExit(f"nmpm {' '.join(words)} ended with status {process.exitcode}.")
 
 
-def nmpm(words: Sequence[str]) -> list[str]:
-    """The command line of this interpreter's nmpm."""
-    return [sys.executable, "-m", "nmpm", *words]
+def start(words: Sequence[str]) -> ForkServerProcess:
+    """A process of nmpm, in which its modules are imported already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["nmpm.cli.emulator_cli", "nmpm.data.generate"])
+    process = context.Process(target=run_silently, args=(list(words),))
+    process.start()
+    return process
+
+
+def run_silently(words: list[str]) -> None:
+    """Run nmpm in this process and exit with its status; nothing is shown."""
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        status = main_of_nmpm(words)
+    raise SystemExit(status)
 
 
 def last(out: Path) -> Path:
