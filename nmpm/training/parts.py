@@ -144,6 +144,6 @@ def _differences(theirs: Any, mine: Any, name: str) -> Iterator[tuple[str, Any, 
     elif theirs.get("class_path") != mine.get("class_path"):
         yield name, theirs.get("class_path"), mine.get("class_path")
     else:
-        for key in theirs | mine:
+        for key in {**theirs, **mine}:
             inner = name if key == "init_args" else f"{name}.{key}"
             yield from _differences(theirs.get(key), mine.get(key), inner)
