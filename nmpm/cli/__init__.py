@@ -58,7 +58,7 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; errors that a user can correct are printed without a traceback.
+    """Run a command; errors that a user can correct, those of the file system too, are printed without a traceback.
 
     Returns:
         The exit status: 0 for success, 1 for an error, 2 for a wrong call, 130 for an interruption.
@@ -80,6 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
+        return 1
+    except OSError as error:
+        if error.filename is None or error.strerror is None:
+            raise
+        sys.stderr.write(f"nmpm {words[0]}: {error.filename}: {error.strerror.lower()}.\n")
         return 1
     except KeyboardInterrupt as interrupt:
         sys.stderr.write(f"\nnmpm {words[0]}: {interrupt or 'interrupted.'}\n")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
@@ -31,7 +32,13 @@ from nmpm.training.augmentation import check_mirrors, mirror_windows
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.losses import density_error, position_error
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
-from nmpm.training.parts import check_same_optimizer, check_same_recipe, check_same_scene
+from nmpm.training.parts import (
+    adopt_optimizer_arguments,
+    changed_arguments,
+    check_same_optimizer,
+    check_same_recipe,
+    check_same_scene,
+)
 from nmpm.training.schedules import Schedule
 
 CALIBRATION_BATCHES = 4
@@ -151,21 +158,35 @@ class EmulatorModule(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Compare the checkpoint with this model, and with its optimizer if a training goes on.
 
+        A training goes on with this model's arguments; those that the checkpoint has otherwise are logged.
+
         Raises:
             ConfigError: if a newer version wrote it, or a part differs.
         """
         check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
         check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
         if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
-            self.check_optimizer(checkpoint)
+            changed = self.adopt_arguments(checkpoint)
+            if changed:
+                step = checkpoint.get("global_step")
+                rank_zero_info(f"Going on from step {step} with changed arguments: {'; '.join(changed)}.")
 
-    def check_optimizer(self, checkpoint: Mapping[str, Any]) -> None:
-        """Make sure that a training can go on with a checkpoint's optimizer state.
+    def adopt_arguments(self, checkpoint: Mapping[str, Any]) -> list[str]:
+        """Make a training go on from a checkpoint with this model's arguments, those of its optimizer among them.
+
+        Args:
+            checkpoint: Changed in place.
+
+        Returns:
+            What differs, such as "model.optimizer.lr = 0.001 (was 0.003)".
 
         Raises:
-            ConfigError: if it is of another optimizer.
+            ConfigError: if its optimizer state is of another optimizer.
         """
-        check_same_optimizer(checkpoint, build_optimizer(self.make_optimizer, self.emulator.parameters()))
+        optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
+        check_same_optimizer(checkpoint, optimizer)
+        changed = changed_arguments(checkpoint["hyper_parameters"], dict(self.hparams))
+        return changed + adopt_optimizer_arguments(checkpoint, optimizer)
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Seed the batch's random numbers by its index, so that a resumed run repeats them.
