@@ -71,6 +71,9 @@ class ReportWriter(Callback):
         mse = trainer.callback_metrics.get("valid/mse")
         if self._trained and not trainer.sanity_checking and mse is not None:
             self.curve.append([round(self._elapsed(), 1), self.trained_steps, float(mse)])
+        if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
+            dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
+            _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self.trained_seconds, self._since = self._elapsed(), None
@@ -105,11 +108,6 @@ class ReportWriter(Callback):
             write_animation(trajectories, folder / "rollout.gif")
         _print_table(f"{figures['dataset']}: test", figures["test"])
         Console().print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
-            dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
-            _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))
 
     def _elapsed(self) -> float:
         return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
