@@ -1,14 +1,59 @@
-"""Training losses: the squared error of positions, and beside it that of the density that they make on the grid."""
+"""Training losses: the squared error of positions, and beside it that of the density that they make on the grid.
+
+Either as a mean over all particles, or window by window and bundle by bundle, to be tempered: raised to a power below
+1, so that splashes, whose errors nothing can reduce much, do not drown what can be learnt elsewhere.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
+
+_FLOOR = 1e-4
+"""Cells², added to errors before they are raised to a power: below a hundredth of a cell errors no longer count."""
+
+
+@dataclass(frozen=True)
+class TrainingError:
+    """What a training minimises: the position error, with the density error at the last frame of each bundle.
+
+    Args:
+        density_weight: Weight of the density error beside the position error in cells².
+        power: In (0, 1]; below 1, the error of each window and bundle is raised to it before the mean.
+
+    Raises:
+        ConfigError: if the power is not in that range.
+    """
+
+    density_weight: float = 0.0
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.power <= 1:
+            raise ConfigError(f"model.error_power = {self.power} must be above 0 and at most 1.")
+
+    def __call__(self, predicted: Tensor, window: Window, scene: Scene, grid: Grid, frames: int) -> Tensor:
+        """The error () of predicted positions (B, K m, N, D), m frames to a bundle, as a mean over particles."""
+        target = window.target[:, : predicted.shape[1]]
+        last = slice(frames - 1, None, frames)
+        if self.power == 1:
+            error = position_error(predicted, target, window.mask, grid)
+            if not self.density_weight:
+                return error
+            return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
+        errors = position_errors(predicted, target, window.mask, grid, frames)
+        if self.density_weight:
+            density = density_errors(predicted[:, last], target[:, last], window, scene, grid)
+            errors = errors + self.density_weight * density
+        return tempered_error(errors, window.mask, self.power)
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:
@@ -32,6 +77,32 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
     return squared.sum() / (mask.sum() * predicted.shape[1] * predicted.shape[3])
 
 
+def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
+    """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames); NaN for empty ones.
+
+    Args:
+        predicted: (B, T, N, D) positions in domain length.
+        target: (B, T, N, D), likewise.
+        mask: (B, N) bool, False for padding.
+        grid: Gives the cells' size.
+        frames: m; T is a multiple of it.
+    """
+    squared = grid.to_cell_displacement(predicted - target).square().mean(-1) * mask.unsqueeze(1)
+    return squared.sum(-1).unflatten(1, (-1, frames)).mean(-1) / mask.sum(1, keepdim=True)
+
+
+def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:
+    """Mean over real particles and bundles of (error + floor) ** power, the error that of a particle's window.
+
+    Args:
+        errors: (B, K) of each window and bundle, in cells².
+        mask: (B, N) bool, False for padding.
+        power: 0.5 for root mean squares.
+    """
+    count = mask.sum(1, keepdim=True)
+    return ((errors + _FLOOR).pow(power) * count).sum() / (count.sum() * errors.shape[1])
+
+
 def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
     """Squared error of each material's volume fraction φ on the grid, Σ (φ' - φ)² / (2 Σ φ) over frames and cells.
 
@@ -48,6 +119,30 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
     Returns:
         A number; NaN if there is no real particle.
     """
+    found, true = _volume_fractions(predicted, target, window, scene, grid)
+    particles = window.mask.sum() * predicted.shape[1]
+    return (found - true).square().sum() / (2 * scene.particle_volume / grid.cell_volume * particles)
+
+
+def density_errors(predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
+    """`density_error` of each of B windows and of each frame, (B, F); NaN for windows without real particles.
+
+    Args:
+        predicted: (B, F, N, D) positions in domain length, at F frames.
+        target: (B, F, N, D), likewise.
+        window: Says which particles are real and of which material.
+        scene: Gives the materials and a particle's volume.
+        grid: Where densities are compared, by linear weights.
+    """
+    found, true = _volume_fractions(predicted, target, window, scene, grid)
+    squared = (found - true).square().flatten(1).sum(1).unflatten(0, (len(window.mask), -1))
+    return squared / (2 * scene.particle_volume / grid.cell_volume * window.mask.sum(1, keepdim=True))
+
+
+def _volume_fractions(
+    predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid
+) -> tuple[Tensor, Tensor]:
+    """Each material's volume fraction on the grid, (B * F, M, *S), of predicted and of target positions."""
     kinds = torch.arange(len(scene.materials), device=window.material.device)
     member = (window.material.unsqueeze(-1) == kinds) & window.mask.unsqueeze(-1)
     weight = member.to(torch.float32).repeat_interleave(predicted.shape[1], dim=0)
@@ -55,4 +150,4 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
     found, true = (
         fraction * Linear().p2g(weight, grid.to_cells(frames.flatten(0, 1)), grid) for frames in (predicted, target)
     )
-    return (found - true).square().sum() / (2 * fraction * weight.sum())
+    return found, true
