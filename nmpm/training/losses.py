@@ -88,7 +88,8 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
         frames: m; T is a multiple of it.
     """
     squared = grid.to_cell_displacement(predicted - target).square().mean(-1) * mask.unsqueeze(1)
-    return squared.sum(-1).unflatten(1, (-1, frames)).mean(-1) / mask.sum(1, keepdim=True)
+    bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
+    return bundles.mean(-1) / mask.sum(1, keepdim=True)
 
 
 def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:
@@ -135,7 +136,7 @@ def density_errors(predicted: Tensor, target: Tensor, window: Window, scene: Sce
         grid: Where densities are compared, by linear weights.
     """
     found, true = _volume_fractions(predicted, target, window, scene, grid)
-    squared = (found - true).square().flatten(1).sum(1).unflatten(0, (len(window.mask), -1))
+    squared: Tensor = (found - true).square().flatten(1).sum(1).unflatten(0, (len(window.mask), -1))
     return squared / (2 * scene.particle_volume / grid.cell_volume * window.mask.sum(1, keepdim=True))
 
 
