@@ -46,14 +46,12 @@ class TrainingError:
         last = slice(frames - 1, None, frames)
         if self.power == 1:
             error = position_error(predicted, target, window.mask, grid)
-            if not self.density_weight:
-                return error
-            return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
-        errors = position_errors(predicted, target, window.mask, grid, frames)
-        if self.density_weight:
-            density = density_errors(predicted[:, last], target[:, last], window, scene, grid)
-            errors = errors + self.density_weight * density
-        return tempered_error(errors, window.mask, self.power)
+        else:
+            errors = position_errors(predicted, target, window.mask, grid, frames)
+            error = tempered_error(errors, window.mask, self.power)
+        if not self.density_weight:
+            return error
+        return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:
