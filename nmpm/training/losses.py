@@ -1,7 +1,7 @@
 """Training losses: the squared error of positions, and beside it that of the density that they make on the grid.
 
-Either as a mean over all particles, or window by window and bundle by bundle, to be tempered: raised to a power below
-1, so that splashes, whose errors nothing can reduce much, do not drown what can be learnt elsewhere.
+Position errors may be tempered: those of each window and bundle raised to a power below 1, so that splashes, whose
+errors nothing can reduce much, do not drown what can be learnt elsewhere.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class TrainingError:
 
     Args:
         density_weight: Weight of the density error beside the position error in cells².
-        power: In (0, 1]; below 1, the error of each window and bundle is raised to it before the mean.
+        power: In (0, 1]; below 1, the position error of each window and bundle is raised to it before the mean. The density
+            error is not: it is what keeps the volume of splashes.
 
     Raises:
         ConfigError: if the power is not in that range.
@@ -118,30 +119,6 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
     Returns:
         A number; NaN if there is no real particle.
     """
-    found, true = _volume_fractions(predicted, target, window, scene, grid)
-    particles = window.mask.sum() * predicted.shape[1]
-    return (found - true).square().sum() / (2 * scene.particle_volume / grid.cell_volume * particles)
-
-
-def density_errors(predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
-    """`density_error` of each of B windows and of each frame, (B, F); NaN for windows without real particles.
-
-    Args:
-        predicted: (B, F, N, D) positions in domain length, at F frames.
-        target: (B, F, N, D), likewise.
-        window: Says which particles are real and of which material.
-        scene: Gives the materials and a particle's volume.
-        grid: Where densities are compared, by linear weights.
-    """
-    found, true = _volume_fractions(predicted, target, window, scene, grid)
-    squared: Tensor = (found - true).square().flatten(1).sum(1).unflatten(0, (len(window.mask), -1))
-    return squared / (2 * scene.particle_volume / grid.cell_volume * window.mask.sum(1, keepdim=True))
-
-
-def _volume_fractions(
-    predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid
-) -> tuple[Tensor, Tensor]:
-    """Each material's volume fraction on the grid, (B * F, M, *S), of predicted and of target positions."""
     kinds = torch.arange(len(scene.materials), device=window.material.device)
     member = (window.material.unsqueeze(-1) == kinds) & window.mask.unsqueeze(-1)
     weight = member.to(torch.float32).repeat_interleave(predicted.shape[1], dim=0)
@@ -149,4 +126,4 @@ def _volume_fractions(
     found, true = (
         fraction * Linear().p2g(weight, grid.to_cells(frames.flatten(0, 1)), grid) for frames in (predicted, target)
     )
-    return found, true
+    return (found - true).square().sum() / (2 * fraction * weight.sum())

@@ -7,7 +7,7 @@ from scenes import box, cloud
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
-from nmpm.training.losses import TrainingError, density_error, density_errors, position_error, position_errors
+from nmpm.training.losses import TrainingError, density_error, position_error, position_errors
 
 
 def at(*places: tuple[float, float], cells: int = 42, materials=("goop",), material=None, mask=None):
@@ -95,9 +95,6 @@ def test_errors_of_windows_and_bundles_average_to_those_of_all():
     errors = position_errors(predicted, window.target, window.mask, grid, 2)
     torch.testing.assert_close(errors, torch.tensor([[0.005] * 2, [50.0] * 2]), rtol=1e-3, atol=0)
     torch.testing.assert_close(errors.mean(), position_error(predicted, window.target, window.mask, grid))
-    density = density_errors(predicted, window.target, window, scene, grid)
-    assert density.shape == (2, 4)
-    torch.testing.assert_close(density.mean(), density_error(predicted, window.target, window, scene, grid))
 
 
 def test_at_power_one_half_a_calm_window_weighs_as_much_as_a_violent_one():
@@ -111,6 +108,14 @@ def test_at_power_one_half_a_calm_window_weighs_as_much_as_a_violent_one():
         shares[power] = torch.autograd.grad(error, scale)[0]
     torch.testing.assert_close(shares[1.0], torch.tensor([0.005, 50.0]), rtol=1e-3, atol=0)
     torch.testing.assert_close(shares[0.5], torch.tensor([0.005, 50.0]).sqrt() / 2, rtol=2e-2, atol=0)
+
+
+def test_the_density_error_is_added_as_it_is():
+    scene, grid, window, predicted = calm_and_violent()
+    last = slice(1, None, 2)
+    density = density_error(predicted[:, last], window.target[:, last], window, scene, grid)
+    alone, both = (TrainingError(weight, 0.5)(predicted, window, scene, grid, 2) for weight in (0.0, 3.0))
+    torch.testing.assert_close(both, alone + 3 * density)
 
 
 def test_perfect_predictions_have_finite_gradients_at_any_power():
