@@ -27,8 +27,8 @@ class TrainingError:
 
     Args:
         density_weight: Weight of the density error beside the position error in cells².
-        power: In (0, 1]; below 1, the position error of each window and bundle is raised to it before the mean. The density
-            error is not: it is what keeps the volume of splashes.
+        power: In (0, 1]; below 1, the position error of each window and bundle is raised to it before the mean; the
+            density error, which keeps the volume of splashes, is not.
 
     Raises:
         ConfigError: if the power is not in that range.

@@ -47,8 +47,8 @@ class EmulatorModule(LightningModule):
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error in cells².
-        error_power: Power, in (0, 1], to which the position error of each window and bundle is raised before the mean. At
-            0.5, calm windows and early bundles weigh as much as splashes.
+        error_power: Power, in (0, 1], to which the position error of each window and bundle is raised before the mean.
+            At 0.5, calm windows and early bundles weigh as much as splashes.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.

@@ -91,7 +91,7 @@ def calm_and_violent(frames: int = 4):
 
 
 def test_errors_of_windows_and_bundles_average_to_those_of_all():
-    scene, grid, window, predicted = calm_and_violent()
+    _, grid, window, predicted = calm_and_violent()
     errors = position_errors(predicted, window.target, window.mask, grid, 2)
     torch.testing.assert_close(errors, torch.tensor([[0.005] * 2, [50.0] * 2]), rtol=1e-3, atol=0)
     torch.testing.assert_close(errors.mean(), position_error(predicted, window.target, window.mask, grid))
