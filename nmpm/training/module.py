@@ -30,7 +30,7 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirror_windows
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.losses import density_error, position_error
+from nmpm.training.losses import TrainingError
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
 from nmpm.training.parts import (
     adopt_optimizer_arguments,
@@ -54,6 +54,8 @@ class EmulatorModule(LightningModule):
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error in cells².
+        error_power: Power, in (0, 1], to which the position error of each window and bundle is raised before the mean.
+            At 0.5, calm windows and early bundles weigh as much as splashes.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
@@ -73,6 +75,7 @@ class EmulatorModule(LightningModule):
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         density_weight: float = 0.0,
+        error_power: float = 1.0,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
         metrics: Sequence[RolloutMetric] | None = None,
@@ -90,7 +93,8 @@ class EmulatorModule(LightningModule):
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
-        self.density_weight, self.position_noise, self.mirror = density_weight, position_noise, tuple(mirror)
+        self.error = TrainingError(density_weight, error_power)
+        self.position_noise, self.mirror = position_noise, tuple(mirror)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
         plain = self.emulator.recipe.to_dict()
@@ -100,6 +104,7 @@ class EmulatorModule(LightningModule):
             "unroll_growth": unroll_growth,
             "schedule": dataclasses.asdict(self.schedule),
             "density_weight": density_weight,
+            "error_power": error_power,
             "position_noise": position_noise,
             "mirror": list(mirror),
             "recompute": recompute,
@@ -213,14 +218,9 @@ class EmulatorModule(LightningModule):
 
     def _error(self, predicted: Tensor, batch: Window) -> Tensor:
         """The error of predicted positions (B, K m, N, D), in float32 whatever autocast says."""
-        emulator, target = self.emulator, batch.target[:, : predicted.shape[1]]
-        error = position_error(predicted, target, batch.mask, emulator.grid)
-        if not self.density_weight:
-            return error
-        last = slice(emulator.frames - 1, None, emulator.frames)
+        emulator = self.emulator
         with torch.autocast(predicted.device.type, enabled=False):
-            density = density_error(predicted[:, last], target[:, last], batch, emulator.scene, emulator.grid)
-        return error + self.density_weight * density
+            return self.error(predicted, batch, emulator.scene, emulator.grid, emulator.frames)
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:
         self.valid_errors.update(batch, self.predict_step(batch, batch_idx))
