@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from nmpm.evaluation.comparison import PREDICTORS, figure_names
+from nmpm.zoo.intervals import bootstrap_interval
+from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {
     "energy": "energy (kinetic plus potential energy never exceeds that of the first state)",
@@ -35,12 +37,12 @@ def stress_line(card: Mapping[str, Any]) -> str:
     return "; ".join(f"{kind}: {_stress_outcome(digest)}" for kind, digest in kinds.items())
 
 
-def readme(card: Mapping[str, Any], pictured: bool) -> str:
+def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
     """The README of an entry, as Markdown.
 
     Args:
         card: The content of `card.yaml`.
-        pictured: Whether the entry has a `rollout.png`.
+        files: Names of the files of the entry; pictures among them are shown.
     """
     training, test = card["training"], card["test"]
     names = figure_names(test)
@@ -49,12 +51,14 @@ def readme(card: Mapping[str, Any], pictured: bool) -> str:
         "",
         f"An emulator of: {card['dataset']}. {card.get('about', '')}".rstrip(),
         "",
+        *_lifecycle_lines(card),
         f"Test error ×10⁻³ of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
         " length² (`mse`: over all frames), exact earth mover's distance (`emd`) in domain length.",
         "",
         f"| predictor | {' | '.join(names)} |",
         f"|---|{'---:|' * len(names)}",
         *(f"| {label} | {' | '.join(_errors(test, kind))} |" for kind, label in PREDICTORS.items()),
+        *_interval_row(card, names),
         "",
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
         f"{training['precision']}; {training['parameters']:,} parameters; one run.",
@@ -69,8 +73,32 @@ def readme(card: Mapping[str, Any], pictured: bool) -> str:
         "positions = model.rollout(model.example(), frames=400)  # (1, 400, N, D)",
         "```",
     ]
-    lines += ["", "![rollout](rollout.png)"] if pictured else []
+    pictures = {"chart.png": "errors over frames and over training", "rollout.png": "rollout"}
+    lines += [line for name, text in pictures.items() if name in files for line in ("", f"![{text}]({name})")]
     return "\n".join(lines) + "\n"
+
+
+def intervals(card: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """The 95% interval of each figure's mean over test scenes, for those that every scene has; empty for one scene."""
+    rows = card.get("per_trajectory") or []
+    names = [name for name in (rows[0] if len(rows) > 1 else ()) if all(name in row for row in rows)]
+    return {name: bootstrap_interval([row[name] for row in rows]) for name in names}
+
+
+def _lifecycle_lines(card: Mapping[str, Any]) -> list[str]:
+    """What keeps a model from being relied on."""
+    texts = {
+        "preview": f"**Preview**: its full-rollout error is not {FACTOR:g} times lower than a trivial predictor's.",
+        "superseded": f"**Superseded** by `{card.get('superseded_by')}`.",
+    }
+    state = lifecycle(card)
+    return [texts[state], ""] if state in texts else []
+
+
+def _interval_row(card: Mapping[str, Any], names: list[str]) -> list[str]:
+    found = intervals(card)
+    cells = [f"{1e3 * found[name][0]:.3g} – {1e3 * found[name][1]:.3g}" if name in found else "" for name in names]
+    return [f"| model, 95% over scenes | {' | '.join(cells)} |"] if found else []
 
 
 def _errors(test: Mapping[str, float], kind: str) -> Iterator[str]:

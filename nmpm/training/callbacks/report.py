@@ -126,6 +126,8 @@ class ReportWriter(Callback):
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "curve": self.curve,
+            **_simulation(datamodule),
+            **({} if self._first_rollout is None else {"particles": int(self._first_rollout[0].mask[0].sum())}),
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
         }
 
@@ -153,6 +155,13 @@ def device_name(device: torch.device) -> str:
     if device.type == "cpu":
         return f"{_processor()}, {torch.get_num_threads()} threads"
     return device.type
+
+
+def _simulation(datamodule: Any) -> dict[str, Any]:
+    """How the data were simulated, as far as their metadata say: preset, trajectories per split, seed, revision."""
+    source = getattr(datamodule, "data_source", None)
+    stated = source.metadata.extra.get("simulation") if source is not None else None
+    return {"simulation": stated} if isinstance(stated, dict) else {}
 
 
 def _processor() -> str:

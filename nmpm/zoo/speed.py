@@ -1,0 +1,89 @@
+"""Time and memory of a model's rollouts on this machine."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nmpm.emulator import rollout
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+from nmpm.training.callbacks.report import device_name
+from nmpm.zoo.pretrained import Pretrained
+
+BATCHES = (1, 4, 16)
+REPETITIONS = 5
+PARTICLES = 1000
+
+
+def measure_speed(model: Pretrained) -> dict[str, Any]:
+    """Time rollouts of thrown blocks of about as many particles as the test scenes have.
+
+    Returns:
+        `hardware`, `particles`, `ms_per_frame` of one scene, the `best_batch` of `BATCHES` with its
+        `best_ms_per_frame` and scene, and `memory_mb`, the peak above the memory before.
+    """
+    count = int(model.card.get("particles", PARTICLES))
+    state = _example(model, count).to(model.emulator.device)
+    times = {batch: _milliseconds(model, _repeated(state, batch)) / batch for batch in BATCHES}
+    best = min(times, key=lambda batch: times[batch])
+    return {
+        "hardware": device_name(model.emulator.device),
+        "particles": state.position.shape[1],
+        "ms_per_frame": round(times[1], 4),
+        "best_batch": best,
+        "best_ms_per_frame": round(times[best], 4),
+        "memory_mb": round(_peak_memory(model, state), 1),
+    }
+
+
+def _example(model: Pretrained, count: int) -> Particles:
+    """A state of about so many particles, in as few blocks as fit."""
+    for blocks in (1, 2, 3, 4):
+        with suppress(ConfigError):
+            return model.example(count=count, blocks=blocks)
+    return model.example(count=count // 2)
+
+
+def _repeated(state: Particles, batch: int) -> Particles:
+    return Particles(
+        **{name: value.expand(batch, *value.shape[1:]).contiguous() for name, value in vars(state).items()}
+    )
+
+
+def _milliseconds(model: Pretrained, state: Particles) -> float:
+    """Median milliseconds per frame, for all scenes of the batch together, over two bundles."""
+    frames, found = 2 * model.emulator.frames, []
+    for _ in range(REPETITIONS + 1):
+        start = time.perf_counter()
+        rollout(model.emulator, state, frames)[:, -1].sum().item()  # waits for the device
+        found.append(1e3 * (time.perf_counter() - start) / frames)
+    return statistics.median(found[1:])
+
+
+def _peak_memory(model: Pretrained, state: Particles) -> float:
+    """Peak of allocated MB in a rollout of two bundles; NaN where the machine does not tell."""
+    frames, device = 2 * model.emulator.frames, model.emulator.device
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        before = float(torch.cuda.memory_allocated(device))
+        rollout(model.emulator, state, frames)
+        return float(torch.cuda.max_memory_allocated(device) - before) / 2**20
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+        before = _status("VmRSS")
+        rollout(model.emulator, state, frames)
+        return _status("VmHWM") - before
+    except (OSError, StopIteration):
+        return float("nan")
+
+
+def _status(key: str) -> float:
+    """MB of this process by the kernel's count."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(f"{key}:")) / 1024
