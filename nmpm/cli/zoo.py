@@ -1,10 +1,10 @@
-"""`nmpm zoo list | card NAME | add RUN NAME | verify NAME | refresh NAME`."""
+"""`nmpm zoo list | card NAME | add RUN NAME | verify NAME | refresh NAME | push NAME ID | pull ID`."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,25 @@ def run(words: list[str]) -> int | None:
     refresh = commands.add_parser("refresh", help="write READMEs, charts and the table of --root's models again")
     refresh.add_argument("name", nargs="?", help="(default: every model)")
     refresh.add_argument("--measure", action="store_true", help="time rollouts on this machine for the cards")
-    for command in (listing, card, add, verify, refresh):
+    push = commands.add_parser("push", help="upload a model to the Hugging Face hub")
+    push.add_argument("name")
+    push.add_argument("repository", help="owner/repository, created if missing")
+    push.add_argument("--private", action="store_true", help="of a new repository")
+    pull = commands.add_parser("pull", help="download a model of the Hugging Face hub")
+    pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
+    pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
+    for command in (listing, card, add, verify, refresh, push, pull):
         command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
     chosen = parser.parse_args(words[1:])
-    actions = {"list": _list, "card": _card, "add": _add, "verify": _verify, "refresh": _refresh}
+    actions: dict[str, Callable[[argparse.Namespace], int | None]] = {
+        "list": _list,
+        "card": _card,
+        "add": _add,
+        "verify": _verify,
+        "refresh": _refresh,
+        "push": _push,
+        "pull": _pull,
+    }
     return actions[chosen.command](chosen)
 
 
@@ -109,3 +124,30 @@ def _refresh(chosen: argparse.Namespace) -> None:
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
         refresh(Zoo.folder(name, root), chosen.measure)
     sys.stdout.write(f"wrote {write_index(root)}\n")
+
+
+def _push(chosen: argparse.Namespace) -> None:
+    from nmpm.zoo.hub import push
+    from nmpm.zoo.registry import Zoo
+
+    found = push(Zoo.folder(chosen.name, chosen.root), chosen.repository, chosen.private)
+    sys.stdout.write(f"pushed {found}; load it by that id.\n")
+
+
+def _pull(chosen: argparse.Namespace) -> None:
+    from nmpm._support.shipped import user_zoo
+    from nmpm.errors import ConfigError
+    from nmpm.zoo.entries import load_entry
+    from nmpm.zoo.hub import HubId, download, pull
+    from nmpm.zoo.registry import check_name
+
+    identifier = HubId.parse(chosen.id)
+    if identifier is None:
+        raise ConfigError(f"{chosen.id} is not owner/repository@revision; the revision may be a commit, or main.")
+    if chosen.name is None:
+        folder = download(identifier)
+        load_entry(folder)
+    else:
+        root = user_zoo() if chosen.root is None else chosen.root
+        folder = pull(identifier, root / check_name(chosen.name))
+    sys.stdout.write(f"{identifier} is in {folder}\n")

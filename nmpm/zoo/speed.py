@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
+from nmpm._support.devices import device_name
 from nmpm.emulator import rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
-from nmpm.training.callbacks.report import device_name
 from nmpm.zoo.pretrained import Pretrained
 
 BATCHES = (1, 4, 16)
