@@ -59,7 +59,6 @@ def download(identifier: HubId) -> Path:
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import (
-        HfHubHTTPError,
         LocalEntryNotFoundError,
         RepositoryNotFoundError,
         RevisionNotFoundError,
@@ -75,8 +74,8 @@ def download(identifier: HubId) -> Path:
         raise ZooError(f"{identifier.repository} has no revision {identifier.revision}.") from error
     except LocalEntryNotFoundError as error:
         raise ZooError(f"{identifier} is not in the cache, and the hub cannot be reached.") from error
-    except (HfHubHTTPError, OSError) as error:
-        raise ZooError(f"{identifier} cannot be downloaded: {one_line(error)}") from error
+    except Exception as error:  # the client's transport raises errors of its own
+        raise ZooError(f"{identifier} cannot be downloaded ({type(error).__name__}): {one_line(error)}") from error
     if not (folder / CARD).is_file():
         raise ZooError(f"{identifier} is not a model of nmpm: it has no {CARD}.")
     return folder
@@ -120,7 +119,6 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
         ZooError: if the entry is damaged, the name is malformed, or the hub refuses.
     """
     from huggingface_hub import HfApi
-    from huggingface_hub.errors import HfHubHTTPError
 
     if REPOSITORY.fullmatch(repository) is None:
         raise ZooError(f"{one_line(repository, 100)} is not owner/repository.")
@@ -137,8 +135,8 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
         try:
             api.create_repo(repository, private=private, exist_ok=True)
             commit = api.upload_folder(repo_id=repository, folder_path=folder, commit_message=f"nmpm: {entry.name}")
-        except (HfHubHTTPError, OSError) as error:
-            raise ZooError(f"{repository} cannot be uploaded: {one_line(error)}") from error
+        except Exception as error:  # the client's transport raises errors of its own
+            raise ZooError(f"{repository} cannot be uploaded ({type(error).__name__}): {one_line(error)}") from error
     return HubId(repository, str(commit.oid))
 
 
