@@ -190,7 +190,7 @@ def _load_path(path: Path) -> Pretrained:
 
 def _unknown_model(name: str, root: Root = None) -> ZooError:
     known = Zoo.list(root)
-    near = suggestion(name[:NAME_LENGTH], known)
+    near = suggestion(name[:NAME_LENGTH], sorted({*known, *(other.partition("/")[0] for other in known)}))
     path = " No such path exists either." if root is None else ""
     shown = one_line(repr(name), NAME_LENGTH)
     return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(known) or 'none'}.{near}{path}")
