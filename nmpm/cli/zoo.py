@@ -40,6 +40,7 @@ def run(words: list[str]) -> int | None:
     pull = commands.add_parser("pull", help="download a model of the Hugging Face hub")
     pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
     pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
+    refresh.add_argument("--twin", action="store_true", help="simulate test scenes beside themselves, for the cards")
     for command in (listing, card, add, verify, refresh, push, pull):
         command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
     chosen = parser.parse_args(words[1:])
@@ -122,7 +123,7 @@ def _refresh(chosen: argparse.Namespace) -> None:
 
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
-        refresh(Zoo.folder(name, root), chosen.measure)
+        refresh(Zoo.folder(name, root), chosen.measure, chosen.twin)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 
 

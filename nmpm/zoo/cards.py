@@ -60,6 +60,8 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         *(f"| {label} | {' | '.join(_errors(test, kind))} |" for kind, label in PREDICTORS.items()),
         *_interval_row(card, names),
         "",
+        *_twin_lines(card),
+        *_speed_lines(card),
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
         f"{training['precision']}; {training['parameters']:,} parameters; one run.",
         "",
@@ -83,6 +85,35 @@ def intervals(card: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     rows = card.get("per_trajectory") or []
     names = [name for name in (rows[0] if len(rows) > 1 else ()) if all(name in row for row in rows)]
     return {name: bootstrap_interval([row[name] for row in rows]) for name in names}
+
+
+def twin_ratio(card: Mapping[str, Any], name: str) -> str:
+    """A figure of the model over the simulator's own uncertainty, to 2 digits; empty where that is not measured."""
+    twin, test = card.get("twin") or {}, card.get("test") or {}
+    known = name in twin and name in test and twin[name] > 0
+    return f"{test[name] / twin[name]:.2g}" if known else ""
+
+
+def _twin_lines(card: Mapping[str, Any]) -> list[str]:
+    twin = card.get("twin")
+    if not twin:
+        return []
+    names = [name for name in ("mse@100", "mse") if name in twin]
+    figures = ", ".join(f"`{n}` {1e3 * twin[n]:.3g} ×10⁻³ (the model: {twin_ratio(card, n)} times that)" for n in names)
+    return [
+        f"The simulator with {twin['substeps']} substeps a frame beside itself with {twin['own_substeps']}: {figures}.",
+        "",
+    ]
+
+
+def _speed_lines(card: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"{entry['hardware']}: {entry['ms_per_frame']:.3g} ms per frame of one scene of {entry['particles']} particles,"
+        f" {entry['best_ms_per_frame']:.3g} ms in batches of {entry['best_batch']}; {entry['memory_mb']:.0f} MB more"
+        " memory at the peak."
+        for entry in card.get("speed") or ()
+    ]
+    return [line for text in lines for line in (text, "")]
 
 
 def _lifecycle_lines(card: Mapping[str, Any]) -> list[str]:

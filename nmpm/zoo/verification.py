@@ -7,22 +7,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from nmpm.data.format import Split, Trajectory, read_metadata, split_paths
-from nmpm.data.generate import SimulationRequest, preset_metadata
-from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import RecordingReader, SplitRecordings
 from nmpm.errors import ConfigError
 from nmpm.metrics import MSE
 from nmpm.particles import Window
-from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.intervals import bootstrap_interval
 from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.scenes import iterate_test_scenes
 
 SHORT_SCENES, SHORT_FRAMES = 2, 100
 RELATIVE = 0.1
@@ -80,7 +74,7 @@ def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> I
     if not isinstance(rows, Sequence) or not rows:
         raise ConfigError(f"{model.name}: its card states no errors of single test scenes.")
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
-    errors = [_errors(model, window) for window in islice(_windows(model, frames, data), count)]
+    errors = [_errors(model, window) for window in islice(iterate_test_scenes(model, frames, data), count)]
     if full:
         yield from _means(rows, errors)
     else:
@@ -109,51 +103,3 @@ def _errors(model: Pretrained, window: Window) -> dict[str, float]:
     device = model.emulator.device
     metric.update(window, model.rollout(window.initial.to(device), window.target.shape[1]).cpu())
     return metric.per_trajectory()[0]
-
-
-def _windows(model: Pretrained, frames: int | None, data: Path | None) -> Iterator[Window]:
-    """The test scenes in the order of the card, one at a time, with so many frames to predict; all where None."""
-    if data is not None:
-        paths, metadata = split_paths(data), read_metadata(data, "deepmind")
-        if "test" not in paths:
-            raise ConfigError(f"{data} has no test.h5.")
-        for window in EvaluationLoader(SplitRecordings(Split(paths["test"]), metadata, model.scene), 1):
-            yield window if frames is None else _first_frames(window, frames + 2)
-        return
-    preset, request = _simulation(model)
-    shorter = preset if frames is None else preset.with_frames(frames + 1)
-    reader = RecordingReader(preset_metadata(preset), model.scene)
-    for index in range(request.counts["test"]):
-        seed = request.trajectory_seed("test", index)
-        run = shorter.simulate(seed)
-        stored = Trajectory(run.position, run.particle_type, run.attributes)
-        yield collate([reader.recording(stored, f"{preset.name}, seed {seed}")], model.scene)
-
-
-def _first_frames(window: Window, frames: int) -> Window:
-    return Window(
-        window.frames[:, :frames],
-        window.material,
-        window.mask,
-        window.obstacle,
-        window.obstacle_mask,
-        window.gravity,
-    )
-
-
-def _simulation(model: Pretrained) -> tuple[Preset, SimulationRequest]:
-    """The simulator of a model's data, and what was simulated; cards of version 0.1 state the preset's name only."""
-    stated: Any = model.card.get("simulation")
-    if isinstance(stated, Mapping):
-        preset = preset_from_dict(dict(stated["preset"]))
-        if stated.get("revision") != preset.revision:
-            raise ConfigError(
-                f"{model.name}: its data are of revision {stated.get('revision')} of the simulator, which is now"
-                f" {preset.revision} and gives other trajectories."
-            )
-        return preset, SimulationRequest(preset, stated["counts"], stated["seed"])
-    if model.preset not in preset_names():
-        raise ConfigError(f"{model.name} was tested on recorded data ({model.card.get('dataset')}): give their folder.")
-    preset = load_preset(str(model.preset))
-    count = len(model.card["per_trajectory"])
-    return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": count})

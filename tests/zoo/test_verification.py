@@ -11,11 +11,13 @@ import yaml
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import ConfigError
+from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.intervals import bootstrap_interval
 from nmpm.zoo.lifecycle import lifecycle
+from nmpm.zoo.twin import measure_twin, twin_substeps
 from nmpm.zoo.verification import Check, verify
 
 SHIPPED = shipped_folder("zoo")
@@ -137,7 +139,7 @@ def test_a_zoo_is_refreshed_and_its_table_names_every_model(root, capsys):
     assert golden_distance(Zoo.load("small", root), again["golden"]) == 0
     assert again["speed"][0]["ms_per_frame"] > 0
     text = (root / "README.md").read_text()
-    assert "| [small](small/README.md) | active | made up | 100 | 50 – 150 | 10 | 1e+03 | 2.0 h |" in text
+    assert "| [small](small/README.md) | active | made up | 100 | 50 – 150 | 10 |  | 1e+03 | 2.0 h |" in text
     card_text = (root / "small" / "README.md").read_text()
     assert "![errors over frames and over training](chart.png)" in card_text
     assert "| model, 95% over scenes |" in card_text
@@ -183,3 +185,22 @@ def test_limits_that_no_variant_keeps_or_no_card_states_are_named(variants):
         Zoo.load("pond", variants, max_ms_per_frame=5.0)
     with pytest.raises(Exception, match=r"holds no model 'pnd'.*Did you mean pond"):
         Zoo.load("pnd", variants, max_mse=0.5)
+
+
+def test_a_twin_has_half_the_substeps_where_that_is_stable_and_differs_little():
+    assert twin_substeps(load_preset("waterramps")) == 13
+    dam, blocks = load_preset("dambreak2d"), load_preset("wbcsph")
+    assert twin_substeps(dam) == max(50, dam.stable_substeps)
+    assert twin_substeps(blocks) > blocks.stable_substeps
+    model = Zoo.load("goop", SHIPPED)
+    preset = load_preset("goop").with_frames(40)
+    simulation = {"preset": preset.to_dict(), "counts": {"train": 0, "valid": 0, "test": 1}, "seed": 0}
+    stated = simulation | {"revision": preset.revision}
+    short = dataclasses.replace(model, card=model.card | {"simulation": stated})
+    twin = measure_twin(short)
+    assert 0 < twin.errors["mse"] < model.card["test"]["mse@100"]
+    assert "mse@100" not in twin.errors
+    for later in (stated | {"revision": -1}, None):
+        other = dataclasses.replace(model, card=model.card | {"simulation": later, "dataset": "recorded"})
+        with pytest.raises(ConfigError, match=r"revision -1|recorded data"):
+            measure_twin(other)
