@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ import torch
 
 from nmpm._support.devices import device_name
 from nmpm.emulator import rollout
-from nmpm.errors import ConfigError
 from nmpm.particles import Particles
+from nmpm.zoo.golden import fitting_count
 from nmpm.zoo.pretrained import Pretrained
 
 BATCHES = (1, 4, 16)
@@ -22,14 +21,14 @@ PARTICLES = 1000
 
 
 def measure_speed(model: Pretrained) -> dict[str, Any]:
-    """Time rollouts of thrown blocks of about as many particles as the test scenes have.
+    """Time rollouts of a thrown block of about as many particles as the test scenes have, as far as they fit.
 
     Returns:
         `hardware`, `particles`, `ms_per_frame` of one scene, the `best_batch` of `BATCHES` with its
         `best_ms_per_frame` and scene, and `memory_mb`, the peak above the memory before.
     """
-    count = int(model.card.get("particles", PARTICLES))
-    state = _example(model, count).to(model.emulator.device)
+    count = fitting_count(model, int(model.card.get("particles", PARTICLES)))
+    state = model.example(count=count).to(model.emulator.device)
     times = {batch: _milliseconds(model, _repeated(state, batch)) / batch for batch in BATCHES}
     best = min(times, key=lambda batch: times[batch])
     return {
@@ -40,14 +39,6 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
         "best_ms_per_frame": round(times[best], 4),
         "memory_mb": round(_peak_memory(model, state), 1),
     }
-
-
-def _example(model: Pretrained, count: int) -> Particles:
-    """A state of about so many particles, in as few blocks as fit."""
-    for blocks in (1, 2, 3, 4):
-        with suppress(ConfigError):
-            return model.example(count=count, blocks=blocks)
-    return model.example(count=count // 2)
 
 
 def _repeated(state: Particles, batch: int) -> Particles:
