@@ -109,8 +109,8 @@ def _twin_lines(card: Mapping[str, Any]) -> list[str]:
 def _speed_lines(card: Mapping[str, Any]) -> list[str]:
     lines = [
         f"{entry['hardware']}: {entry['ms_per_frame']:.3g} ms per frame of one scene of {entry['particles']} particles,"
-        f" {entry['best_ms_per_frame']:.3g} ms in batches of {entry['best_batch']}; {entry['memory_mb']:.0f} MB more"
-        " memory at the peak."
+        f" {entry['best_ms_per_frame']:.3g} ms in batches of {entry['best_batch']}"
+        + (f"; {entry['memory_mb']:.0f} MB at the peak." if entry.get("memory_mb") is not None else ".")
         for entry in card.get("speed") or ()
     ]
     return [line for text in lines for line in (text, "")]

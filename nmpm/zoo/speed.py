@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,7 +24,7 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
 
     Returns:
         `hardware`, `particles`, `ms_per_frame` of one scene, the `best_batch` of `BATCHES` with its
-        `best_ms_per_frame` and scene, and `memory_mb`, the peak above the memory before.
+        `best_ms_per_frame` and scene, and `memory_mb`, the peak on a GPU beside the weights, None elsewhere.
     """
     count = fitting_count(model, int(model.card.get("particles", PARTICLES)))
     state = model.example(count=count).to(model.emulator.device)
@@ -37,7 +36,7 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
         "ms_per_frame": round(times[1], 4),
         "best_batch": best,
         "best_ms_per_frame": round(times[best], 4),
-        "memory_mb": round(_peak_memory(model, state), 1),
+        "memory_mb": _peak_memory(model, state),
     }
 
 
@@ -57,24 +56,12 @@ def _milliseconds(model: Pretrained, state: Particles) -> float:
     return statistics.median(found[1:])
 
 
-def _peak_memory(model: Pretrained, state: Particles) -> float:
-    """Peak of allocated MB in a rollout of two bundles; NaN where the machine does not tell."""
-    frames, device = 2 * model.emulator.frames, model.emulator.device
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-        before = float(torch.cuda.memory_allocated(device))
-        rollout(model.emulator, state, frames)
-        return float(torch.cuda.max_memory_allocated(device) - before) / 2**20
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-        before = _status("VmRSS")
-        rollout(model.emulator, state, frames)
-        return _status("VmHWM") - before
-    except (OSError, StopIteration):
-        return float("nan")
-
-
-def _status(key: str) -> float:
-    """MB of this process by the kernel's count."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith(f"{key}:")) / 1024
+def _peak_memory(model: Pretrained, state: Particles) -> float | None:
+    """Peak of the MB that a rollout of two bundles allocates on a GPU; None elsewhere, where nothing counts them."""
+    device = model.emulator.device
+    if device.type != "cuda":
+        return None
+    torch.cuda.reset_peak_memory_stats(device)
+    before = float(torch.cuda.memory_allocated(device))
+    rollout(model.emulator, state, 2 * model.emulator.frames)
+    return round((float(torch.cuda.max_memory_allocated(device)) - before) / 2**20, 1)
