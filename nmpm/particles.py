@@ -37,7 +37,8 @@ class _Batched:
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
         names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both subclasses are dataclasses)
-        return type(self)(**{name: change(getattr(self, name)) for name in names})
+        values = {name: getattr(self, name) for name in names}
+        return type(self)(**{name: None if value is None else change(value) for name, value in values.items()})
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class Particles(_Batched):
         obstacle: (B, M, D) positions of particles that do not move; M may be 0.
         obstacle_mask: (B, M) bool, False for padding.
         gravity: (B, D) in length per frame squared; zero where unknown.
+        acceleration: (B, N, D) what the last frame added to the velocity beside gravity, in length per frame squared;
+            None, as for a state at rest or in free fall, where it is unknown.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -64,6 +67,7 @@ class Particles(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
+    acceleration: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -75,11 +79,13 @@ class Particles(_Batched):
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
         }
+        if self.acceleration is not None:
+            expected["acceleration"] = (batch, count, dim)
         _check_shapes(self, expected)
 
-    def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
-        """The same particles elsewhere: (B, N, D) positions and velocities."""
-        return dataclasses.replace(self, position=position, velocity=velocity)
+    def with_motion(self, position: Tensor, velocity: Tensor, acceleration: Tensor | None = None) -> Particles:
+        """The same particles elsewhere: (B, N, D) positions, velocities and, where known, accelerations."""
+        return dataclasses.replace(self, position=position, velocity=velocity, acceleration=acceleration)
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ class Window(_Batched):
 
     Args:
         frames: (B, T, N, D) positions in domain length, T >= 2.
-        material, mask, obstacle, obstacle_mask, gravity: as in `Particles`.
+        material, mask, obstacle, obstacle_mask, gravity, acceleration: as in `Particles`, at the second frame.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -100,6 +106,7 @@ class Window(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
+    acceleration: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -112,6 +119,8 @@ class Window(_Batched):
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
         }
+        if self.acceleration is not None:
+            expected["acceleration"] = (batch, count, dim)
         _check_shapes(self, expected)
 
     @classmethod
@@ -124,6 +133,7 @@ class Window(_Batched):
             obstacle=state.obstacle,
             obstacle_mask=state.obstacle_mask,
             gravity=state.gravity,
+            acceleration=state.acceleration,
         )
 
     @property
@@ -137,6 +147,7 @@ class Window(_Batched):
             obstacle=self.obstacle,
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
+            acceleration=self.acceleration,
         )
 
     @property

@@ -43,6 +43,11 @@ class Bundle:
 
     position: Tensor
     velocity: Tensor
+    acceleration: Tensor | None = None
+
+    def end(self, particles: Particles) -> Particles:
+        """The state after the bundle, of the particles that it started from."""
+        return particles.with_motion(self.position[:, -1], self.velocity, self.acceleration)
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class Emulator(nn.Module):
         self.recipe = recipe
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
-        inputs, outputs = len(scene.input_channels), len(scene.output_channels)
+        inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
         self.processor = recipe.processor.build(GridLayout(inputs, outputs, frames, scene.periodic))
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
@@ -216,7 +221,7 @@ class Emulator(nn.Module):
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self.in_cells(particles)
-            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
+            state = self.grid_state(particles, context.solid)
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
@@ -237,7 +242,22 @@ class Emulator(nn.Module):
             return Bundle(
                 position=self.grid.to_length(path.to(precision)),
                 velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
+                acceleration=self._acceleration(velocity, steps, gravity, precision),
             )
+
+    def grid_state(self, particles: Particles, solid: Tensor) -> Tensor:
+        """(B, C_in, *S) the grid state of particles, in grid units, with the share (B, C_solid, *S) of solids."""
+        cells, velocity, _ = self.in_cells(particles)
+        state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)
+        further = self.recipe.inputs.rasterise(self.scene, self.grid, self.transfer, particles, cells, velocity)
+        return torch.cat([state, *further], dim=1) if further else state
+
+    def _acceleration(self, velocity: Tensor, steps: Tensor, gravity: Tensor, precision: torch.dtype) -> Tensor | None:
+        """What the last frame of (B, m, N, D) steps added to the velocity beside gravity; None if it is no input."""
+        if not self.recipe.inputs.acceleration:
+            return None
+        before = steps[:, -2] if self.frames > 1 else velocity
+        return self.grid.to_displacement((steps[:, -1] - before - gravity).to(precision))
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

@@ -261,10 +261,10 @@ class EmulatorModule(LightningModule):
         for _ in range(count):
             bundle: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
             yield bundle
-            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+            particles = bundle.end(particles)
 
     def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
             return particles
         noise = self.position_noise * normal_like(particles.position)
-        return particles.with_motion(particles.position + noise, particles.velocity)
+        return particles.with_motion(particles.position + noise, particles.velocity, particles.acceleration)

@@ -85,7 +85,20 @@ class PaddedRecordings:
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
+            acceleration=self._acceleration(row, first, frames),
         )
+
+    def _acceleration(self, row: Tensor, first: Tensor, frames: Tensor) -> Tensor:
+        """(B, N, D) what the second of (B, T, N, D) frames added to the velocity beside gravity.
+
+        Zero where the recording has no frame before the first.
+        """
+        earlier = self.frames[row, (first - 1).clamp(min=0)]
+        steps = torch.stack([earlier, frames[:, 0]], dim=1)
+        unwrap(steps, self.scene)
+        change = frames[:, 1] - frames[:, 0] - (steps[:, 1] - steps[:, 0]) - self.gravity[row].unsqueeze(1)
+        known = (first > 0)[:, None, None] & self.mask[row].unsqueeze(-1)
+        return torch.where(known, change, 0.0)
 
 
 def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = None) -> Window:
