@@ -68,6 +68,7 @@ class Particles(_Batched):
     obstacle_mask: Tensor
     gravity: Tensor
     acceleration: Tensor | None = None
+    features: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -107,6 +108,7 @@ class Window(_Batched):
     obstacle_mask: Tensor
     gravity: Tensor
     acceleration: Tensor | None = None
+    features: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -136,6 +138,15 @@ class Window(_Batched):
             acceleration=state.acceleration,
         )
 
+    def later(self, frames: int, features: Tensor | None) -> Window:
+        """The window from some frames later on, with features (B, N, k) of the particles there."""
+        rest = self.frames[:, frames:]
+        before = self.frames[:, frames - 1]
+        change = rest[:, 1] - 2 * rest[:, 0] + before - self.gravity.unsqueeze(1)
+        return dataclasses.replace(
+            self, frames=rest, acceleration=change * self.mask.unsqueeze(-1), features=features
+        )
+
     @property
     def initial(self) -> Particles:
         """The state at the window's second frame."""
@@ -148,6 +159,7 @@ class Window(_Batched):
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
             acceleration=self.acceleration,
+            features=self.features,
         )
 
     @property

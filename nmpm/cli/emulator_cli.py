@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 import os
 import shlex
 import signal
@@ -73,7 +72,9 @@ class EmulatorCLI(LightningCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "resume")
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
-        parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
+        parser.link_arguments(
+            ("model.frames", "model.unroll", "model.warmup"), "data.horizon", compute_fn=lambda m, k, w: m * (k + w)
+        )
 
     def before_instantiate_classes(self) -> None:
         """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""

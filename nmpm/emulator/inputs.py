@@ -29,6 +29,11 @@ class Inputs:
     acceleration: bool = False
     moments: bool = False
     shear: bool = False
+    features: int = 0
+
+    def updates(self, frames: int) -> int:
+        """Output channels per frame of the bundle that the features need."""
+        return -(-self.features // frames)
 
     def channels(self, scene: Scene) -> tuple[str, ...]:
         """Names of the further channels, in order."""
@@ -37,6 +42,7 @@ class Inputs:
         names = []
         if self.acceleration:
             names += [f"{m}.acceleration_{a}" for m in scene.materials for a in axes]
+        names += [f"feature_{index}" for index in range(self.features)]
         if self.moments:
             names += [f"{m}.moment{a}" for m in scene.materials for a in ["", *(f"_{a}" for a in [*axes, *pairs])]]
         if self.shear:
@@ -48,7 +54,7 @@ class Inputs:
     ) -> list[Tensor]:
         """The further channels (B, C, *S), in grid units."""
         parts: list[Tensor] = []
-        if not (self.acceleration or self.moments or self.shear):
+        if not (self.acceleration or self.moments or self.shear or self.features):
             return parts
         member = membership_of(particles, len(scene.materials))
         if self.acceleration:
@@ -58,6 +64,14 @@ class Inputs:
             sums = transfer.p2g(torch.cat([weighted, member], -1), cells, grid)
             total, count = sums.split([weighted.shape[-1], member.shape[-1]], dim=1)
             parts.append(total / torch.where(count > 0, count, 1.0).repeat_interleave(scene.dim, dim=1))
+        if self.features:
+            carried = particles.features
+            real = particles.mask.unsqueeze(-1).to(cells.dtype)
+            if carried is None:
+                parts.append(cells.new_zeros(len(cells), self.features, *grid.shape))
+            else:
+                sums = transfer.p2g(torch.cat([carried.to(cells.dtype) * real, real], -1), cells, grid)
+                parts.append(sums[:, :-1] / torch.where(sums[:, -1:] > 0, sums[:, -1:], 1.0))
         if self.moments or self.shear:
             within = inside(cells, grid)
             place = within - within.detach().floor() - 0.5

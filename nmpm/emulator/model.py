@@ -44,10 +44,12 @@ class Bundle:
     position: Tensor
     velocity: Tensor
     acceleration: Tensor | None = None
+    features: Tensor | None = None
 
     def end(self, particles: Particles) -> Particles:
         """The state after the bundle, of the particles that it started from."""
-        return particles.with_motion(self.position[:, -1], self.velocity, self.acceleration)
+        moved = particles.with_motion(self.position[:, -1], self.velocity, self.acceleration)
+        return dataclasses.replace(moved, features=self.features)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,9 @@ class Emulator(nn.Module):
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
-        self.processor = recipe.processor.build(GridLayout(inputs, outputs, frames, scene.periodic))
+        self.processor = recipe.processor.build(
+            GridLayout(inputs, outputs + recipe.inputs.updates(frames), frames, scene.periodic)
+        )
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
             self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
@@ -227,7 +231,8 @@ class Emulator(nn.Module):
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
         with torch.autocast(device, enabled=False):
-            fields = output.to(self.precision) * self.output_scale
+            moving = output[:, :, : self.output_scale.shape[1]]
+            fields = moving.to(self.precision) * self.output_scale
             advection = self.advection
             smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried_velocity(velocity, smoothed)
@@ -243,7 +248,15 @@ class Emulator(nn.Module):
                 position=self.grid.to_length(path.to(precision)),
                 velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
                 acceleration=self._acceleration(velocity, steps, gravity, precision),
+                features=self._features(output[:, :, moving.shape[2] :], cells, particles),
             )
+
+    def _features(self, update: Tensor, cells: Tensor, particles: Particles) -> Tensor | None:
+        count = self.recipe.inputs.features
+        if not count:
+            return None
+        change = self.transfer.g2p(update.to(self.precision).flatten(1, 2)[:, :count].contiguous(), cells, self.grid)
+        return torch.tanh(change if particles.features is None else particles.features + change)
 
     def grid_state(self, particles: Particles, solid: Tensor) -> Tensor:
         """(B, C_in, *S) the grid state of particles, in grid units, with the share (B, C_solid, *S) of solids."""

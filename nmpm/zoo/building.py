@@ -58,6 +58,7 @@ def _check_network(recipe: EmulatorRecipe) -> None:
     inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
     with torch.device("meta"), bounded_network():
         try:
+            outputs += recipe.inputs.updates(recipe.frames)
             recipe.processor.build(GridLayout(inputs, outputs, recipe.frames, scene.periodic))
         except (RuntimeError, NotImplementedError):
             return  # plugins need not support the meta device; the size is watched again in `build`
