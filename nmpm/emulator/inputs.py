@@ -26,7 +26,7 @@ class Inputs:
         shear: Momentum of each cell's particles and its first moments.
     """
 
-    acceleration: bool = False
+    acceleration: int = 0
     moments: bool = False
     shear: bool = False
     features: int = 0

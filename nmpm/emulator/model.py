@@ -269,8 +269,10 @@ class Emulator(nn.Module):
         """What the last frame of (B, m, N, D) steps added to the velocity beside gravity; None if it is no input."""
         if not self.recipe.inputs.acceleration:
             return None
-        before = steps[:, -2] if self.frames > 1 else velocity
-        return self.grid.to_displacement((steps[:, -1] - before - gravity).to(precision))
+        span = self.recipe.inputs.acceleration
+        before = steps[:, -1 - span] if self.frames > span else velocity
+        span = min(span, self.frames)
+        return self.grid.to_displacement(((steps[:, -1] - before) / span - gravity).to(precision))
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

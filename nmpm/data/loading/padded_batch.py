@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import os
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,6 +13,8 @@ from torch import Tensor
 from nmpm.data.loading.recording import Recording
 from nmpm.particles import Window
 from nmpm.scene import Scene
+
+SPAN = int(os.environ.get('NMPM_SPAN', '1'))
 
 
 @dataclass(frozen=True)
@@ -93,10 +96,12 @@ class PaddedRecordings:
 
         Zero where the recording has no frame before the first.
         """
-        earlier = self.frames[row, (first - 1).clamp(min=0)]
-        steps = torch.stack([earlier, frames[:, 0]], dim=1)
+        span = first.clamp(max=SPAN)
+        begin = first - span
+        steps = torch.stack([self.frames[row, begin], self.frames[row, begin + 1]], dim=1)
         unwrap(steps, self.scene)
-        change = frames[:, 1] - frames[:, 0] - (steps[:, 1] - steps[:, 0]) - self.gravity[row].unsqueeze(1)
+        change = frames[:, 1] - frames[:, 0] - (steps[:, 1] - steps[:, 0])
+        change = change / span.clamp(min=1)[:, None, None] - self.gravity[row].unsqueeze(1)
         known = (first > 0)[:, None, None] & self.mask[row].unsqueeze(-1)
         return torch.where(known, change, 0.0)
 
