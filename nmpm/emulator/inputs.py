@@ -59,9 +59,9 @@ class Inputs:
         member = membership_of(particles, len(scene.materials))
         if self.acceleration:
             known = particles.acceleration
-            values = torch.zeros_like(velocity) if known is None else grid.to_cell_displacement(known, velocity.dtype)
+            values = torch.zeros_like(velocity) if known is None else grid.to_cell_displacement(known.detach(), velocity.dtype)
             weighted = (member.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
-            sums = transfer.p2g(torch.cat([weighted, member], -1), cells, grid)
+            sums = transfer.p2g(torch.cat([weighted, member], -1), cells.detach(), grid)
             total, count = sums.split([weighted.shape[-1], member.shape[-1]], dim=1)
             parts.append(total / torch.where(count > 0, count, 1.0).repeat_interleave(scene.dim, dim=1))
         if self.features:
@@ -73,7 +73,7 @@ class Inputs:
                 sums = transfer.p2g(torch.cat([carried.to(cells.dtype) * real, real], -1), cells, grid)
                 parts.append(sums[:, :-1] / torch.where(sums[:, -1:] > 0, sums[:, -1:], 1.0))
         if self.moments or self.shear:
-            within = inside(cells, grid)
+            within = inside(cells.detach(), grid)
             place = within - within.detach().floor() - 0.5
             terms = []
             if self.moments:
@@ -81,7 +81,7 @@ class Inputs:
                 second = torch.stack([place[..., a] * place[..., b] for a, b in pairs], -1)
                 terms += [torch.ones_like(place[..., :1]), place, second]
             if self.shear:
-                terms += [velocity, (velocity.unsqueeze(-1) * place.unsqueeze(-2)).flatten(-2)]
+                terms += [velocity.detach(), (velocity.detach().unsqueeze(-1) * place.unsqueeze(-2)).flatten(-2)]
             values = torch.cat(terms, -1)
             values = (member.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
             parts.append(Nearest().p2g(values, cells, grid) * (scene.particle_volume / grid.cell_volume))
