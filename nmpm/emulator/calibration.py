@@ -52,7 +52,10 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     windows = [window.to(emulator.device) for window in windows]
     inputs = _combine(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
-    emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
+    own = len(emulator.scene.input_channels)
+    soft = torch.ones_like(inputs.std)
+    soft[own:] = 0.3
+    emulator.input_std.copy_((_nonzero(inputs.std) / soft).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
     spread = inputs.high - inputs.low
     margin = torch.where(spread > 1e-12, _MARGIN * spread, UNLIMITED)
