@@ -37,8 +37,7 @@ class _Batched:
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
         names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both subclasses are dataclasses)
-        values = {name: getattr(self, name) for name in names}
-        return type(self)(**{name: None if value is None else change(value) for name, value in values.items()})
+        return type(self)(**{name: change(getattr(self, name)) for name in names})
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,6 @@ class Particles(_Batched):
         obstacle: (B, M, D) positions of particles that do not move; M may be 0.
         obstacle_mask: (B, M) bool, False for padding.
         gravity: (B, D) in length per frame squared; zero where unknown.
-        acceleration: (B, N, D) what the last frame added to the velocity beside gravity, in length per frame squared;
-            None, as for a state at rest or in free fall, where it is unknown.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -67,8 +64,6 @@ class Particles(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
-    acceleration: Tensor | None = None
-    features: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -80,13 +75,11 @@ class Particles(_Batched):
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
         }
-        if self.acceleration is not None:
-            expected["acceleration"] = (batch, count, dim)
         _check_shapes(self, expected)
 
-    def with_motion(self, position: Tensor, velocity: Tensor, acceleration: Tensor | None = None) -> Particles:
-        """The same particles elsewhere: (B, N, D) positions, velocities and, where known, accelerations."""
-        return dataclasses.replace(self, position=position, velocity=velocity, acceleration=acceleration)
+    def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
+        """The same particles elsewhere: (B, N, D) positions and velocities."""
+        return dataclasses.replace(self, position=position, velocity=velocity)
 
 
 @dataclass(frozen=True)
@@ -95,7 +88,7 @@ class Window(_Batched):
 
     Args:
         frames: (B, T, N, D) positions in domain length, T >= 2.
-        material, mask, obstacle, obstacle_mask, gravity, acceleration: as in `Particles`, at the second frame.
+        material, mask, obstacle, obstacle_mask, gravity: as in `Particles`.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -107,8 +100,6 @@ class Window(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
-    acceleration: Tensor | None = None
-    features: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -121,8 +112,6 @@ class Window(_Batched):
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
         }
-        if self.acceleration is not None:
-            expected["acceleration"] = (batch, count, dim)
         _check_shapes(self, expected)
 
     @classmethod
@@ -135,16 +124,6 @@ class Window(_Batched):
             obstacle=state.obstacle,
             obstacle_mask=state.obstacle_mask,
             gravity=state.gravity,
-            acceleration=state.acceleration,
-        )
-
-    def later(self, frames: int, features: Tensor | None) -> Window:
-        """The window from some frames later on, with features (B, N, k) of the particles there."""
-        rest = self.frames[:, frames:]
-        before = self.frames[:, frames - 1]
-        change = rest[:, 1] - 2 * rest[:, 0] + before - self.gravity.unsqueeze(1)
-        return dataclasses.replace(
-            self, frames=rest, acceleration=change * self.mask.unsqueeze(-1), features=features
         )
 
     @property
@@ -158,8 +137,6 @@ class Window(_Batched):
             obstacle=self.obstacle,
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
-            acceleration=self.acceleration,
-            features=self.features,
         )
 
     @property

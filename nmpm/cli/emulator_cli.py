@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import shlex
 import signal
@@ -72,9 +73,7 @@ class EmulatorCLI(LightningCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "resume")
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
-        parser.link_arguments(
-            ("model.frames", "model.unroll", "model.warmup"), "data.horizon", compute_fn=lambda m, k, w: m * (k + w)
-        )
+        parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
     def before_instantiate_classes(self) -> None:
         """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""

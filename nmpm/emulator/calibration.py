@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Window
 
 _MARGIN = 0.5
@@ -52,10 +53,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     windows = [window.to(emulator.device) for window in windows]
     inputs = _combine(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
-    own = len(emulator.scene.input_channels)
-    soft = torch.ones_like(inputs.std)
-    soft[own:] = 0.3
-    emulator.input_std.copy_((_nonzero(inputs.std) / soft).reshape_as(emulator.input_std))
+    emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
     spread = inputs.high - inputs.low
     margin = torch.where(spread > 1e-12, _MARGIN * spread, UNLIMITED)
@@ -98,8 +96,9 @@ def _combine(parts: Sequence[_Inputs]) -> _Inputs:
 
 
 def _state(emulator: Emulator, window: Window) -> Tensor:
-    start = window.initial
-    return emulator.grid_state(start, emulator.solid(start))
+    start, grid = window.initial, emulator.grid
+    cells, velocity = grid.to_cells(start.position), grid.to_cell_displacement(start.velocity)
+    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
 
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:

@@ -43,13 +43,6 @@ class Bundle:
 
     position: Tensor
     velocity: Tensor
-    acceleration: Tensor | None = None
-    features: Tensor | None = None
-
-    def end(self, particles: Particles) -> Particles:
-        """The state after the bundle, of the particles that it started from."""
-        moved = particles.with_motion(self.position[:, -1], self.velocity, self.acceleration)
-        return dataclasses.replace(moved, features=self.features)
 
 
 @dataclass(frozen=True)
@@ -86,10 +79,8 @@ class Emulator(nn.Module):
         self.recipe = recipe
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
-        inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
-        self.processor = recipe.processor.build(
-            GridLayout(inputs, outputs + recipe.inputs.updates(frames), frames, scene.periodic)
-        )
+        inputs, outputs = len(scene.input_channels), len(scene.output_channels)
+        self.processor = recipe.processor.build(GridLayout(inputs, outputs, frames, scene.periodic))
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
             self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
@@ -225,14 +216,13 @@ class Emulator(nn.Module):
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self.in_cells(particles)
-            state = self.grid_state(particles, context.solid)
+            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
         with torch.autocast(device, enabled=False):
-            moving = output[:, :, : self.output_scale.shape[1]]
-            fields = moving.to(self.precision) * self.output_scale
+            fields = output.to(self.precision) * self.output_scale
             advection = self.advection
             smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
             carried = self.decoder.carried_velocity(velocity, smoothed)
@@ -247,32 +237,7 @@ class Emulator(nn.Module):
             return Bundle(
                 position=self.grid.to_length(path.to(precision)),
                 velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
-                acceleration=self._acceleration(velocity, steps, gravity, precision),
-                features=self._features(output[:, :, moving.shape[2] :], cells, particles),
             )
-
-    def _features(self, update: Tensor, cells: Tensor, particles: Particles) -> Tensor | None:
-        count = self.recipe.inputs.features
-        if not count:
-            return None
-        change = self.transfer.g2p(update.to(self.precision).flatten(1, 2)[:, :count].contiguous(), cells, self.grid)
-        return torch.tanh(change if particles.features is None else particles.features + change)
-
-    def grid_state(self, particles: Particles, solid: Tensor) -> Tensor:
-        """(B, C_in, *S) the grid state of particles, in grid units, with the share (B, C_solid, *S) of solids."""
-        cells, velocity, _ = self.in_cells(particles)
-        state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)
-        further = self.recipe.inputs.rasterise(self.scene, self.grid, self.transfer, particles, cells, velocity)
-        return torch.cat([state, *further], dim=1) if further else state
-
-    def _acceleration(self, velocity: Tensor, steps: Tensor, gravity: Tensor, precision: torch.dtype) -> Tensor | None:
-        """What the last frame of (B, m, N, D) steps added to the velocity beside gravity; None if it is no input."""
-        if not self.recipe.inputs.acceleration:
-            return None
-        span = self.recipe.inputs.acceleration
-        before = steps[:, -1 - span] if self.frames > span else velocity
-        span = min(span, self.frames)
-        return self.grid.to_displacement(((steps[:, -1] - before) / span - gravity).to(precision))
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

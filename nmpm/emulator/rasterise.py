@@ -27,7 +27,7 @@ def grid_state(
         velocity: (B, N, D) in cells per frame.
         solid: (B, C_solid, *S).
     """
-    membership = membership_of(particles, len(scene.materials))
+    membership = _membership(particles, len(scene.materials))
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
     mean = momentum / _positive(count).repeat_interleave(scene.dim, dim=1)
     volume = count * (scene.particle_volume / grid.cell_volume)
@@ -86,7 +86,7 @@ def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
     return (1 - free).float().to(torch.get_default_device())
 
 
-def membership_of(particles: Particles, materials: int) -> Tensor:
+def _membership(particles: Particles, materials: int) -> Tensor:
     """(B, N, materials): one at each real particle's material, zero elsewhere."""
     index = torch.arange(materials, device=particles.material.device)
     return ((particles.material.unsqueeze(-1) == index) & particles.mask.unsqueeze(-1)).float()

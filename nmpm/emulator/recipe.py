@@ -11,7 +11,6 @@ from nmpm._support.plain_data import to_lists
 from nmpm._support.specs import from_spec, to_spec
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.inputs import Inputs
 from nmpm.emulator.model import Emulator
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
@@ -51,7 +50,6 @@ class EmulatorRecipe:
     decoder: Decoder = Residual()  # noqa: RUF009
     grid_noise: float = 0.0
     constraints: Constraints = Constraints()  # noqa: RUF009
-    inputs: Inputs = Inputs()  # noqa: RUF009
 
     def __post_init__(self) -> None:
         scene = self.scene if isinstance(self.scene, Scene) else Scene.from_dict(self.scene)
@@ -63,7 +61,6 @@ class EmulatorRecipe:
             "processor": from_spec(self.processor, Processor),
             "decoder": from_spec(self.decoder, Decoder),
             "constraints": constraints if isinstance(constraints, Constraints) else _constraints(constraints),
-            "inputs": self.inputs if isinstance(self.inputs, Inputs) else Inputs(**self.inputs),
         }
         for name, value in read.items():
             object.__setattr__(self, name, value)
@@ -74,11 +71,6 @@ class EmulatorRecipe:
                 "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
             )
         self.processor.check_grid(self.grid)
-
-    @property
-    def input_channels(self) -> tuple[str, ...]:
-        """Names of the grid channels the processor sees, in order: the scene's own, then further ones."""
-        return self.scene.input_channels + self.inputs.channels(self.scene)
 
     @property
     def grid(self) -> Grid:
@@ -164,6 +156,6 @@ def _constraints(plain: Any) -> Constraints:
 def _plain(value: Any) -> Any:
     if isinstance(value, Scene):
         return value.to_dict()
-    if isinstance(value, Constraints | Inputs):
+    if isinstance(value, Constraints):
         return dataclasses.asdict(value)
     return to_spec(value) if dataclasses.is_dataclass(value) else to_lists(value)

@@ -63,7 +63,6 @@ class EmulatorModule(LightningModule):
         scene: Scene,
         unroll: int = 2,
         unroll_growth: float = 0.0,
-        warmup: int = 0,
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         density_weight: float = 0.0,
@@ -81,7 +80,6 @@ class EmulatorModule(LightningModule):
         if not 0 <= unroll_growth <= 1:
             raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
         self.unroll, self.unroll_growth = unroll, unroll_growth
-        self.warmup = warmup
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
@@ -93,7 +91,6 @@ class EmulatorModule(LightningModule):
         own = {
             "unroll": unroll,
             "unroll_growth": unroll_growth,
-            "warmup": warmup,
             "schedule": dataclasses.asdict(self.schedule),
             "density_weight": density_weight,
             "position_noise": position_noise,
@@ -187,24 +184,11 @@ class EmulatorModule(LightningModule):
         for axis in self.mirror:
             draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
             batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
-        batch = self._warmed_up(batch)
         bundles = self._unroll(self._add_position_noise(batch.initial), self.bundles(self._progress()))
         error = self._error(torch.cat([bundle.position for bundle in bundles], dim=1), batch)
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged)
         return loss
-
-    def _warmed_up(self, batch: Window) -> Window:
-        """The window after 0 … `warmup` bundles along its known positions, with the features from there."""
-        if not self.warmup:
-            return batch
-        count = int(torch.randint(self.warmup + 1, ()))
-        context = self.emulator.context(batch.initial)
-        with torch.no_grad():
-            for _ in range(count):
-                bundle = self.emulator(batch.initial, context)
-                batch = batch.later(self.emulator.frames, bundle.features)
-        return batch
 
     def _error(self, predicted: Tensor, batch: Window) -> Tensor:
         """The error of predicted positions (B, K m, N, D), in float32 whatever autocast says."""
@@ -277,10 +261,10 @@ class EmulatorModule(LightningModule):
         for _ in range(count):
             bundle: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
             yield bundle
-            particles = bundle.end(particles)
+            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
 
     def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
             return particles
         noise = self.position_noise * normal_like(particles.position)
-        return particles.with_motion(particles.position + noise, particles.velocity, particles.acceleration)
+        return particles.with_motion(particles.position + noise, particles.velocity)

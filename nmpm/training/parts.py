@@ -13,7 +13,7 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
 from nmpm.scene import Scene
 
-COMPARED = ("cells", "frames", "transfer", "processor", "decoder", "inputs")
+COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
 """Parts of a recipe that its weights were trained for; constraints and noise may change."""
 
 

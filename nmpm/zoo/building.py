@@ -55,10 +55,9 @@ def _check_numbers(value: Any, key: str = "the recipe") -> None:
 def _check_network(recipe: EmulatorRecipe) -> None:
     """Build the network without memory for its parameters, to learn whether it is too large."""
     scene = recipe.scene
-    inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
+    inputs, outputs = len(scene.input_channels), len(scene.output_channels)
     with torch.device("meta"), bounded_network():
         try:
-            outputs += recipe.inputs.updates(recipe.frames)
             recipe.processor.build(GridLayout(inputs, outputs, recipe.frames, scene.periodic))
         except (RuntimeError, NotImplementedError):
             return  # plugins need not support the meta device; the size is watched again in `build`

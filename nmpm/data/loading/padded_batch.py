@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import os
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,8 +12,6 @@ from torch import Tensor
 from nmpm.data.loading.recording import Recording
 from nmpm.particles import Window
 from nmpm.scene import Scene
-
-SPAN = int(os.environ.get('NMPM_SPAN', '1'))
 
 
 @dataclass(frozen=True)
@@ -88,22 +85,7 @@ class PaddedRecordings:
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
-            acceleration=self._acceleration(row, first, frames),
         )
-
-    def _acceleration(self, row: Tensor, first: Tensor, frames: Tensor) -> Tensor:
-        """(B, N, D) what the second of (B, T, N, D) frames added to the velocity beside gravity.
-
-        Zero where the recording has no frame before the first.
-        """
-        span = first.clamp(max=SPAN)
-        begin = first - span
-        steps = torch.stack([self.frames[row, begin], self.frames[row, begin + 1]], dim=1)
-        unwrap(steps, self.scene)
-        change = frames[:, 1] - frames[:, 0] - (steps[:, 1] - steps[:, 0])
-        change = change / span.clamp(min=1)[:, None, None] - self.gravity[row].unsqueeze(1)
-        known = (first > 0)[:, None, None] & self.mask[row].unsqueeze(-1)
-        return torch.where(known, change, 0.0)
 
 
 def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = None) -> Window:
