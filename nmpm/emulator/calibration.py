@@ -10,7 +10,6 @@ from torch import Tensor
 
 from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.model import UNLIMITED, Emulator
-from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Window
 
 _MARGIN = 0.5
@@ -96,9 +95,7 @@ def _combine(parts: Sequence[_Inputs]) -> _Inputs:
 
 
 def _state(emulator: Emulator, window: Window) -> Tensor:
-    start, grid = window.initial, emulator.grid
-    cells, velocity = grid.to_cells(start.position), grid.to_cell_displacement(start.velocity)
-    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
+    return emulator.grid_state(window.initial, emulator.solid(window.initial))
 
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
