@@ -166,7 +166,7 @@ class VariantTimer:
     def count_costs(self) -> dict[str, float]:
         """Parameters, 10⁹ floating-point operations of the network per scene and call, and on a GPU MB per step."""
         emulator = self.module.emulator
-        grid = torch.zeros(1, len(emulator.recipe.input_channels), *emulator.grid.shape, device=self.device)
+        grid = torch.zeros(1, len(self.data.scene.input_channels), *emulator.grid.shape, device=self.device)
         with FlopCounterMode(display=False) as counter, torch.no_grad():
             emulator.processor(grid)
         costs = {

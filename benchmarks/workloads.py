@@ -154,7 +154,7 @@ class TrainingStep:
             if self.setup.paper:
                 context = self.emulator.context(particles)
             bundle = self._predict_bundle(particles, context)
-            particles = bundle.end(particles)
+            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
             bundles.append(bundle.position)
         return torch.cat(bundles, dim=1)
 
@@ -191,4 +191,4 @@ class RolloutCalls:
             if self.setup.paper:
                 context = self.emulator.context(particles)
             bundle = self.emulator(particles, context)
-            particles = bundle.end(particles)
+            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)

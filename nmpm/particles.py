@@ -36,9 +36,8 @@ class _Batched:
         return self._map(lambda values: values[chosen])
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        fields = dataclasses.fields(self)  # type: ignore[arg-type]  # (both subclasses are dataclasses)
-        values = {field.name: getattr(self, field.name) for field in fields}
-        return type(self)(**{name: None if value is None else change(value) for name, value in values.items()})
+        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both subclasses are dataclasses)
+        return type(self)(**{name: change(getattr(self, name)) for name in names})
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,6 @@ class Particles(_Batched):
         obstacle: (B, M, D) positions of particles that do not move; M may be 0.
         obstacle_mask: (B, M) bool, False for padding.
         gravity: (B, D) in length per frame squared; zero where unknown.
-        acceleration: (B, N, D) mean acceleration beside gravity over the last frames, in length per frame squared; None
-            where these are unknown, as at a rollout's start, which counts as free fall.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -67,7 +64,6 @@ class Particles(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
-    acceleration: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -78,13 +74,12 @@ class Particles(_Batched):
             "obstacle": (batch, self.obstacle.shape[1], dim),
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
-            "acceleration": (batch, count, dim),
         }
         _check_shapes(self, expected)
 
-    def with_motion(self, position: Tensor, velocity: Tensor, acceleration: Tensor | None = None) -> Particles:
-        """The same particles elsewhere: (B, N, D) positions, velocities and, where they are known, accelerations."""
-        return dataclasses.replace(self, position=position, velocity=velocity, acceleration=acceleration)
+    def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
+        """The same particles elsewhere: (B, N, D) positions and velocities."""
+        return dataclasses.replace(self, position=position, velocity=velocity)
 
 
 @dataclass(frozen=True)
@@ -94,7 +89,6 @@ class Window(_Batched):
     Args:
         frames: (B, T, N, D) positions in domain length, T >= 2.
         material, mask, obstacle, obstacle_mask, gravity: as in `Particles`.
-        acceleration: (B, N, D) at the second frame, as in `Particles`.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -106,7 +100,6 @@ class Window(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
-    acceleration: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -118,7 +111,6 @@ class Window(_Batched):
             "obstacle": (batch, self.obstacle.shape[1], dim),
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
-            "acceleration": (batch, count, dim),
         }
         _check_shapes(self, expected)
 
@@ -132,7 +124,6 @@ class Window(_Batched):
             obstacle=state.obstacle,
             obstacle_mask=state.obstacle_mask,
             gravity=state.gravity,
-            acceleration=state.acceleration,
         )
 
     @property
@@ -146,7 +137,6 @@ class Window(_Batched):
             obstacle=self.obstacle,
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
-            acceleration=self.acceleration,
         )
 
     @property
@@ -157,9 +147,6 @@ class Window(_Batched):
 
 def _check_shapes(owner: object, expected: dict[str, tuple[int, ...]]) -> None:
     for name, shape in expected.items():
-        value = getattr(owner, name)
-        if value is None:
-            continue
-        found = tuple(value.shape)
+        found = tuple(getattr(owner, name).shape)
         if found != shape:
             raise ValueError(f"{type(owner).__name__}.{name} has shape {found}, expected {shape}.")

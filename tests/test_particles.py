@@ -1,5 +1,3 @@
-import dataclasses
-
 import pytest
 import torch
 from scenes import box, cloud
@@ -10,8 +8,7 @@ KEPT = {"material": torch.int64, "mask": torch.bool, "obstacle_mask": torch.bool
 
 
 def state(batch: int = 3) -> Particles:
-    start = cloud(box(), count=5, batch=batch, statics=2)
-    return dataclasses.replace(start, acceleration=1e-3 * torch.ones_like(start.velocity))
+    return cloud(box(), count=5, batch=batch, statics=2)
 
 
 @pytest.mark.parametrize("whole", [state(), Window.of(state())], ids=["Particles", "Window"])

@@ -74,7 +74,6 @@ class EmulatorCLI(LightningCLI):
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
-        parser.link_arguments("model.history", "data.history")
 
     def before_instantiate_classes(self) -> None:
         """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""

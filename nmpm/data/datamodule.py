@@ -49,7 +49,6 @@ class TrajectoryDataModule(LightningDataModule):
         source: "disk"; or "simulate" to train on new trajectories of `name` from the simulator, which are not written
             and used in one buffer only; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
         horizon: Frames to predict in a training window: frames per bundle times bundles unrolled.
-        history: Frames over which training windows have a mean acceleration, for models that see it; 0: they have none.
         batch_size: Training windows per batch and rank.
         buffer_size: Training trajectories in memory at a time; up to three times as many while the next are read.
         passes: How often the windows of a buffer are drawn, on average, before the next buffer.
@@ -75,7 +74,6 @@ class TrajectoryDataModule(LightningDataModule):
         name: str | None = None,
         source: SourceName = "disk",
         horizon: int = 16,
-        history: int = 0,
         batch_size: int = 16,
         buffer_size: int = 16,
         passes: float = 4,
@@ -97,9 +95,7 @@ class TrajectoryDataModule(LightningDataModule):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
         self.data_source = _make_source(path, name, source, StatedFacts(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
-        if history < 0:
-            raise ConfigError(f"history = {history} must not be negative.")
-        self.horizon, self.history, self.batch_size, self.seed = horizon, history, batch_size, seed
+        self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
         self._provider: RecordingProvider | None = None
@@ -156,8 +152,7 @@ class TrajectoryDataModule(LightningDataModule):
         )
         plan = plan.resume_after(self.batches_seen, history.batch_size, history.world, world)
         self._history = _BatchHistory(plan.start, self.batch_size, world)
-        device = self.buffer_device(self._provider, plan)
-        return TrainingLoader(TrajectoryBuffer(self._provider, plan, device, self.history), self)
+        return TrainingLoader(TrajectoryBuffer(self._provider, plan, self.buffer_device(self._provider, plan)), self)
 
     @property
     def target_device(self) -> torch.device:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Window
 
 _MARGIN = 0.5
@@ -95,7 +96,9 @@ def _combine(parts: Sequence[_Inputs]) -> _Inputs:
 
 
 def _state(emulator: Emulator, window: Window) -> Tensor:
-    return emulator.grid_state(window.initial, emulator.solid(window.initial))
+    start, grid = window.initial, emulator.grid
+    cells, velocity = grid.to_cells(start.position), grid.to_cell_displacement(start.velocity)
+    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
 
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:

@@ -18,7 +18,7 @@ from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection, Flight
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
-from nmpm.emulator.rasterise import grid_state, mean_per_material, solid_fraction, wall_fraction
+from nmpm.emulator.rasterise import grid_state, solid_fraction, wall_fraction
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -39,17 +39,10 @@ class Bundle:
     Args:
         position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
         velocity: (B, N, D) at the last frame, in length per frame.
-        acceleration: (B, N, D) mean acceleration beside gravity over the last frames, in length per frame squared; None
-            where the emulator has no history.
     """
 
     position: Tensor
     velocity: Tensor
-    acceleration: Tensor | None = None
-
-    def end(self, start: Particles) -> Particles:
-        """The state at the last frame, from the state that the bundle started from."""
-        return start.with_motion(self.position[:, -1], self.velocity, self.acceleration)
 
 
 @dataclass(frozen=True)
@@ -86,7 +79,7 @@ class Emulator(nn.Module):
         self.recipe = recipe
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
-        inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
+        inputs, outputs = len(scene.input_channels), len(scene.output_channels)
         self.processor = recipe.processor.build(GridLayout(inputs, outputs, frames, scene.periodic))
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
@@ -223,7 +216,7 @@ class Emulator(nn.Module):
         device = particles.position.device.type
         with torch.autocast(device, enabled=False):
             cells, velocity, gravity = self.in_cells(particles)
-            state = self.grid_state(particles, context.solid)
+            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
@@ -244,31 +237,7 @@ class Emulator(nn.Module):
             return Bundle(
                 position=self.grid.to_length(path.to(precision)),
                 velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
-                acceleration=self._acceleration(velocity, steps, gravity, precision),
             )
-
-    def grid_state(self, particles: Particles, solid: Tensor) -> Tensor:
-        """The grid state (B, C_in, *S) of particles in grid units, with the share (B, C_solid, *S) of solids."""
-        cells, velocity, _ = self.in_cells(particles)
-        parts = [grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, solid)]
-        if self.recipe.history:
-            known = torch.zeros_like(velocity)  # free fall
-            if particles.acceleration is not None:
-                known = self.grid.to_cell_displacement(particles.acceleration, self.precision)
-            parts.append(mean_per_material(self.scene, self.grid, self.transfer, particles, cells, known))
-        return torch.cat(parts, dim=1)
-
-    def _acceleration(self, velocity: Tensor, steps: Tensor, gravity: Tensor, precision: torch.dtype) -> Tensor | None:
-        """Mean acceleration beside gravity over the last of (B, m, N, D) steps, in length; None without history.
-
-        Without gradient: with it, small differences of large velocities make the training noisy.
-        """
-        span = self.recipe.history
-        if not span:
-            return None
-        before = velocity if span == self.frames else steps[:, -1 - span]
-        mean = (steps[:, -1] - before).detach() / span - gravity
-        return self.grid.to_displacement(mean.to(precision))
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

@@ -38,26 +38,6 @@ def grid_state(
     return torch.cat(parts, dim=1)
 
 
-def mean_per_material(
-    scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, cells: Tensor, values: Tensor
-) -> Tensor:
-    """Each material's mean of particle values on the grid, (B, materials * C, *S); zero where it has no particle.
-
-    Args:
-        scene: Gives the materials.
-        grid: What to rasterise onto.
-        transfer: How to.
-        particles: Gives materials and mask.
-        cells: (B, N, D) positions in cells.
-        values: (B, N, C).
-    """
-    membership = _membership(particles, len(scene.materials))
-    weighted = (membership.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
-    sums = transfer.p2g(torch.cat([weighted, membership], dim=-1), cells, grid)
-    total, count = sums.split([weighted.shape[-1], membership.shape[-1]], dim=1)
-    return total / _positive(count).repeat_interleave(values.shape[-1], dim=1)
-
-
 def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, walls: Tensor) -> Tensor:
     """The share of each cell taken by walls and obstacles, (B, 1, *S) in [0, 1]; (B, 0, *S) where a scene has none.
 

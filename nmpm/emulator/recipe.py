@@ -37,8 +37,6 @@ class EmulatorRecipe:
         decoder: What the network's output means.
         grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training only.
         constraints: Facts that rollouts are held to; but for the bounds they do not act in training.
-        history: Frames, up to m, over which each material's mean acceleration beside gravity is a further input; 0: it
-            is none.
 
     Raises:
         ConfigError: if scene, grid, processor and constraints do not suit each other.
@@ -52,7 +50,6 @@ class EmulatorRecipe:
     decoder: Decoder = Residual()  # noqa: RUF009
     grid_noise: float = 0.0
     constraints: Constraints = Constraints()  # noqa: RUF009
-    history: int = 0
 
     def __post_init__(self) -> None:
         scene = self.scene if isinstance(self.scene, Scene) else Scene.from_dict(self.scene)
@@ -69,20 +66,11 @@ class EmulatorRecipe:
             object.__setattr__(self, name, value)
         if self.frames < 1:
             raise ConfigError(f"frames = {self.frames}: a call predicts at least 1 frame.")
-        if not 0 <= self.history <= self.frames:
-            raise ConfigError(f"history = {self.history} must be from 0 to frames = {self.frames}.")
         if self.constraints.energy and not self.scene.gravity_known:
             raise ConfigError(
                 "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
             )
         self.processor.check_grid(self.grid)
-
-    @property
-    def input_channels(self) -> tuple[str, ...]:
-        """Names of the grid channels that the processor sees, in order: the scene's, then those of the history."""
-        scene = self.scene
-        further = [f"{m}.acceleration_{a}" for m in scene.materials for a in "xyz"[: scene.dim]] if self.history else []
-        return (*scene.input_channels, *further)
 
     @property
     def grid(self) -> Grid:
@@ -120,13 +108,8 @@ class EmulatorRecipe:
         return dataclasses.replace(self, scene=scene, cells=tuple(round(side) for side in sides))
 
     def to_dict(self) -> dict[str, Any]:
-        """The recipe as plain lists, strings and numbers, with the version of this form.
-
-        Without a history if there is none, as in older files.
-        """
+        """The recipe as plain lists, strings and numbers, with the version of this form."""
         plain = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        if not self.history:
-            del plain["history"]
         return {"format": FORMAT, **plain}
 
     @classmethod

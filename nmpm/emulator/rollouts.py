@@ -33,7 +33,7 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
             if not remaining:
                 monitor.read()
         yield bundle
-        particles = bundle.end(particles)
+        particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:

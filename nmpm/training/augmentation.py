@@ -44,7 +44,6 @@ def mirror_windows(window: Window, scene: Scene, axis: int, chosen: Tensor) -> W
         frames=_reflect(window.frames, axis, middle, chosen),
         obstacle=_reflect(window.obstacle, axis, middle, chosen),
         gravity=_reflect(window.gravity, axis, 0.0, chosen),
-        acceleration=None if window.acceleration is None else _reflect(window.acceleration, axis, 0.0, chosen),
     )
 
 

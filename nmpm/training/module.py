@@ -126,15 +126,11 @@ class EmulatorModule(LightningModule):
         """Make sure that the data are of the model's scene.
 
         Raises:
-            ConfigError: naming the facts in which they differ, or if training windows lack the model's history.
+            ConfigError: naming the facts in which they differ.
         """
-        data = getattr(self.trainer, "datamodule", None)
-        scene = getattr(data, "scene", None)
+        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
         if isinstance(scene, Scene):
             check_same_scene(self.emulator.scene, scene)
-        given, needed = getattr(data, "history", None), self.emulator.recipe.history
-        if given not in (None, needed):
-            raise ConfigError(f"data.history = {given} must be the model's history = {needed}.")
 
     def on_fit_start(self) -> None:
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
@@ -265,10 +261,10 @@ class EmulatorModule(LightningModule):
         for _ in range(count):
             bundle: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
             yield bundle
-            particles = bundle.end(particles)
+            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
 
     def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
             return particles
         noise = self.position_noise * normal_like(particles.position)
-        return dataclasses.replace(particles, position=particles.position + noise)
+        return particles.with_motion(particles.position + noise, particles.velocity)

@@ -13,7 +13,7 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
 from nmpm.scene import Scene
 
-COMPARED = ("cells", "frames", "transfer", "processor", "decoder", "history")
+COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
 """Parts of a recipe that its weights were trained for; constraints and noise may change."""
 
 
@@ -51,7 +51,7 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], mine: EmulatorRecipe)
     stored = EmulatorRecipe.from_dict({name: value for name, value in hyper_parameters.items() if name in names})
     check_same_scene(stored.scene, mine.scene)
     theirs, ours = stored.to_dict(), mine.to_dict()
-    found = [line for name in COMPARED for line in _differences(theirs.get(name, 0), ours.get(name, 0), f"model.{name}")]
+    found = [line for name in COMPARED for line in _differences(theirs[name], ours[name], f"model.{name}")]
     if found:
         raise ConfigError(
             f"The checkpoint has {'; '.join(found)}. Give the checkpoint's values, or train the new form in another"

@@ -55,7 +55,7 @@ def _check_numbers(value: Any, key: str = "the recipe") -> None:
 def _check_network(recipe: EmulatorRecipe) -> None:
     """Build the network without memory for its parameters, to learn whether it is too large."""
     scene = recipe.scene
-    inputs, outputs = len(recipe.input_channels), len(scene.output_channels)
+    inputs, outputs = len(scene.input_channels), len(scene.output_channels)
     with torch.device("meta"), bounded_network():
         try:
             recipe.processor.build(GridLayout(inputs, outputs, recipe.frames, scene.periodic))

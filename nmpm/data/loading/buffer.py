@@ -85,10 +85,10 @@ class _BufferContents:
     recordings: Mapping[int, Recording]
     motion: MotionSampler | None
 
-    def gather(self, drawn: Sequence[tuple[int, int]], length: int, history: int) -> Window:
+    def gather(self, drawn: Sequence[tuple[int, int]], length: int) -> Window:
         row = {trajectory: row for row, trajectory in enumerate(self.recordings)}
         trajectories, starts = zip(*drawn, strict=True)
-        return self.padded.gather([row[trajectory] for trajectory in trajectories], starts, length, history)
+        return self.padded.gather([row[trajectory] for trajectory in trajectories], starts, length)
 
 
 class TrajectoryBuffer:
@@ -101,18 +101,14 @@ class TrajectoryBuffer:
         provider: The trajectories.
         plan: Which windows make up which batch.
         device: Where the buffer is stored and the windows are gathered.
-        history: Frames over which windows have a mean acceleration; 0: they have none.
 
     Raises:
         DataError: if a trajectory is shorter than a window.
     """
 
-    def __init__(
-        self, provider: RecordingProvider, plan: WindowPlan, device: torch.device | None = None, history: int = 0
-    ) -> None:
+    def __init__(self, provider: RecordingProvider, plan: WindowPlan, device: torch.device | None = None) -> None:
         provider.require_frames(plan.length, f"a training window of {plan.length - 2} frames to predict")
         self.provider, self.plan, self.device = provider, plan, device or torch.device("cpu")
-        self.history = history
 
     def batches(self, start: int = 0, rank: int = 0, world: int = 1) -> Iterator[Window]:
         """Yields the batches of one of `world` ranks, from index `start` on.
@@ -129,8 +125,7 @@ class TrajectoryBuffer:
             try:
                 for index in indices:
                     drawn = plan.batch(index, rank, world)
-                    drawn = self._emphasise(drawn, contents.motion, index, rank, world)
-                    yield contents.gather(drawn, plan.length, self.history)
+                    yield contents.gather(self._emphasise(drawn, contents.motion, index, rank, world), plan.length)
                 contents = upcoming.result()
             finally:
                 upcoming.cancel()

@@ -64,7 +64,7 @@ class PaddedRecordings:
             scene=self.scene,
         )
 
-    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int, history: int = 0) -> Window:
+    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int) -> Window:
         """Gathers consecutive frames of B recordings.
 
         Args:
@@ -72,8 +72,6 @@ class PaddedRecordings:
             starts: First frame of each. On the scene's periodic axes positions are unwrapped from there on, so that
                 differences between frames are displacements.
             length: Frames of the window; each recording must have as many from its start on.
-            history: Frames over which the acceleration at the window's second frame is averaged, fewer where the
-                recording has fewer before that; 0: the windows have none.
         """
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)
@@ -87,20 +85,7 @@ class PaddedRecordings:
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
-            acceleration=self._acceleration(row, first, frames, history) if history else None,
         )
-
-    def _acceleration(self, row: Tensor, first: Tensor, frames: Tensor, history: int) -> Tensor:
-        """(B, N, D) mean acceleration beside gravity over some frames before the second of (B, T, N, D) frames.
-
-        Zero in windows that start with a recording's first frame, where it is unknown.
-        """
-        span = first.clamp(max=history)
-        earlier = torch.stack([self.frames[row, first - span], self.frames[row, first - span + 1]], dim=1)
-        unwrap(earlier, self.scene)
-        change = frames[:, 1] - frames[:, 0] - (earlier[:, 1] - earlier[:, 0])
-        mean = change / span.clamp(min=1)[:, None, None] - self.gravity[row].unsqueeze(1)
-        return torch.where((span > 0)[:, None, None], mean, 0.0)
 
 
 def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = None) -> Window:

@@ -143,7 +143,7 @@ def _max_violations(
             for position in made.position[0]:
                 bad = forbidden(position, bundle) | ~position.isfinite().all(-1)
                 most = max(most, int(bad.sum()))
-            state = made.end(state)
+            state = state.with_motion(made.position[:, -1], made.velocity)
     return most
 
 

@@ -7,7 +7,6 @@ sums are torch's own, nothing is trained.
 from __future__ import annotations
 
 import copy
-import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -94,18 +93,15 @@ class Step(Part):
         state: tuple[str | int, ...] = ("B", "N", scene.dim)
         names = ", ".join(f"{index} {name}" for index, name in enumerate(scene.materials))
         budget = "energy per mass not to be exceeded, in cells and frames; nan for that of this state, inf for no limit"
-        averaged = f"mean over {emulator.recipe.history} frames, in domain length per frame squared"
         possible = {
             "position": Value("position", state, "domain length"),
             "velocity": Value("velocity", state, "domain length per frame"),
-            "acceleration": Value("acceleration", state, f"beside gravity, {averaged}; zero at a rollout's start"),
             "material": Value("material", ("B", "N"), f"index of each particle's material: {names}", torch.int64),
             "gravity": Value("gravity", ("B", scene.dim), "domain length per frame squared"),
             "solid": Value("solid", ("B", 1, *shape), "share of each cell that is wall or obstacle, from 0 to 1"),
             "budget": Value("budget", ("B",), budget),
         }
         needed = {
-            "acceleration": emulator.recipe.history > 0,
             "material": len(scene.materials) > 1,
             "gravity": scene.gravity_varies,
             "solid": scene.obstacles,
@@ -115,13 +111,7 @@ class Step(Part):
         positions = Value("positions", ("B", emulator.frames, "N", scene.dim), "the next frames, in domain length")
         velocity = Value("next_velocity", state, "at the last frame, in domain length per frame: the next call's")
         kept = Value("next_budget", ("B",), "the budget that was kept: the next call's")
-        further = Value("next_acceleration", state, f"beside gravity, {averaged}: the next call's")
-        self.outputs = (
-            positions,
-            velocity,
-            *((kept,) if emulator.constraints.energy else ()),
-            *((further,) if emulator.recipe.history else ()),
-        )
+        self.outputs = (positions, velocity, kept) if emulator.constraints.energy else (positions, velocity)
         known = torch.tensor(scene.gravity or (0.0,) * scene.dim) * scene.dt**2
         self.register_buffer("known_gravity", known, persistent=False)
 
@@ -135,16 +125,17 @@ class Step(Part):
         gravity: Tensor | None = None,
         solid: Tensor | None = None,
         budget: Tensor | None = None,
-        acceleration: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """The outputs for the inputs that this emulator needs."""
-        state = dataclasses.replace(self._state(position, velocity, material, gravity), acceleration=acceleration)
+        state = self._state(position, velocity, material, gravity)
         solid = self.emulator.solid(state) if solid is None else solid
         own = self.emulator.budget(state)
-        kept = own if own is None or budget is None else torch.where(budget.isnan(), own, budget)
+        if own is None or budget is None:
+            bundle = self.emulator(state, RolloutContext(solid, own))
+            return bundle.position, bundle.velocity
+        kept = torch.where(budget.isnan(), own, budget)
         bundle = self.emulator(state, RolloutContext(solid, kept))
-        found = (bundle.position, bundle.velocity, kept if self.emulator.constraints.energy else None)
-        return tuple(value for value in (*found, bundle.acceleration) if value is not None)
+        return bundle.position, bundle.velocity, kept
 
     def _state(self, position: Tensor, velocity: Tensor, material: Tensor | None, gravity: Tensor | None) -> Particles:
         batch, count, dim = position.shape
@@ -167,7 +158,6 @@ class Step(Part):
         values = {
             "position": low + (high - low) * torch.rand(batch, count, scene.dim, generator=random),
             "velocity": spread * torch.randn(batch, count, scene.dim, generator=random),
-            "acceleration": 0.1 * spread * torch.randn(batch, count, scene.dim, generator=random),
             "material": torch.randint(len(scene.materials), (batch, count), generator=random),
             "gravity": (torch.tensor(scene.gravity or (0.0,) * scene.dim) * scene.dt**2).repeat(batch, 1),
             "solid": wall_fraction(scene, grid).expand(batch, 1, *grid.shape).clone(),
@@ -185,10 +175,10 @@ class Network(Part):
     def __init__(self, emulator: Emulator) -> None:
         super().__init__(emulator)
         scene, shape = emulator.scene, emulator.grid.shape
-        channels = emulator.recipe.input_channels
-        description = f"channels {', '.join(channels)}; velocities in cells per frame, volumes and solids as shares of a cell"
+        channels = ", ".join(scene.input_channels)
+        description = f"channels {channels}; velocities in cells per frame, volumes and solids as shares of a cell"
         decoder = type(emulator.decoder).__name__
-        self.inputs = (Value("grid", ("B", len(channels), *shape), description),)
+        self.inputs = (Value("grid", ("B", len(scene.input_channels), *shape), description),)
         out: tuple[str | int, ...] = ("B", emulator.frames, len(scene.output_channels), *shape)
         fields = f"channels {', '.join(scene.output_channels)}, in cells per frame, for the decoder {decoder}"
         self.outputs = (Value("fields", out, fields),)
@@ -200,7 +190,7 @@ class Network(Part):
 
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:  # noqa: ARG002 (no particles here)
         emulator = self.emulator
-        shape = (batch, len(emulator.recipe.input_channels), *emulator.grid.shape)
+        shape = (batch, len(emulator.scene.input_channels), *emulator.grid.shape)
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
         return {"grid": noise}
 
