@@ -63,6 +63,7 @@ def measure_model(name: str, frames: int, repeats: int, device: torch.device) ->
         "energy": roll_out(Constraints(energy=True, solids=False)),
         "rest": roll_out(Constraints(rest_speed=0.01, solids=False)),
         "solids": roll_out(Constraints(solids=True)),
+        "cap": roll_out(Constraints(density_cap=emulator.constraints.density_cap or 1.0, solids=False)),
         "all": roll_out(Constraints(energy=True, rest_speed=0.01, solids=True)),
     }
     seconds = time_alternating(rollouts, repeats, clock_for(device))

@@ -1,6 +1,6 @@
 """The dam break beside JAX-SPH's, from the same first frame: how near the two simulators stay over time.
 
-Usage: NMPM_TEST_DATA=… python benchmarks/dam_break.py
+python benchmarks/dam_break.py --data $NMPM_TEST_DATA/jaxsph-dambreak-2d
 
 The recording is one run of LagrangeBench's dam break. Its first frame, a relaxed column of 5000 particles, starts ours,
 and the same quantities are taken from both at the same times:
@@ -19,6 +19,7 @@ of the two simulators.
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import time
@@ -44,10 +45,26 @@ FLUID = 0  # the recording's type of fluid particles
 
 def main() -> None:
     """Simulate, compare and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    folder = Path(os.environ.get("NMPM_TEST_DATA", "")) / "jaxsph-dambreak-2d"
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=folder,
+        help="folder of the recording, with test.h5 (default: jaxsph-dambreak-2d in the folder NMPM_TEST_DATA)",
+    )
+    chosen = parser.parse_args()
+    path = chosen.data / "test.h5"
+    if not path.is_file():
+        parser.error(f"--data {chosen.data}: there is no {path}.")
+    compare(recording(path))
+
+
+def compare(recorded: Water) -> None:
+    """Simulate from the first recorded frame, and print both beside one another."""
     preset = load_preset("dambreak2d")
     if not isinstance(preset, SphPreset):
         raise TypeError("dambreak2d is not simulated by WCSPH.")
-    recorded = recording()
     ours = simulated(preset, recorded[0])
     nudged = simulated(preset, recorded[0] + np.random.default_rng(0).normal(scale=1e-6, size=recorded[0].shape))
     series, floor = measured(ours, preset), measured(nudged, preset)
@@ -68,9 +85,8 @@ def simulated(preset: SphPreset, start: Water) -> Water:
     return made.position[:, : len(start)].astype(np.float64)
 
 
-def recording() -> Water:
+def recording(path: Path) -> Water:
     """The recorded water, (401, 5000, 2)."""
-    path = Path(os.environ["NMPM_TEST_DATA"]) / "jaxsph-dambreak-2d" / "test.h5"
     with h5py.File(path) as file:
         group = file["00000"]
         return np.asarray(group["position"][:, group["particle_type"][:] == FLUID], np.float64)

@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from nmpm.data.format import Trajectory as Trajectory
     from nmpm.emulator import Emulator as Emulator
     from nmpm.emulator import EmulatorRecipe as EmulatorRecipe
+    from nmpm.emulator import differentiable_rollout as differentiable_rollout
     from nmpm.emulator import rollout as rollout
     from nmpm.particles import Particles as Particles
     from nmpm.scene import Scene as Scene
     from nmpm.training.module import EmulatorModule as EmulatorModule
+    from nmpm.viz.viewer import view as view
     from nmpm.zoo.registry import Zoo as Zoo
 
 _MODULE_OF = {
@@ -29,7 +31,9 @@ _MODULE_OF = {
     "Trajectory": "nmpm.data.format",
     "TrajectoryDataModule": "nmpm.data.datamodule",
     "Zoo": "nmpm.zoo",
+    "differentiable_rollout": "nmpm.emulator",
     "rollout": "nmpm.emulator",
+    "view": "nmpm.viz.viewer",
     "write_trajectories": "nmpm.data.convert.arrays",
 }
 
@@ -43,7 +47,9 @@ __all__ = [
     "TrajectoryDataModule",
     "Zoo",
     "__version__",
+    "differentiable_rollout",
     "rollout",
+    "view",
     "write_trajectories",
 ]
 

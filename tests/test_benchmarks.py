@@ -21,10 +21,10 @@ ROOT = Path(__file__).parent.parent / "benchmarks"
 if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
-WITHOUT_DEVICE = {"exported", "gallery"} | {
-    "against_recordings", "calibration", "dam_break", "simulators", "stable_substeps",
+WITHOUT_DEVICE = {"exported", "gallery", "recipes"} | {
+    "against_recordings", "calibration", "dam_break", "kills", "simulators", "stable_substeps",
 }  # fmt: skip
-"""These measure the CPU alone: export runtimes on one thread, and the simulators."""
+"""These measure the CPU alone: export runtimes and recipes on one thread, and the simulators."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -51,9 +51,6 @@ def run_script(name, *words):
 def test_help_of_every_script(name):
     if name == "exported":
         pytest.importorskip("onnxruntime")
-    source = (ROOT / f"{name}.py").read_text()
-    if "ArgumentParser" not in source and "_parser(" not in source:
-        pytest.skip(f"{name} takes no options")
     text = run_script(name, "--help")
     assert text.startswith(f"usage: {name}.py")
     assert "--device" in text or name in WITHOUT_DEVICE | {"streaming"}
@@ -174,6 +171,45 @@ def test_a_zoo_model_agrees_with_itself_on_the_same_device():
     figures = zoo_on_device.compare_devices("goop", load_preset("goop").with_frames(12), 1, CPU)
     assert figures["cells_after_8"] == figures["cells_at_end"] == 0
     assert 0 < figures["cpu"]["errors"]["mse"] < figures["cpu"]["errors"]["still/mse"]
+
+
+# ---- trained runs side by side
+
+
+def test_ratio_of_scaled_errors_has_no_spread_and_that_of_noise_contains_one():
+    import recipes
+
+    theirs = [1.0, 5.0, 2.0, 0.1]
+    assert recipes.ratio_interval([value / 2 for value in theirs], theirs) == pytest.approx((0.5, 0.5, 0.5))
+    _, low, high = recipes.ratio_interval(theirs[::-1], theirs)
+    assert low < 1 < high
+
+
+def test_seeds_are_averaged_scene_by_scene():
+    import recipes
+
+    rows = [{"errors": {"settings": "", "mse": [1.0, 3.0]}}, {"errors": {"settings": "", "mse": [2.0, 5.0]}}]
+    assert recipes.mean_over_seeds(rows, "errors") == {"mse": [1.5, 4.0]}
+    assert recipes.mean_over_seeds([*rows, {}], "errors") == {}
+    assert {recipes.Run(Path(name)).recipe for name in ("goop-0", "goop-12")} == {"goop"}
+
+
+def test_figures_of_a_run_are_kept_until_its_checkpoint_or_the_settings_change(tmp_path):
+    import recipes
+
+    checkpoint = tmp_path / "checkpoints" / "best.ckpt"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"one")
+    values = iter(range(10))
+
+    def measured(settings="", fresh=False):
+        figures = recipes.Figures(recipes.Run(tmp_path), fresh)
+        figures.measure("errors", settings, lambda: {"mse": next(values)})
+        return figures.rows["errors"]["mse"]
+
+    assert [measured(), measured(), measured("other"), measured("other", fresh=True)] == [0, 0, 1, 2]
+    checkpoint.write_bytes(b"another")
+    assert measured("other") == 3
 
 
 # ---- the script that runs everything on a machine with a GPU

@@ -7,6 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+STEM = 40
+"""Characters of a file's name that its temporary name begins with."""
+
+
+def temporary_path(path: Path) -> Path:
+    """The hidden file beside `path` that this process writes first; a long name is cut, so that the whole fits."""
+    return path.with_name(f".{path.stem[:STEM]}.{os.getpid()}.part{path.suffix}")
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
@@ -16,7 +24,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     exception the temporary file is deleted and `path` is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    temporary = temporary_path(path)
     try:
         yield temporary
         os.replace(temporary, path)

@@ -42,15 +42,20 @@ RENAMED: Mapping[str, str] = MappingProxyType(
 
 
 def to_spec(recipe: object) -> dict[str, Any]:
-    """The class path and arguments of a frozen dataclass of plain values.
+    """The class path and arguments of a frozen dataclass of plain values and other such dataclasses.
 
     Raises:
         ConfigError: if the object is not a dataclass.
     """
     if not dataclasses.is_dataclass(recipe):
         raise ConfigError(f"{type(recipe).__name__} must be a dataclass, so that a checkpoint can store its arguments.")
-    arguments = {field.name: to_lists(getattr(recipe, field.name)) for field in dataclasses.fields(recipe)}
+    arguments = {field.name: _to_plain(getattr(recipe, field.name)) for field in dataclasses.fields(recipe)}
     return {"class_path": class_path(type(recipe)), "init_args": arguments}
+
+
+def _to_plain(value: object) -> object:
+    """A recipe within another as its spec, other values as plain data."""
+    return to_spec(value) if dataclasses.is_dataclass(value) else to_lists(value)
 
 
 def from_spec(spec: object, base: type[T]) -> T:

@@ -22,7 +22,8 @@ COMMANDS = {
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
     "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
-    "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF."),
+    "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF or MP4."),
+    "view": ("nmpm.cli.view", "Write a page that plays trajectories in a browser."),
 }
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]
@@ -40,6 +41,7 @@ first steps:
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
   nmpm render out.h5                           draw the rollout
+  nmpm view out.h5                             play it in a browser
   nmpm stress goop                             test it at the extremes
 
 Add --help to any command for its options; fit --print_config prints a whole configuration.
@@ -56,7 +58,7 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; errors that a user can correct are printed without a traceback.
+    """Run a command; errors that a user can correct, those of the file system too, are printed without a traceback.
 
     Returns:
         The exit status: 0 for success, 1 for an error, 2 for a wrong call, 130 for an interruption.
@@ -78,6 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
+        return 1
+    except OSError as error:
+        if error.filename is None or error.strerror is None:
+            raise
+        sys.stderr.write(f"nmpm {words[0]}: {error.filename}: {error.strerror.lower()}.\n")
         return 1
     except KeyboardInterrupt as interrupt:
         sys.stderr.write(f"\nnmpm {words[0]}: {interrupt or 'interrupted.'}\n")

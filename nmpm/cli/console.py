@@ -41,6 +41,7 @@ WARNINGS = (
     (r"`max_epochs` was not set", r"lightning\."),
     (r"The '\w+' does not have many workers", r"lightning\."),
     (r"You're using the WeightAveraging callback, but loading a checkpoint outside", r"lightning\."),
+    (r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint", r"lightning\."),
     (r"Precision .* is not supported by the model summary", r"lightning\."),
 )
 """Messages and modules of warnings about what is meant to be so."""

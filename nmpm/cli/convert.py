@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.options import add_data_options, data_options, new_ids
+from nmpm.cli.options import add_data_options, check_folder, data_options, new_ids
 
 _DESCRIPTION = """\
 Bring a dataset of another format into the native layout (LagrangeBench's HDF5 files with a metadata.json).
@@ -44,6 +44,7 @@ def run(words: list[str]) -> None:
     parser.add_argument("--ids", metavar="OLD=NEW,...", help="new type ids in the written files, e.g. 5=0,3=1")
     add_data_options(parser)
     chosen = parser.parse_args(words[1:])
+    check_folder("DESTINATION", chosen.destination)
     options, ids = data_options(chosen), new_ids(chosen.ids)
     for note in convert(chosen.source, chosen.destination, chosen.format, options, ids):
         sys.stdout.write(f"- {note}\n")

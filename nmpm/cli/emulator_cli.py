@@ -23,7 +23,8 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
-from nmpm.cli.typos import BriefParser, UsageError
+from nmpm.cli.options import check_folder
+from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
 from nmpm.training.budget import check_endless_batches
@@ -35,12 +36,16 @@ from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
+from nmpm.training.parts import check_same_recipe
 from nmpm.training.run_folder import RunFolder
+from nmpm.zoo.registry import load_model
 
 BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
 # A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best
 # does not change.
 LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
+
+START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
 class EmulatorCLI(LightningCLI):
@@ -72,15 +77,30 @@ class EmulatorCLI(LightningCLI):
         parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
         parser.add_lightning_class_args(ModelCheckpoint, "resume")
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
+        if self.words[0] == "fit":
+            parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
     def before_instantiate_classes(self) -> None:
-        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder."""
+        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder.
+
+        Raises:
+            ConfigError: if a model that was not trained is to be judged, or the learning rate is not positive.
+        """
         config = self.config[self.subcommand]
         config["weights_only"] = True
         trainer = config["trainer"]
         trainer["default_root_dir"] = trainer["default_root_dir"] or "runs/default"
+        check_folder("--trainer.default_root_dir", Path(trainer["default_root_dir"]))
+        if self.subcommand != "fit":
+            if not config["ckpt_path"]:
+                raise ConfigError(
+                    "--ckpt_path is missing, so the model would be an untrained one: give best or last, of"
+                    f" {trainer['default_root_dir']}, or a checkpoint's file."
+                )
+            if config.get("verbose"):
+                config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
         for saver in ("checkpoint", "resume"):
             folder = Path(trainer["default_root_dir"]) / "checkpoints"
@@ -130,28 +150,44 @@ class EmulatorCLI(LightningCLI):
         check_endless_batches(self.trainer)
         resumed = self._load_checkpoint()
         if resumed is not None:
-            self.model.check_optimizer(resumed)
+            self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated
+        elif self.config_init[self.subcommand].get("start_from"):
+            self._load_initial_weights(str(self.config_init[self.subcommand]["start_from"]))
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         self.locks.append(self.run_folder.lock())
         if resumed is None:
             self.run_folder.check_new()
+        self._print_start()
+        sys.stdout.write(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
+        sys.stdout.flush()
+
+    def _print_start(self) -> None:
+        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
+            return
         weights = sum(parameter.numel() for parameter in self.model.emulator.parameters())
         sys.stdout.write(
             f"Data: {self.datamodule.description}. Model: {type(self.model.emulator.recipe.processor).__name__},"
             f" {weights:,} parameters, on {device_name(self.trainer.strategy.root_device)}.\n"
-            f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n"
         )
         sys.stdout.flush()
 
     def before_validate(self) -> None:
         self._load_checkpoint()
+        self._print_start()
 
-    def before_test(self) -> None:
-        self._load_checkpoint()
+    before_test = before_predict = before_validate
 
-    def before_predict(self) -> None:
-        self._load_checkpoint()
+    def _load_initial_weights(self, name: str) -> None:
+        """Give the model the weights and statistics of another one, over the data's scene.
+
+        Raises:
+            ConfigError: naming the parts in which the two differ.
+        """
+        own = self.model.emulator
+        found = load_model(name).emulator.over(own.scene)
+        check_same_recipe(found.recipe.to_dict(), own.recipe)
+        own.load_state_dict(found.state_dict())
 
     def _load_checkpoint(self) -> dict[str, Any] | None:
         """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""
@@ -210,9 +246,10 @@ def run_command(words: list[str], found: list[str]) -> int:
         found: The same with the configuration files' paths.
 
     Returns:
-        The exit status: 2 for an option or key that cannot be.
+        The exit status.
 
     Raises:
+        UsageError: for an option or key that cannot be.
         ConfigError: if Lightning refuses the configuration.
         KeyboardInterrupt: at SIGINT and SIGTERM, saying how to go on.
     """
@@ -230,9 +267,6 @@ def run_command(words: list[str], found: list[str]) -> int:
                 parser_kwargs={"parser_mode": "omegaconf+"},
                 save_config_kwargs={"overwrite": True},
             )
-    except UsageError as error:
-        sys.stderr.write(f"nmpm {words[0]}: {error}\n")
-        return 2
     except MisconfigurationException as error:
         raise ConfigError(" ".join(str(error).split())) from error
     except SystemExit as ended:

@@ -86,7 +86,6 @@ def _origin(path: Path, format_name: str | None, options: Options, native: Path)
         native: A folder for conversions that are not kept.
     """
     from nmpm.data.convert import convert
-    from nmpm.data.convert.cache import native_folder
     from nmpm.data.format import split_paths
     from nmpm.data.inspection.tolerance import convert_readable
     from nmpm.data.loading.sources import FolderSource
@@ -97,11 +96,22 @@ def _origin(path: Path, format_name: str | None, options: Options, native: Path)
         return _native_origin(path, options), []
     try:
         if format_name is None:
-            return FolderSource(native_folder(path, options)), []
+            return _converted(path, options)
         convert(path, native, format_name, options)
         return FolderSource(native), []
     except DataError as error:
         return FolderSource(native), convert_readable(path, native, format_name, options) or [str(error)]
+
+
+def _converted(path: Path, options: Options) -> tuple[FolderSource, list[str]]:
+    """A foreign dataset in the cache; a gravity that contradicts its files is left out and becomes a finding."""
+    from nmpm.data.convert.cache import native_folder
+    from nmpm.data.loading.sources import FolderSource
+
+    try:
+        return FolderSource(native_folder(path, options)), []
+    except ConfigError as error:
+        return FolderSource(native_folder(path, replace(options, gravity=None))), [str(error)]
 
 
 def _native_origin(path: Path, options: Options) -> FolderSource:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nmpm._support.writable import file_obstacle, folder_obstacle
+from nmpm._support.writable import file_obstacle, folder_obstacle, name_obstacle
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def check_folder(option: str, path: Path) -> None:
     Raises:
         ConfigError: if the path is a file, or the nearest folder that exists is not writable.
     """
+    _refuse(option, path, name_obstacle(path))
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{option} {path}: it is a file; name a folder.")
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
@@ -91,6 +92,7 @@ def check_input(option: str, path: Path) -> None:
     Raises:
         ConfigError: if it does not, or is a folder.
     """
+    _refuse(option, path, name_obstacle(path))
     if path.is_dir():
         raise ConfigError(f"{option} {path}: it is a folder; name a file in it, such as {path / 'test.h5'}.")
     if not path.is_file():

@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from nmpm.cli.options import check_input
 from nmpm.errors import ConfigError
-
-if TYPE_CHECKING:
-    from nmpm.data.format import Split, Trajectory
-    from nmpm.scene import Scene
-    from nmpm.viz import LabelledTrajectories
 
 
 def run(words: list[str]) -> None:
@@ -32,6 +23,7 @@ def run(words: list[str]) -> None:
     arguments = parser.parse_args(words[1:])
     from nmpm.data.format import Split
     from nmpm.viz import write_animation, write_snapshots
+    from nmpm.viz.files import read_labelled
     from nmpm.viz.output import check_output
 
     stem = arguments.out or arguments.file.with_suffix("")
@@ -45,40 +37,6 @@ def run(words: list[str]) -> None:
         )
     for path in (picture, video):
         check_output(path)
-    trajectories = _read(split, arguments.trajectory, arguments.family)
+    trajectories = read_labelled(split, arguments.trajectory, arguments.family)
     for path in (write_snapshots(trajectories, picture), write_animation(trajectories, video)):
         sys.stdout.write(f"wrote {path}\n")
-
-
-def _read(split: Split, index: int, family: str | None) -> LabelledTrajectories:
-    from nmpm.viz import LabelledTrajectories, material_names
-
-    trajectory = split.read(index)
-    scene, names, static = _describe(split, trajectory, family)
-    moving = ~np.isin(trajectory.particle_type, sorted(static))
-    label = "prediction" if "predicted" in str(trajectory.attributes.get("generator", "")) else "recorded"
-    return LabelledTrajectories(
-        positions={label: trajectory.position[:, moving]},
-        material=material_names(trajectory.particle_type[moving], names),
-        bounds=scene.bounds,
-        dt=scene.dt,
-        domain=scene.domain,
-        obstacle=trajectory.position[0, ~moving],
-        periodic=scene.periodic,
-        gravity=scene.gravity,
-    )
-
-
-def _describe(split: Split, trajectory: Trajectory, family: str | None) -> tuple[Scene, dict[int, str], frozenset[int]]:
-    """Scene, names of the type ids and static ids: from a rollout's own attributes, otherwise from metadata.json."""
-    from nmpm.data.format import read_metadata
-    from nmpm.data.scene_inference import infer_scene
-    from nmpm.scene import Scene
-
-    if "scene" in trajectory.attributes:
-        names = json.loads(trajectory.attributes["particle_types"])
-        static = frozenset(int(index) for index in trajectory.attributes["static_types"])
-        scene = Scene.from_dict(json.loads(trajectory.attributes["scene"]))
-        return scene, {int(index): name for index, name in names.items()}, static
-    metadata = read_metadata(split.path.parent, family)
-    return infer_scene(split.path.parent, family), dict(metadata.particle_types), metadata.static_types

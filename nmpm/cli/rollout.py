@@ -113,6 +113,7 @@ def _family(model: Pretrained) -> str | None:
 def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
     """Predict, and write the two frames of the start and the prediction, with what is needed to draw them."""
     import torch
+    from rich.console import Console
     from rich.progress import track
 
     from nmpm.data.format import write_split
@@ -123,7 +124,10 @@ def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> N
     count, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
     bundles = stream(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
     # On the CPU, as a device may have less memory than a long rollout needs.
-    positions = [bundle.cpu() for bundle in track(bundles, "rollout", total=count, transient=True)]
+    shown = track(
+        bundles, "rollout", count, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
+    )
+    positions = [bundle.cpu() for bundle in shown]
     origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
     predicted = predicted_trajectory(model.scene, state.to("cpu"), torch.cat(positions, dim=1), origin)
     write_split(chosen.out, [predicted])

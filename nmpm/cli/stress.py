@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import add_device_option, add_model_options, check_device
+from nmpm.cli.options import add_device_option, add_model_options, check_device, check_folder
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,8 +24,8 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["stress", "goop"]."""
     chosen = _parser().parse_args(words[1:])
     check_device(chosen.device)
-    if chosen.report is not None and chosen.report.exists() and not chosen.report.is_dir():
-        raise ConfigError(f"--report {chosen.report} is a file: give a folder.")
+    if chosen.report is not None:
+        check_folder("--report", chosen.report)
     from nmpm.evaluation.stress import FULL, GROUPS, QUICK
 
     unknown = sorted(set(chosen.groups or ()) - set(GROUPS))

@@ -1,31 +1,31 @@
-"""`nmpm fit | validate | test | predict`: files are checked before Lightning, which takes seconds, is imported."""
+"""`nmpm fit | validate | test | predict`: names and paths are checked before Lightning is imported."""
 
 from __future__ import annotations
 
-from itertools import pairwise
-from pathlib import Path
+import sys
 
 from nmpm._support.shipped import find_config
-from nmpm.errors import ConfigError
-
-FILES = {"--data.path": "dataset", "--ckpt_path": "checkpoint"}
-NOT_FILES = ("last", "best", "null")
+from nmpm.cli.early_checks import UsageError, check_command
 
 
 def run(words: list[str]) -> int:
     """Run a training command, e.g. ["fit", "--config", "goop.yaml"].
 
     Returns:
-        The exit status.
+        The exit status: 2 for an option or key that cannot be.
 
     Raises:
         ConfigError: if a file that an option names does not exist.
     """
     found = with_shipped_configs(words)
-    check_files(found)
-    from nmpm.cli.emulator_cli import run_command
+    try:
+        check_command(found)
+        from nmpm.cli.emulator_cli import run_command
 
-    return run_command(words, found)
+        return run_command(words, found)
+    except UsageError as error:
+        sys.stderr.write(f"nmpm {words[0]}: {error}\n")
+        return 2
 
 
 def with_shipped_configs(words: list[str]) -> list[str]:
@@ -41,16 +41,3 @@ def with_shipped_configs(words: list[str]) -> list[str]:
         elif word.startswith("--config="):
             found[index] = f"--config={find_config(word.removeprefix('--config='))}"
     return found
-
-
-def check_files(words: list[str]) -> None:
-    """Make sure that dataset and checkpoint exist.
-
-    Raises:
-        ConfigError: naming the option.
-    """
-    options = dict(pairwise(words)) | dict(word.split("=", 1) for word in words if "=" in word)
-    for option, kind in FILES.items():
-        value = options.get(option)
-        if value is not None and value not in NOT_FILES and not Path(value).exists():
-            raise ConfigError(f"{option} {value}: there is no such {kind}.")

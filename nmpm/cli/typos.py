@@ -10,6 +10,7 @@ from typing import NoReturn
 
 from lightning.pytorch.cli import LightningArgumentParser
 
+from nmpm.cli.early_checks import UsageError
 from nmpm.decoders import Decoder
 from nmpm.processors import Processor
 from nmpm.transfer import Transfer
@@ -17,10 +18,6 @@ from nmpm.transfer import Transfer
 PARTS = {"processor": Processor, "transfer": Transfer, "decoder": Decoder}
 LONGEST = 300
 """Characters of a message of jsonargparse's that are shown."""
-
-
-class UsageError(Exception):
-    """An option or key that does not exist, or a value of the wrong kind; the message is one line."""
 
 
 class BriefParser(LightningArgumentParser):

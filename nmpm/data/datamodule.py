@@ -13,7 +13,7 @@ from lightning.pytorch import LightningDataModule
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.pinning import pin_for
-from nmpm.data.loading.sources import DataSource, EmbeddedSource, FolderSource, HubSource, SimulatedSource, StatedFacts
+from nmpm.data.loading.sources import DataSource, FolderSource, HubSource, StatedFacts
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
@@ -239,10 +239,13 @@ def _make_source(
 ) -> DataSource:
     if path is not None:
         return FolderSource(Path(path), stated)
+    if source == "hub":
+        return HubSource(Path(str(name)), stated)
+    from nmpm.data.loading.simulated_sources import EmbeddedSource, SimulatedSource
+
     sources: dict[str, Callable[[str], DataSource]] = {
         "disk": lambda known: EmbeddedSource(known, generate),
         "simulate": lambda known: SimulatedSource(known, generate),
-        "hub": lambda known: HubSource(Path(known), stated),
     }
     return sources[source](str(name))
 

@@ -8,8 +8,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from nmpm._support.limits import EXPANSION, expansion_limit
+from nmpm._support.shipped import user_home
 from nmpm.data.archive_errors import ZIP_ERRORS
-from nmpm.data.catalog import dataset_home
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import SPLITS
 from nmpm.errors import ConfigError, DataError
@@ -38,7 +38,7 @@ def hub_folder(name: str) -> Path:
     archives = sorted(downloaded.rglob("*.zip"))
     if not archives:
         return downloaded
-    unpacked = dataset_home() / "hub" / repository.replace("/", "--") / (folder or "all")
+    unpacked = user_home() / "hub" / repository.replace("/", "--") / (folder or "all")
     with lock_folder(unpacked.parent):
         if not unpacked.is_dir():
             _unpack(downloaded, archives, unpacked)

@@ -50,7 +50,7 @@ def infer_scene(
     stated = read_metadata(folder, family)
     metadata = _override(stated, gravity, boundary, bounds)
     if gravity is not None:
-        _check_gravity(metadata.gravity, stated.gravity, folder / METADATA_FILE)
+        check_gravity(metadata.gravity, stated.gravity, folder / METADATA_FILE)
     split = _reference_split(folder)
     if split.dim != metadata.dim:
         raise DataError(
@@ -62,7 +62,7 @@ def infer_scene(
     gravities = _gravities(split, metadata)
     if gravity is not None:
         for found in gravities:
-            _check_gravity(metadata.gravity, found, split.path)
+            check_gravity(metadata.gravity, found, split.path)
     materials = _materials(types, metadata, split)
     return Scene(
         bounds=widened,
@@ -98,7 +98,12 @@ def _override(
     return metadata
 
 
-def _check_gravity(given: tuple[float, ...] | None, stated: tuple[float, ...] | None, path: Path) -> None:
+def check_gravity(given: tuple[float, ...] | None, stated: tuple[float, ...] | None, path: Path) -> None:
+    """Compare a user's gravity with that of a file, if it states one.
+
+    Raises:
+        ConfigError: naming both, if they differ.
+    """
     if stated is not None and not (len(given or ()) == len(stated) and np.allclose(given or (), stated, atol=1e-6)):
         raise ConfigError(
             f"gravity = {list(given or ())} contradicts {path}, which states gravity {list(stated)}. Leave the option"

@@ -1,7 +1,17 @@
 """The emulator: its recipe, the network between p2g and g2p, what its rollouts are held to, and rollouts themselves."""
 
+from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.model import Bundle, Emulator, RolloutContext
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.rollouts import rollout, stream, unroll
 
-__all__ = ["Bundle", "Emulator", "EmulatorRecipe", "RolloutContext", "rollout", "stream", "unroll"]
+__all__ = [
+    "Bundle",
+    "Emulator",
+    "EmulatorRecipe",
+    "RolloutContext",
+    "differentiable_rollout",
+    "rollout",
+    "stream",
+    "unroll",
+]

@@ -17,15 +17,18 @@ from nmpm.emulator.constraints import (
     BOUNDS,
     Constraints,
     affordable,
+    affordable_share,
     at_rest,
     check_within_bounds,
     energy,
 )
-from nmpm.emulator.contact import Contact
+from nmpm.emulator.contact import SURFACE, Contact
+from nmpm.emulator.crowding import Crowding
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
 from nmpm.transfer.chunks import can_branch, chunks
+from nmpm.transfer.linear import linear_g2p
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,30 @@ class Advection:
             still = at_rest(flight.cells, path, self.constraints.rest_speed, flight.gravity)
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
         return self._check_bounds(path)
+
+    def uncrowded_path(self, flight: Flight, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
+        """A constrained path (B, m, N, D) whose overfull cells at the end have been spread, evenly over its frames.
+
+        Args:
+            flight: What it started from.
+            path: (B, m, N, D) from `constrained_path`.
+            solid: As for `constrained_path`.
+            budget: As for `constrained_path`.
+        """
+        volume = self.scene.particle_volume / self.grid.cell_volume
+        taken = solid if solid.shape[1] else self.walls.expand(1, 1, *self.grid.shape)
+        crowding = Crowding(self.constraints.density_cap, volume, 1 - taken, self.grid)
+        shift = crowding.shift(path[:, -1], flight.share > 0)
+        if shift is None:
+            return path
+        frames = path.shape[1]
+        ramp = torch.arange(1, frames + 1, device=path.device, dtype=path.dtype).view(-1, 1, 1) / frames
+        spread = self._confine(path + ramp * shift.unsqueeze(1))
+        if self.constraints.solids and self.scene.obstacles:
+            depth = linear_g2p(self._obstacle_share(solid).to(path.dtype), spread.flatten(1, 2), self.grid)
+            blocked = (depth > SURFACE).unflatten(1, path.shape[1:3]).any(1, keepdim=True)
+            spread = torch.where(blocked, path, spread)
+        return spread if budget is None else self._afford_spread(flight, path, spread, budget)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
@@ -187,9 +214,30 @@ class Advection:
         """The path (B, m, N, D), clear of obstacles."""
         if not (self.constraints.solids and self.scene.obstacles):
             return path
+        return self._confine(Contact(self._obstacle_share(solid), self.grid).hold(flight.cells, path))
+
+    def _obstacle_share(self, solid: Tensor) -> Tensor:
+        """Share of each cell's room between the walls that is obstacle, (B, 1, *S)."""
         room = 1 - self.walls
-        share = torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
-        return self._confine(Contact(share, self.grid).hold(flight.cells, path))
+        return torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
+
+    def _afford_spread(self, flight: Flight, path: Tensor, spread: Tensor, budget: Tensor) -> Tensor:
+        """The largest part of the way from path to spread (B, m, N, D) that no frame's energy (B,) forbids.
+
+        The state after the bundle, which keeps the path's velocity, counts as a further frame.
+        """
+        after = self._spread_energies(flight, path, spread)
+        if can_branch(budget) and not bool((after > budget.unsqueeze(1)).any()):
+            return spread
+        share = affordable_share(self._spread_energies(flight, path, path), after, budget)[:, None, None, None]
+        return torch.where(share < 1, path + share * (spread - path), spread)
+
+    def _spread_energies(self, flight: Flight, path: Tensor, spread: Tensor) -> Tensor:
+        """(B, m + 1) energies of the frames of a spread path, and of its end with the velocity of the path's end."""
+        before = path[:, -2] if path.shape[1] > 1 else flight.cells
+        place, step, gravity = self.grid.isotropic_units(spread[:, -1], path[:, -1] - before, flight.gravity)
+        end = energy(place, step, gravity, flight.share)
+        return torch.cat([self._energies(flight, spread), end.unsqueeze(1)], dim=1)
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""

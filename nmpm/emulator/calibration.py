@@ -10,11 +10,15 @@ from torch import Tensor
 
 from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.model import UNLIMITED, Emulator
-from nmpm.emulator.rasterise import grid_state
+from nmpm.emulator.rasterise import grid_state, volume_fraction
 from nmpm.particles import Window
+from nmpm.transfer import Linear
 
 _MARGIN = 0.5
 """Inputs are clipped to the sampled range, widened by this fraction of it on either side."""
+
+_FULL = 0.995
+"""Share of the occupied cells that are not fuller than the density cap."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,32 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     scale = torch.cat([_root_mean_square(parts) for parts in materials], dim=-1)
     emulator.output_scale.copy_(_nonzero(scale).reshape_as(emulator.output_scale))
     emulator.calibrated.fill_(True)
+
+
+@torch.no_grad()
+def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
+    """The volume fraction that the fullest 0.5% of the occupied cells exceed, for `Constraints.density_cap`.
+
+    Cells that are half solid or less than half full do not count. The value is read back from the device.
+
+    Args:
+        emulator: Gives scene and grid.
+        windows: Of training data, drawn from whole trajectories, as crowding grows while material settles.
+
+    Raises:
+        ValueError: if no cell is half full.
+    """
+    found = []
+    for window in (window.to(emulator.device) for window in windows):
+        start, grid = window.initial, emulator.grid
+        taken = emulator.solid(start)
+        room = 1 - (taken if taken.shape[1] else emulator.walls)
+        full = volume_fraction(emulator.scene, grid, Linear(), window.mask, grid.to_cells(window.target[:, -1]))
+        found.append((full / room.clamp(min=0.5))[(full > 0.5) & (room > 0.5)])
+    filled = torch.cat(found).sort().values
+    if not len(filled):
+        raise ValueError("No cell of the windows is half full: the density cap cannot be measured.")
+    return float(filled[min(len(filled) - 1, int(_FULL * len(filled)))])
 
 
 def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:

@@ -9,6 +9,7 @@ each axis, as cells need not be square.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -87,21 +88,26 @@ class Constraints:
             freely, stay where they are. Set it to the speed that the model predicts in material that is at rest.
         solids: Particles do not enter obstacles.
         bounds: Rule for particles that would leave the scene's bounds, one of `BOUNDS`; in training too.
+        density_cap: Volume fraction above which the particles of a cell spread into the room around it, after each
+            bundle; 0 for no cap. `nmpm.emulator.calibration.density_cap` measures it in data.
 
     Raises:
-        ConfigError: if the speed is negative, or the bounds' rule unknown.
+        ConfigError: if the speed or the cap is negative or not finite, or the bounds' rule unknown.
     """
 
     energy: bool = False
     rest_speed: float = 0.0
     solids: bool = True
     bounds: str = "stop"
+    density_cap: float = 0.0
 
     def __post_init__(self) -> None:
         if self.bounds not in BOUNDS:
             raise ConfigError(f"constraints.bounds = {self.bounds!r} is not one of {', '.join(BOUNDS)}.")
         if not self.rest_speed >= 0:
             raise ConfigError(f"constraints.rest_speed = {self.rest_speed} must not be negative.")
+        if not 0 <= self.density_cap < math.inf:
+            raise ConfigError(f"constraints.density_cap = {self.density_cap} must be 0, for no cap, or more.")
 
 
 def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> Tensor:
@@ -193,6 +199,24 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
     exceeds = both[:, 1] + excess > 0
     applies = exceeds.unsqueeze(1) & (gains | ~suffices.unsqueeze(1))
     return torch.where(applies, chosen.unsqueeze(1), 1.0).unsqueeze(-1)
+
+
+def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
+    """The part of the way between two paths that each scene can afford, as energy is convex in it.
+
+    Args:
+        before: (B, F) energies at its beginning.
+        after: (B, F) energies at its end.
+        budget: (B,) energy that is allowed.
+
+    Returns:
+        (B,) from 0 to 1; exactly 1 where the end is within the budget.
+    """
+    exceeds = after > budget.unsqueeze(1)
+    rise = torch.where(exceeds, after - before, 1.0)
+    room = (budget.unsqueeze(1) - before).clamp(min=0)
+    possible = torch.where(rise > 0, room / torch.where(rise > 0, rise, 1.0), 0.0)
+    return torch.where(exceeds, possible, 1.0).amin(1)
 
 
 def _gains(cells: Tensor, step: Tensor, before: Tensor, work: Tensor) -> Tensor:

@@ -233,6 +233,9 @@ class Emulator(nn.Module):
             else:
                 path = advection.constrained_path(flight, context.solid, context.budget)
             steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
+            if self.constraints.density_cap and not self.training:
+                # Spreading is no motion of the material: the velocity is that of the path without it.
+                path = advection.uncrowded_path(flight, path, context.solid, context.budget)
             precision = particles.position.dtype
             return Bundle(
                 position=self.grid.to_length(path.to(precision)),

@@ -9,6 +9,7 @@ from nmpm.processors.convnext import ConvNeXt
 from nmpm.processors.ffno import FFNO
 from nmpm.processors.fno import FNO, TFNO
 from nmpm.processors.identity import Identity
+from nmpm.processors.patched import Patched
 from nmpm.processors.pointwise import Pointwise
 from nmpm.processors.unet import UNet
 from nmpm.processors.unet_modern import UNetModern
@@ -22,6 +23,7 @@ __all__ = [
     "GridLayout",
     "GridProcessor",
     "Identity",
+    "Patched",
     "Pointwise",
     "Processor",
     "UNet",

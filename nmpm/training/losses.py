@@ -1,14 +1,58 @@
-"""Training losses: the squared error of positions, and beside it that of the density that they make on the grid."""
+"""Training losses: the squared error of positions, and beside it that of the density that they make on the grid.
+
+Position errors may be tempered: those of each window and bundle raised to a power below 1, so that splashes, whose
+errors nothing can reduce much, do not drown what can be learnt elsewhere.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
+
+_FLOOR = 1e-4
+"""Cells², added to errors before they are raised to a power: below a hundredth of a cell errors no longer count."""
+
+
+@dataclass(frozen=True)
+class TrainingError:
+    """What a training minimises: the position error, with the density error at the last frame of each bundle.
+
+    Args:
+        density_weight: Weight of the density error beside the position error in cells².
+        power: In (0, 1]; below 1, the position error of each window and bundle is raised to it before the mean; the
+            density error, which keeps the volume of splashes, is not.
+
+    Raises:
+        ConfigError: if the power is not in that range.
+    """
+
+    density_weight: float = 0.0
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.power <= 1:
+            raise ConfigError(f"model.error_power = {self.power} must be above 0 and at most 1.")
+
+    def __call__(self, predicted: Tensor, window: Window, scene: Scene, grid: Grid, frames: int) -> Tensor:
+        """The error () of predicted positions (B, K m, N, D), m frames to a bundle, as a mean over particles."""
+        target = window.target[:, : predicted.shape[1]]
+        last = slice(frames - 1, None, frames)
+        if self.power == 1:
+            error = position_error(predicted, target, window.mask, grid)
+        else:
+            errors = position_errors(predicted, target, window.mask, grid, frames)
+            error = tempered_error(errors, window.mask, self.power)
+        if not self.density_weight:
+            return error
+        return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:
@@ -30,6 +74,33 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
         raise ValueError(f"Predicted {tuple(predicted.shape)} and target {tuple(target.shape)} positions do not match.")
     squared = grid.to_cell_displacement(predicted - target).square() * mask[:, None, :, None]
     return squared.sum() / (mask.sum() * predicted.shape[1] * predicted.shape[3])
+
+
+def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
+    """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames); NaN for empty ones.
+
+    Args:
+        predicted: (B, T, N, D) positions in domain length.
+        target: (B, T, N, D), likewise.
+        mask: (B, N) bool, False for padding.
+        grid: Gives the cells' size.
+        frames: m; T is a multiple of it.
+    """
+    squared = grid.to_cell_displacement(predicted - target).square().mean(-1) * mask.unsqueeze(1)
+    bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
+    return bundles.mean(-1) / mask.sum(1, keepdim=True)
+
+
+def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:
+    """Mean over real particles and bundles of (error + floor) ** power, the error that of a particle's window.
+
+    Args:
+        errors: (B, K) of each window and bundle, in cells².
+        mask: (B, N) bool, False for padding.
+        power: 0.5 for root mean squares.
+    """
+    count = mask.sum(1, keepdim=True)
+    return ((errors + _FLOOR).pow(power) * count).sum() / (count.sum() * errors.shape[1])
 
 
 def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:

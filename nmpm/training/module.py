@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.collectives import global_mean, normal_like, rank_slice
 from nmpm._support.digests import weights_digest
@@ -21,6 +21,7 @@ from nmpm._support.specs import class_path
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
+from nmpm.emulator.gradients import recomputing_unroll
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
@@ -29,9 +30,15 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirror_windows
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.losses import density_error, position_error
+from nmpm.training.losses import TrainingError
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
-from nmpm.training.parts import check_same_optimizer, check_same_recipe, check_same_scene
+from nmpm.training.parts import (
+    adopt_optimizer_arguments,
+    changed_arguments,
+    check_same_optimizer,
+    check_same_recipe,
+    check_same_scene,
+)
 from nmpm.training.schedules import Schedule
 
 CALIBRATION_BATCHES = 4
@@ -47,6 +54,8 @@ class EmulatorModule(LightningModule):
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error in cells².
+        error_power: Power, in (0, 1], to which the position error of each window and bundle is raised before the mean.
+            At 0.5, calm windows and early bundles weigh as much as splashes.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
@@ -66,6 +75,7 @@ class EmulatorModule(LightningModule):
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         density_weight: float = 0.0,
+        error_power: float = 1.0,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
         metrics: Sequence[RolloutMetric] | None = None,
@@ -83,7 +93,8 @@ class EmulatorModule(LightningModule):
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
-        self.density_weight, self.position_noise, self.mirror = density_weight, position_noise, tuple(mirror)
+        self.error = TrainingError(density_weight, error_power)
+        self.position_noise, self.mirror = position_noise, tuple(mirror)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
         plain = self.emulator.recipe.to_dict()
@@ -93,6 +104,7 @@ class EmulatorModule(LightningModule):
             "unroll_growth": unroll_growth,
             "schedule": dataclasses.asdict(self.schedule),
             "density_weight": density_weight,
+            "error_power": error_power,
             "position_noise": position_noise,
             "mirror": list(mirror),
             "recompute": recompute,
@@ -151,21 +163,35 @@ class EmulatorModule(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Compare the checkpoint with this model, and with its optimizer if a training goes on.
 
+        A training goes on with this model's arguments; those that the checkpoint has otherwise are logged.
+
         Raises:
             ConfigError: if a newer version wrote it, or a part differs.
         """
         check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
         check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
         if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
-            self.check_optimizer(checkpoint)
+            changed = self.adopt_arguments(checkpoint)
+            if changed:
+                step = checkpoint.get("global_step")
+                rank_zero_info(f"Going on from step {step} with changed arguments: {'; '.join(changed)}.")
 
-    def check_optimizer(self, checkpoint: Mapping[str, Any]) -> None:
-        """Make sure that a training can go on with a checkpoint's optimizer state.
+    def adopt_arguments(self, checkpoint: Mapping[str, Any]) -> list[str]:
+        """Make a training go on from a checkpoint with this model's arguments, those of its optimizer among them.
+
+        Args:
+            checkpoint: Changed in place.
+
+        Returns:
+            What differs, such as "model.optimizer.lr = 0.001 (was 0.003)".
 
         Raises:
-            ConfigError: if it is of another optimizer.
+            ConfigError: if its optimizer state is of another optimizer.
         """
-        check_same_optimizer(checkpoint, build_optimizer(self.make_optimizer, self.emulator.parameters()))
+        optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
+        check_same_optimizer(checkpoint, optimizer)
+        changed = changed_arguments(checkpoint["hyper_parameters"], dict(self.hparams))
+        return changed + adopt_optimizer_arguments(checkpoint, optimizer)
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Seed the batch's random numbers by its index, so that a resumed run repeats them.
@@ -192,14 +218,9 @@ class EmulatorModule(LightningModule):
 
     def _error(self, predicted: Tensor, batch: Window) -> Tensor:
         """The error of predicted positions (B, K m, N, D), in float32 whatever autocast says."""
-        emulator, target = self.emulator, batch.target[:, : predicted.shape[1]]
-        error = position_error(predicted, target, batch.mask, emulator.grid)
-        if not self.density_weight:
-            return error
-        last = slice(emulator.frames - 1, None, emulator.frames)
+        emulator = self.emulator
         with torch.autocast(predicted.device.type, enabled=False):
-            density = density_error(predicted[:, last], target[:, last], batch, emulator.scene, emulator.grid)
-        return error + self.density_weight * density
+            return self.error(predicted, batch, emulator.scene, emulator.grid, emulator.frames)
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:
         self.valid_errors.update(batch, self.predict_step(batch, batch_idx))
@@ -254,14 +275,7 @@ class EmulatorModule(LightningModule):
         return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
 
     def _unroll(self, particles: Particles, count: int) -> Iterator[Bundle]:
-        if not self.recompute:
-            yield from unroll(self.emulator, particles, count)
-            return
-        context = self.emulator.context(particles)
-        for _ in range(count):
-            bundle: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
-            yield bundle
-            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        return (recomputing_unroll if self.recompute else unroll)(self.emulator, particles, count)
 
     def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:

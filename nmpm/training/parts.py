@@ -8,6 +8,7 @@ from typing import Any
 
 from torch.optim import Optimizer
 
+from nmpm._support.plain_data import to_lists
 from nmpm._support.specs import class_path
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
@@ -15,6 +16,9 @@ from nmpm.scene import Scene
 
 COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
 """Parts of a recipe that its weights were trained for; constraints and noise may change."""
+
+UNREPORTED = ("scene", "format", "recompute", "compile")
+"""Hyperparameters that `changed_arguments` leaves out: compared elsewhere, or without influence on the result."""
 
 
 def check_same_scene(mine: Scene, theirs: Scene, data: str = "the data's") -> None:
@@ -51,7 +55,11 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], mine: EmulatorRecipe)
     stored = EmulatorRecipe.from_dict({name: value for name, value in hyper_parameters.items() if name in names})
     check_same_scene(stored.scene, mine.scene)
     theirs, ours = stored.to_dict(), mine.to_dict()
-    found = [line for name in COMPARED for line in _differences(theirs[name], ours[name], f"model.{name}")]
+    found = [
+        f"{name} = {old}, not {new}"
+        for part in COMPARED
+        for name, old, new in _differences(theirs[part], ours[part], f"model.{part}")
+    ]
     if found:
         raise ConfigError(
             f"The checkpoint has {'; '.join(found)}. Give the checkpoint's values, or train the new form in another"
@@ -79,15 +87,63 @@ def check_same_optimizer(checkpoint: Mapping[str, Any], optimizer: Optimizer) ->
         )
 
 
-def _differences(theirs: Any, mine: Any, name: str) -> Iterator[str]:
-    """`name = theirs, not mine` for each value that differs; classes that differ stand for their arguments."""
+def changed_arguments(stored: Mapping[str, Any], mine: Mapping[str, Any]) -> list[str]:
+    """What a training goes on with that its checkpoint was made without, such as "model.unroll = 4 (was 2)".
+
+    Args:
+        stored: Hyperparameters of the checkpoint.
+        mine: Those of the model that goes on from it; `check_same_recipe` has compared the parts.
+    """
+    names = [name for name in mine if name in stored and name not in (*COMPARED, *UNREPORTED)]
+    return [
+        f"{name} = {new} (was {old})"
+        for argument in names
+        for name, old, new in _differences(stored[argument], mine[argument], f"model.{argument}")
+    ]
+
+
+def adopt_optimizer_arguments(checkpoint: Mapping[str, Any], optimizer: Optimizer) -> list[str]:
+    """Replace the optimizer's arguments in a checkpoint by those of an optimizer, and keep its state.
+
+    Without it, the arguments of a resumed training would silently be the checkpoint's, whatever the user gives. The
+    learning rate keeps its place in the schedule.
+
+    Args:
+        checkpoint: Changed in place.
+        optimizer: Of the same kind as the checkpoint's.
+
+    Returns:
+        What has changed, such as "model.optimizer.lr = 0.001 (was 0.003)".
+    """
+    states, schedules = checkpoint.get("optimizer_states") or [], checkpoint.get("lr_schedulers") or []
+    if not states:
+        return []
+    changed: dict[str, None] = {}
+    for stored, mine in zip(states[0]["param_groups"], optimizer.param_groups, strict=False):
+        for name in sorted(optimizer.defaults.keys() & stored.keys() & mine.keys()):
+            kept, new = "initial_lr" if name == "lr" and "initial_lr" in stored else name, mine[name]
+            if to_lists(stored[kept]) == to_lists(new):
+                continue
+            changed[f"model.optimizer.{name} = {new} (was {stored[kept]})"] = None
+            if kept == "initial_lr":
+                stored["lr"] *= new / stored[kept]
+            stored[kept] = new
+    rates = [group["initial_lr"] for group in states[0]["param_groups"] if "initial_lr" in group]
+    for schedule in schedules:
+        if rates and len(schedule.get("base_lrs", ())) == len(rates):
+            schedule["base_lrs"] = rates
+    return list(changed)
+
+
+def _differences(theirs: Any, mine: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
+    """(name, theirs, mine) for each value that differs; classes that differ stand for their arguments."""
     if theirs == mine:
         return
     if not (isinstance(theirs, Mapping) and isinstance(mine, Mapping)):
-        yield f"{name} = {theirs}, not {mine}"
+        yield name, theirs, mine
     elif theirs.get("class_path") != mine.get("class_path"):
-        yield f"{name} = {theirs.get('class_path')}, not {mine.get('class_path')}"
+        yield name, theirs.get("class_path"), mine.get("class_path")
     else:
-        for key in theirs:
+        for key in {**theirs, **mine}:
             inner = name if key == "init_args" else f"{name}.{key}"
-            yield from _differences(theirs[key], mine.get(key), inner)
+            yield from _differences(theirs.get(key), mine.get(key), inner)

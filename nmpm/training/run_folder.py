@@ -53,12 +53,13 @@ class RunFolder:
         """Make sure that no run is written over.
 
         Raises:
-            ConfigError: if there is a checkpoint, a report or a log with figures.
+            ConfigError: if there is a checkpoint or a report. (A run that was killed before its first checkpoint leaves
+                logs alone: there is nothing to lose, and the next run logs beside them.)
         """
         last = self.checkpoints["last"]
         folders = {path.parent for path in self.checkpoints.values()}
         old = [path for folder in folders for path in folder.glob("*.ckpt")]
-        old += [path for path in (self.root / "report.json", *self.root.glob("logs/*/metrics.csv")) if path.is_file()]
+        old += [path for path in [self.root / "report.json"] if path.is_file()]
         if old:
             resume = "Go on with it by adding --ckpt_path last, or choose" if last.is_file() else "Remove it, or choose"
             raise ConfigError(

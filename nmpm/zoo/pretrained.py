@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, rollout
+from nmpm.emulator import Emulator, differentiable_rollout, rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -145,3 +145,13 @@ class Pretrained:
             (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
         """
         return rollout(self.emulator, state.to(self.emulator.device), frames)
+
+    def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
+        """Predict with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
+
+        Memory grows by one state per bundle; backward passes compute each bundle again.
+
+        Returns:
+            (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
+        """
+        return differentiable_rollout(self.emulator, state.to(self.emulator.device), frames)

@@ -44,11 +44,28 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
         ZooError: if the run is not finished, a report cannot be read, the name is taken, or the folder cannot be
             written or is part of the installed package.
     """
+    target = _target(check_name(name), root)
+    _publish(run, name, target, about)
+    return target
+
+
+def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
+    """Like `add`, in place of the entry `root/name` where there is one."""
+    target = _writable_zoo(root) / check_name(name)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".replaced-", dir=root) as old:
+        _publish(run, name, Path(old) / "new", about)
+        if target.exists():
+            os.replace(target, Path(old) / "old")
+        os.replace(Path(old) / "new", target)
+    return target
+
+
+def _publish(run: Path, name: str, target: Path, about: str) -> None:
     checkpoint, report = run / BEST, run / "report.json"
     for needed in (checkpoint, report):
         if not needed.is_file():
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
-    target = _target(check_name(name), root)
     emulator = load_module(checkpoint).emulator
     weights = save({key: value.contiguous() for key, value in emulator.state_dict().items()})
     picture = run / "rollout.png"
@@ -64,7 +81,6 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
         _write(target, weights, texts, picture)
     except OSError as error:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
-    return target
 
 
 def _target(name: str, root: str | Path | None) -> Path:
@@ -73,14 +89,23 @@ def _target(name: str, root: str | Path | None) -> Path:
     Raises:
         ZooError: if the name is taken, or the folder is part of the installed package.
     """
-    zoo = user_zoo() if root is None else Path(root)
-    if zoo.resolve().is_relative_to(PACKAGE.resolve()):
-        raise ZooError(f"{zoo} is part of the installed package: leave --root out to add to {user_zoo()}.")
+    zoo = _writable_zoo(user_zoo() if root is None else Path(root))
     taken = [zoo / name, *([shipped_folder("zoo") / name] if root is None else [])]
     for folder in taken:
         if (folder / "card.yaml").exists():
             raise ZooError(f"{folder} exists: choose another name, or remove it first.")
     return zoo / name
+
+
+def _writable_zoo(zoo: Path) -> Path:
+    """The folder of a zoo.
+
+    Raises:
+        ZooError: if it is part of the installed package.
+    """
+    if zoo.resolve().is_relative_to(PACKAGE.resolve()):
+        raise ZooError(f"{zoo} is part of the installed package: leave --root out to add to {user_zoo()}.")
+    return zoo
 
 
 def _write(target: Path, weights: bytes, texts: Mapping[str, str], picture: Path) -> None:
@@ -107,6 +132,7 @@ def _card(name: str, about: str, figures: Mapping[str, Any], emulator: Emulator)
         "test": figures["test"],
         "per_trajectory": figures["per_trajectory"]["model"],
         "training": figures["training"],
+        **({"curve": figures["curve"]} if figures.get("curve") else {}),
         "constraints": dataclasses.asdict(emulator.constraints),
         "obstacles": emulator.scene.obstacles,
         "versions": figures["versions"],

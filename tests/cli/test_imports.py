@@ -1,9 +1,15 @@
 """What a command does not need it does not import: torch takes a second, Lightning three."""
 
+import dataclasses
+import inspect
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
+
+from nmpm import EmulatorModule, EmulatorRecipe, TrajectoryDataModule
+from nmpm.cli.early_checks import PARTS, argument_names, class_names
 
 
 @pytest.mark.parametrize(
@@ -24,3 +30,45 @@ def test_a_command_leaves_alone_what_it_does_not_need(words, unwanted, tmp_path)
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-500:]
     assert done.stdout.splitlines()[-1] == "imported []"
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--model.cels", "3"], "did you mean --model.cells?"),
+        (["--model.cels=3"], "did you mean --model.cells?"),
+        (["--config", "mine.yaml"], "unknown key model.cels; did you mean model.cells?"),
+        (["--model.processor=nmpm.processors.Unet"], "did you mean nmpm.processors.UNet?"),
+        (["--data.path", "nowhere"], "--data.path nowhere: there is no such dataset."),
+        (["--data.name", "lava"], "No embedded dataset is called 'lava'"),
+        (["--ckpt_path=nowhere.ckpt"], "--ckpt_path nowhere.ckpt: there is no such checkpoint."),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_common_mistakes_are_found_before_torch_and_lightning_are_imported(words, complaint, tmp_path):
+    (tmp_path / "mine.yaml").write_text("model: {cels: 3}\n")
+    script = (
+        f"import sys; from nmpm.cli import main; assert main({['fit', '--config', 'goop.yaml', *words]!r}); "
+        "print('imported', sorted({'torch', 'lightning'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "imported []\n"
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_names_that_are_checked_early_are_those_of_the_parts():
+    own = set(inspect.signature(EmulatorModule).parameters) - {"recipe"}
+    fields = {field.name for field in dataclasses.fields(EmulatorRecipe)}
+    assert argument_names("model") == own | fields
+    assert argument_names("data") == set(inspect.signature(TrajectoryDataModule).parameters)
+    for module in PARTS:
+        public = {name for name, kind in vars(import_module(module)).items() if isinstance(kind, type)}
+        defined = {name for name in public if vars(import_module(module))[name].__module__.startswith("nmpm.")}
+        assert defined <= class_names(module), module
+
+
+def test_simulators_and_numba_are_imported_for_simulated_data_alone():
+    script = "import sys; import nmpm.cli.emulator_cli; print(sorted({'numba', 'nmpm.sim'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

@@ -85,3 +85,15 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):
     assert re.search(r"file.*: cannot be written \(.*NMPM_HOME", json.loads(capsys.readouterr().out)["findings"][0])
     with pytest.raises(DataError, match="NMPM_HOME"):
         native_folder(tmp_path / "ramps")
+
+
+def test_a_gravity_that_contradicts_foreign_data_is_a_finding(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    folder = tmp_path / "ramps"
+    for split in ("train", "valid", "test"):
+        records.write_records(folder / f"{split}.tfrecord", records.trajectory_record(*made(frames=8)))
+    (folder / "metadata.json").write_text(json.dumps(METADATA | {"gravity": [0.0, -9.81]}))
+    assert main(["inspect", str(folder), "--no-picture", "--gravity=0,-1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "gravity = [0.0, -1.0] contradicts" in said
+    assert "which states gravity [0.0, -9.81]" in said

@@ -1,11 +1,14 @@
 import errno
 import os
+import re
 import tempfile
 
 import numpy as np
 import pytest
 
+from nmpm._support.atomic import atomic_write
 from nmpm._support.shipped import shipped_folder
+from nmpm._support.writable import file_obstacle
 from nmpm.cli import main
 from nmpm.data.format import Split
 
@@ -79,6 +82,50 @@ def test_a_read_only_folder_is_found_before_the_work(words, folder, monkeypatch,
     assert "is not writable (Read-only file system)" in capsys.readouterr().err
 
 
+LONG = "x" * 300
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["rollout", "goop", "--out", LONG + ".h5"],
+        ["rollout", "goop", "--out", f"{LONG}/a.h5"],
+        ["rollout", "goop", "--data", LONG],
+        ["export", "goop", "--out", LONG + ".onnx"],
+        ["simulate", "goop", "--out", LONG],
+        ["simulate", "goop", "--preview", LONG + ".png"],
+        ["simulate", LONG],
+        ["inspect", LONG],
+        ["inspect", ".", "--out", LONG + ".png"],
+        ["convert", LONG, "new"],
+        ["convert", ".", LONG],
+        ["render", LONG],
+        ["stress", "goop", "--report", LONG],
+        ["fit", "--config", LONG],
+        ["fit", "--config", "goop.yaml", "--data.path", LONG],
+        ["fit", "--config", "goop.yaml", "--ckpt_path", LONG],
+        ["fit", "--config", "goop.yaml", "--trainer.default_root_dir", LONG],
+    ],
+    ids=lambda words: " ".join(words).replace(LONG, "x…"),
+)
+def test_names_that_are_too_long_for_the_file_system_get_one_line_before_the_work(words, folder, capsys):
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert re.search(r"[Nn]ame (is )?too long", said.err)
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+    assert not list(folder.iterdir())
+
+
+def test_a_name_that_just_fits_is_written(tmp_path):
+    path = tmp_path / ("x" * 250 + ".h5")
+    assert file_obstacle(path) == ""
+    with atomic_write(path) as part:
+        part.write_text("written")
+    assert path.read_text() == "written"
+    assert "too long" in file_obstacle(tmp_path / ("x" * 253 + ".h5"))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -86,6 +133,11 @@ def test_a_read_only_folder_is_found_before_the_work(words, folder, monkeypatch,
         (["simulate", "goop", "--seed", "-1"], "--seed -1: it must be at least 0."),
         (["simulate", "goop", "--out", "file"], "--out file: it is a file; name a folder."),
         (["simulate", "goop", "--out", "file/new"], "is a file, not a folder"),
+        (["convert", ".", "file"], "DESTINATION file: it is a file; name a folder."),
+        (["convert", ".", "file/new"], "is a file, not a folder"),
+        (["rollout", "goop", "--out", "file/a.h5"], "--out file/a.h5: file is a file, not a folder."),
+        (["fit", "--config", "goop.yaml", "--trainer.default_root_dir", "file"], "default_root_dir file: it is a file"),
+        (["fit", "--config", "goop.yaml", "--trainer.default_root_dir", "file/a"], "is a file, not a folder"),
         (["inspect", "nowhere"], "nowhere: there is no such file or folder."),
         (["inspect", ".", "--out", "no/a.png"], "--out no/a.png: the folder no does not exist"),
         (["render", "nowhere.h5"], "FILE nowhere.h5: there is no such file."),

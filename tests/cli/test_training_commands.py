@@ -21,6 +21,8 @@ from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
 
 TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']
+SLOW = ("dambreak2d.yaml", "waterdrop3d.yaml", "wbcsph.yaml")
+"""Configurations of data whose simulation, or network in three dimensions, takes long."""
 TINY = [
     *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
     *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
@@ -45,7 +47,9 @@ def source(config: str, make_dataset) -> list[str]:
     return ["--data.path", str(make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),)))]
 
 
-@pytest.mark.parametrize("config", config_names())
+@pytest.mark.parametrize(
+    "config", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in config_names()]
+)
 def test_every_shipped_configuration_runs_to_its_report(config, make_dataset, capsys):
     data = [*source(config, make_dataset), "--trainer.default_root_dir", "run"]
     assert main(["fit", "--config", config, *TINY, *data]) == 0
@@ -180,8 +184,17 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     trained = json.loads(Path("run/report.json").read_text())["training"]
     best = torch.load("run/checkpoints/best.ckpt", weights_only=True)["callbacks"]["Report"]
     assert trained["seconds"] >= round(best["trained_seconds"], 1)
-    for command in ("validate", "test", "predict"):
+    capsys.readouterr()
+    for command, title, end in (
+        ("validate", "dataset: validation error ×10⁻³", "┘"),
+        ("test", "dataset: test error ×10⁻³", "written to run: report.json, errors.csv, rollout.png, rollout.gif"),
+        ("predict", "Data: dataset.", "written to run/predictions.h5; to draw them: nmpm render run/predictions.h5"),
+    ):
         assert main([command, *checked]) == 0
+        said = capsys.readouterr().out
+        assert title in said
+        assert said.rstrip().endswith(end)
+        assert "DataLoader" not in said  # of Lightning's own table
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == best["trained_steps"] > 0
     predictions = Split(Path("run/predictions.h5"))
     assert len(predictions) == 1
@@ -240,6 +253,17 @@ def test_mistakes_get_one_line_that_says_how_to_mend_them(words, complaint, caps
     message = capsys.readouterr().err.splitlines()[-1]
     assert re.search(complaint, message)
     assert len(message) < 600
+
+
+@pytest.mark.parametrize("command", ["validate", "test", "predict"])
+def test_an_untrained_model_is_not_judged(command, capsys):
+    assert main([command, "--config", "goop.yaml", *TINY_GOOP]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == (
+        f"nmpm {command}: --ckpt_path is missing, so the model would be an untrained one: give best or last, of"
+        " runs/goop, or a checkpoint's file.\n"
+    )
 
 
 def test_a_file_here_comes_before_the_shipped_one():

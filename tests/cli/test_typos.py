@@ -35,7 +35,7 @@ FILES = [
     ("model: {widht: 3}", "unknown key model.widht; did you mean model.processor.width?"),
     ("modle: {cells: 3}", "unknown key modle.cells; did you mean model.cells?"),
     ("model: {processor: {class_path: nmpm.processors.UNet, init_args: {widht: 3}}}", "did you mean"),
-    ("model: {cells: 3\n  a: [", "Problems parsing config"),
+    ("model: {cells: 3\n  a: [", "--config mine.yaml: it is not YAML (while parsing a flow mapping"),
 ]
 
 

@@ -116,8 +116,9 @@ def test_reproducible_sums(transfer):
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("bounds", ["stop", "reflect"])
 @pytest.mark.parametrize(("energy", "rest", "solids"), [(True, 0.0, True), (False, 0.1, True), (False, 0.0, False)])
-def test_each_constraint(name, bounds, energy, rest, solids):
-    held = {"bounds": bounds, "energy": energy, "rest_speed": rest, "solids": solids}
+@pytest.mark.parametrize("cap", [0.0, 2.0])
+def test_each_constraint(name, bounds, energy, rest, solids, cap):
+    held = {"bounds": bounds, "energy": energy, "rest_speed": rest, "solids": solids, "density_cap": cap}
     roll(emulator_of(SCENES[name], **held), window(SCENES[name]))
 
 

@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from nmpm._support.specs import from_spec, to_spec
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors import (
@@ -11,10 +12,13 @@ from nmpm.processors import (
     ConvNeXt,
     GridLayout,
     Identity,
+    Patched,
     Pointwise,
+    Processor,
     UNet,
     UNetModern,
 )
+from nmpm.processors.patched import cells_to_channels, channels_to_cells
 from nmpm.testing import ProcessorContract
 
 
@@ -50,6 +54,14 @@ class TestAxial(ProcessorContract):
     recipe = Axial(width=16, layers=2, heads=2, patch=4)
 
 
+class TestPatched(ProcessorContract):
+    recipe = Patched(UNet(width=6, depth=1, perceptron=(5,)))
+
+
+class TestPatchedOthers(ProcessorContract):
+    recipe = Patched(UNetModern(width=4, growth=(1, 2)))
+
+
 class TestIdentity(ProcessorContract):
     recipe = Identity()
 
@@ -71,6 +83,7 @@ SMALL = [
     FNO(modes=4, width=6, layers=2),
     FFNO(modes=4, width=6, layers=2),
     Axial(width=16, layers=2, heads=2, patch=4),
+    Patched(UNet(width=6, depth=1, perceptron=(5,))),
     Pointwise(hidden=(6,)),
     Identity(),
 ]
@@ -91,6 +104,30 @@ def test_a_box_twice_as_wide_is_a_grid_like_any_other(recipe):
     network = recipe.build(GridLayout(3, 2, 2, (False, False)))
     recipe.check_grid(Grid((32, 16), (0.0, 0.0), (1.0, 1.0), (False, False)))
     assert network(torch.randn(1, 3, 32, 16)).shape == (1, 2, 2, 32, 16)
+
+
+@pytest.mark.parametrize("shape", [(12,), (8, 12), (4, 8, 12)])
+@pytest.mark.parametrize("patch", [1, 2, 4])
+def test_cells_go_to_channels_of_their_patch_and_back(shape, patch):
+    grid = torch.randn(2, 3, *shape)
+    coarse = cells_to_channels(grid, patch)
+    assert coarse.shape == (2, 3 * patch ** len(shape), *(n // patch for n in shape))
+    assert torch.equal(channels_to_cells(coarse, patch), grid)
+    first = coarse[(0, slice(0, patch ** len(shape)), *(0,) * len(shape))]
+    assert torch.equal(first, grid[(0, 0, *(slice(0, patch),) * len(shape))].flatten())
+
+
+def test_a_patched_processor_is_the_same_from_yaml_and_names_bad_grids():
+    plain = {"class_path": "nmpm.processors.UNet", "init_args": {"width": 6, "depth": 2, "perceptron": [5]}}
+    recipe = Patched(plain, patch=2)
+    assert recipe == Patched(UNet(width=6, depth=2, perceptron=(5,)))
+    assert from_spec(to_spec(recipe), Processor) == recipe
+    with pytest.raises(ConfigError, match="too small for a U-Net of depth 2"):
+        recipe.check_grid(Grid((6, 64), (0.0, 0.0), (1.0, 1.0), (False, False)))
+    with pytest.raises(ConfigError, match="periodic"):
+        recipe.check_grid(Grid((20, 64), (0.0, 0.0), (1.0, 1.0), (True, False)))
+    with pytest.raises(ConfigError, match="Patched needs patches"):
+        Patched(patch=0)
 
 
 def test_pointwise_sees_only_its_own_cell():

@@ -124,14 +124,12 @@ def test_a_folder_is_trained_in_by_one_process_and_free_again_when_that_is_kille
     os.close(folder_of(tmp_path).lock())
 
 
-@pytest.mark.parametrize(
-    "left", ["checkpoints/best.ckpt", "checkpoints/last.ckpt", "report.json", "logs/a/metrics.csv"]
-)
+@pytest.mark.parametrize("left", ["checkpoints/best.ckpt", "checkpoints/last.ckpt", "report.json"])
 def test_what_a_run_left_is_not_written_over(tmp_path, left):
     folder = folder_of(tmp_path)
     folder.check_new()
     (tmp_path / "logs" / "a").mkdir(parents=True)
-    (tmp_path / "logs" / "a" / "config.yaml").touch()  # of a run that failed before its first step
+    (tmp_path / "logs" / "a" / "metrics.csv").touch()  # of a run that was killed before its first checkpoint
     folder.check_new()
     (tmp_path / left).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / left).touch()

@@ -4,9 +4,10 @@ import pytest
 import torch
 from scenes import box, cloud
 
+from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
-from nmpm.training.losses import density_error
+from nmpm.training.losses import TrainingError, density_error, position_error, position_errors
 
 
 def at(*places: tuple[float, float], cells: int = 42, materials=("goop",), material=None, mask=None):
@@ -73,3 +74,71 @@ def test_the_error_of_a_batch_is_the_mean_over_its_particles():
     fields = {f.name: torch.cat([getattr(w, f.name) for *_, w in scenes]) for f in dataclasses.fields(first)}
     together = density_error(torch.cat(moved), torch.cat([t for _, _, t, _ in scenes]), Window(**fields), scene, grid)
     torch.testing.assert_close(together, torch.stack(alone).mean())
+
+
+# ---- errors of windows, and their powers
+
+
+def calm_and_violent(frames: int = 4):
+    """Two windows of one particle that is still: scene, grid, window, and predictions 0.1 and 10 cells away."""
+    scene = box()
+    grid = Grid.of(scene, 42)
+    state = cloud(scene, batch=2, count=1)
+    still = Window.of(state)
+    window = dataclasses.replace(still, frames=state.position.unsqueeze(1).expand(-1, frames + 2, -1, -1))
+    away = grid.spacing[0] * torch.tensor([[0.1, 0.0], [10.0, 0.0]])
+    return scene, grid, window, window.target + away[:, None, None]
+
+
+def test_errors_of_windows_and_bundles_average_to_those_of_all():
+    _, grid, window, predicted = calm_and_violent()
+    errors = position_errors(predicted, window.target, window.mask, grid, 2)
+    torch.testing.assert_close(errors, torch.tensor([[0.005] * 2, [50.0] * 2]), rtol=1e-3, atol=0)
+    torch.testing.assert_close(errors.mean(), position_error(predicted, window.target, window.mask, grid))
+
+
+def test_at_power_one_half_a_calm_window_weighs_as_much_as_a_violent_one():
+    scene, grid, window, predicted = calm_and_violent()
+    shares = {}
+    for power in (1.0, 0.5):
+        scale = torch.ones(2, requires_grad=True)
+        moved = window.target + scale[:, None, None, None] * (predicted - window.target)
+        error = TrainingError(power=power)(moved, window, scene, grid, 2)
+        # d/ds of (s² e)^p is 2 p e^p at s = 1.
+        shares[power] = torch.autograd.grad(error, scale)[0]
+    torch.testing.assert_close(shares[1.0], torch.tensor([0.005, 50.0]), rtol=1e-3, atol=0)
+    torch.testing.assert_close(shares[0.5], torch.tensor([0.005, 50.0]).sqrt() / 2, rtol=2e-2, atol=0)
+
+
+def test_the_density_error_is_added_as_it_is():
+    scene, grid, window, predicted = calm_and_violent()
+    last = slice(1, None, 2)
+    density = density_error(predicted[:, last], window.target[:, last], window, scene, grid)
+    alone, both = (TrainingError(weight, 0.5)(predicted, window, scene, grid, 2) for weight in (0.0, 3.0))
+    torch.testing.assert_close(both, alone + 3 * density)
+
+
+def test_perfect_predictions_have_finite_gradients_at_any_power():
+    scene, grid, window, _ = calm_and_violent()
+    moved = window.target.clone().requires_grad_()
+    TrainingError(density_weight=1.0, power=0.1)(moved, window, scene, grid, 4).backward()
+    assert moved.grad is not None
+    assert moved.grad.isfinite().all()
+
+
+def test_padding_changes_no_tempered_error():
+    places = ((10.3, 12.1), (15.2, 11.4))
+    scene, grid, there, window = at(*places)
+    error = TrainingError(1.0, 0.5)
+    window = dataclasses.replace(window, frames=there.expand(-1, 3, -1, -1))
+    expected = error(there + 0.3 * grid.spacing[0], window, scene, grid, 1)
+    scene, grid, more, padded = at(*places, (30.0, 30.0), mask=(True, True, False))
+    padded = dataclasses.replace(padded, frames=more.expand(-1, 3, -1, -1))
+    shift = torch.tensor([0.3, 0.3, 5.0])[:, None] * grid.spacing[0]
+    torch.testing.assert_close(error(more + shift, padded, scene, grid, 1), expected)
+
+
+@pytest.mark.parametrize("power", [0.0, -1.0, 1.5])
+def test_powers_out_of_range_are_named(power):
+    with pytest.raises(ConfigError, match=r"error_power = .* above 0 and at most 1"):
+        TrainingError(power=power)

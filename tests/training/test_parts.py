@@ -66,13 +66,44 @@ def test_what_may_change_does(begun, tmp_path):
     assert trainer.global_step == 3
 
 
+def test_a_training_goes_on_with_the_arguments_that_it_is_given(begun, tmp_path, caplog):
+    data = data_of(tmp_path / "dataset")
+    slower = functools.partial(torch.optim.Adam, lr=1e-5, betas=(0.5, 0.9))
+    changed = module_of(data, optimizer=slower, density_weight=0.5, schedule={"warmup": 1})
+    was = torch.load(begun, weights_only=True)
+    with caplog.at_level("INFO", "lightning.pytorch"):
+        trainer_of(tmp_path / "more", 4).fit(changed, data, ckpt_path=begun, weights_only=True)
+    (line,) = [record.getMessage() for record in caplog.records if "changed arguments" in record.getMessage()]
+    assert line.startswith("Going on from step 2 with changed arguments: ")
+    rate = was["optimizer_states"][0]["param_groups"][0]["initial_lr"]
+    assert f"model.optimizer.lr = 1e-05 (was {rate})" in line
+    for found in (
+        "betas = (0.5, 0.9) (was (0.9, 0.999))",
+        "density_weight = 0.5 (was 0.0)",
+        "schedule.warmup = 1 (was",
+    ):
+        assert found in line
+    ended = torch.load(tmp_path / "more" / "last.ckpt", weights_only=True)
+    group = ended["optimizer_states"][0]["param_groups"][0]
+    assert (group["initial_lr"], group["betas"]) == (1e-5, (0.5, 0.9))
+    assert group["lr"] <= 1e-5
+    assert ended["lr_schedulers"][0]["base_lrs"] == [1e-5]
+
+
+def test_a_training_that_goes_on_unchanged_says_nothing(begun, tmp_path, caplog):
+    data = data_of(tmp_path / "dataset")
+    with caplog.at_level("INFO", "lightning.pytorch"):
+        trainer_of(tmp_path / "more", 4).fit(module_of(data), data, ckpt_path=begun, weights_only=True)
+    assert "changed arguments" not in caplog.text
+
+
 def test_checkpoints_without_the_name_of_their_optimizer_are_compared_by_its_arguments(begun, tmp_path):
     old = torch.load(begun, weights_only=True)
     del old["nmpm_optimizer"]
     data = data_of(tmp_path / "dataset")
     with pytest.raises(ConfigError, match=r"model\.optimizer = another optimizer, with amsgrad, betas"):
-        module_of(data, optimizer=SOAP).check_optimizer(old)
-    module_of(data, optimizer=functools.partial(torch.optim.Adam, lr=1e-4)).check_optimizer(old)
+        module_of(data, optimizer=SOAP).adopt_arguments(old)
+    module_of(data, optimizer=functools.partial(torch.optim.Adam, lr=1e-4)).adopt_arguments(old)
 
 
 def test_a_checkpoint_of_version_0_1_0_goes_on_loading_and_a_newer_one_is_refused(tmp_path):

@@ -101,4 +101,5 @@ def test_the_text_of_a_card_is_yaml_of_plain_data(run):
     folder = add(run, "mine", about="made up")
     card = yaml.safe_load((folder / "card.yaml").read_text())
     assert card["about"] == "made up"
-    assert card["constraints"] == {"energy": True, "rest_speed": 0.01, "solids": True, "bounds": "stop"}
+    held = {"energy": True, "rest_speed": 0.01, "solids": True, "bounds": "stop", "density_cap": 0.0}
+    assert card["constraints"] == held

@@ -79,7 +79,7 @@ EMULATORS = {
         transfer=Nearest(),
     ),
     "3-D, gravity varies, obstacles": lambda: emulator_of(box(dim=3, gravity_varies=True, obstacles=True)),
-    "held": lambda: emulator_of(box(), Constraints(energy=True, rest_speed=0.02), gain=1.0),
+    "held": lambda: emulator_of(box(), Constraints(energy=True, rest_speed=0.02, density_cap=0.3), gain=1.0),
 }
 
 

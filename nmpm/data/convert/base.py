@@ -90,12 +90,14 @@ class ForeignDataset:
         splits: Trajectories of the splits "train", "valid" and "test" that exist; read one by one, in each iteration.
         notes: Sentences for the user, on assumptions and inconsistencies.
         counts: Trajectories per split; None where only reading them all would tell.
+        assumed: Fields of the metadata that the files do not state.
     """
 
     metadata: Metadata
     splits: Mapping[str, Iterable[Trajectory]]
     notes: tuple[str, ...] = ()
     counts: Mapping[str, int | None] = field(default_factory=dict)
+    assumed: frozenset[str] = frozenset()
 
 
 class DatasetFormat(abc.ABC):

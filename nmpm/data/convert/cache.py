@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
-from nmpm.data.catalog import dataset_home
-from nmpm.data.convert import Options, convert
+from nmpm._support.shipped import user_home
+from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import METADATA_FILE
+from nmpm.data.scene_inference import check_gravity
 
 _log = logging.getLogger(__name__)
 
@@ -26,15 +28,26 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
 
     Raises:
         DataError: if the source cannot be read or the cache cannot be written.
+        ConfigError: if the options contradict the gravity that the files state.
     """
     path, options = Path(path).resolve(), options or Options()
-    cache = dataset_home() / "converted"
+    _check_stated_gravity(path, options)
+    cache = user_home() / "converted"
     folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
     with lock_folder(cache):
         if not (folder / METADATA_FILE).is_file():
             for note in convert(path, folder, options=options):
                 _log.info("%s: %s", path.name, note)
     return folder
+
+
+def _check_stated_gravity(path: Path, options: Options) -> None:
+    if options.gravity is None:
+        return
+    dataset = open_dataset(path, options=replace(options, gravity=None))
+    if "gravity" not in dataset.assumed:
+        metadata = (path if path.is_dir() else path.parent) / METADATA_FILE
+        check_gravity(options.gravity, dataset.metadata.gravity, metadata if metadata.is_file() else path)
 
 
 def _fingerprint(path: Path, options: Options) -> str:

@@ -54,6 +54,7 @@ class Dmcf(DatasetFormat):
                 *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
             ),
             counts={split: len(found) for split, found in files.items()},
+            assumed=frozenset({"dt", "gravity"}),
         )
 
 

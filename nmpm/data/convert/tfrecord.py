@@ -8,12 +8,12 @@ buffer; of its wire format only the parts that `tensorflow/core/example/example.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -95,7 +95,7 @@ def masked_crc(data: bytes) -> int:
 
 def crc32c(data: bytes) -> int:
     """CRC-32C (Castagnoli)."""
-    return int(_crc32c(np.frombuffer(data, np.uint8), _TABLE)) ^ 0xFFFFFFFF
+    return int(_compiled_crc()(np.frombuffer(data, np.uint8), _TABLE)) ^ 0xFFFFFFFF
 
 
 def _make_table() -> NDArray[np.uint32]:
@@ -115,7 +115,11 @@ def _crc_loop(data: NDArray[np.uint8], table: NDArray[np.uint32]) -> np.uint32:
     return crc
 
 
-_crc32c = numba.njit(cache=True, nogil=True)(_crc_loop)
+@cache
+def _compiled_crc() -> Callable[[NDArray[np.uint8], NDArray[np.uint32]], np.uint32]:
+    import numba  # takes half a second to import
+
+    return numba.njit(cache=True, nogil=True)(_crc_loop)  # type: ignore[no-any-return]
 
 
 def _length(file: BinaryIO, path: Path, index: int, offset: int) -> int:

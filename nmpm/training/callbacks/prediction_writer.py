@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -46,5 +47,7 @@ class PredictionWriter(BasePredictionWriter):
         if trainer.is_global_zero:
             rounds = zip_longest(*by_rank)  # ranks take trajectories in turn, so the last round may be short
             ordered = [trajectory for turn in rounds for trajectory in turn if trajectory is not None]
-            write_split(Path(trainer.default_root_dir) / "predictions.h5", ordered)
+            path = Path(trainer.default_root_dir) / "predictions.h5"
+            write_split(path, ordered)
+            sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
         self._predicted = []

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.trainer.states import TrainerFn
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -25,7 +26,7 @@ from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
 
 
 class ReportWriter(Callback):
-    """Measures the time that training takes, and writes the report when a test ends.
+    """Measures the time that training takes and the errors on the way, prints errors, and reports when a test ends.
 
     Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions), `errors.csv`
     (error against frame), `rollout.png` and `rollout.gif` (the first test trajectory beside its prediction).
@@ -34,6 +35,7 @@ class ReportWriter(Callback):
     def __init__(self) -> None:
         self.trained_seconds = 0.0
         self.trained_steps = 0
+        self.curve: list[list[float]] = []  # seconds of training, steps and MSE of each validation
         self._since: float | None = None
         self._trained = False
         self._first_rollout: tuple[Window, Tensor] | None = None
@@ -43,13 +45,14 @@ class ReportWriter(Callback):
         return "Report"  # its name in checkpoints of earlier versions
 
     def state_dict(self) -> dict[str, Any]:
-        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps}
+        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps, "curve": list(self.curve)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if self._trained:
             return  # the test after a fit loads the best checkpoint, which is often older than the training's end
         self.trained_seconds = float(state_dict["trained_seconds"])
         self.trained_steps = int(state_dict.get("trained_steps", 0))
+        self.curve = list(state_dict.get("curve", []))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self._since, self._trained = time.monotonic(), True
@@ -63,6 +66,14 @@ class ReportWriter(Callback):
         batch_idx: int,  # noqa: ARG002
     ) -> None:
         self.trained_steps = trainer.global_step
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        mse = trainer.callback_metrics.get("valid/mse")
+        if self._trained and not trainer.sanity_checking and mse is not None:
+            self.curve.append([round(self._elapsed(), 1), self.trained_steps, float(mse)])
+        if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
+            dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
+            _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self.trained_seconds, self._since = self._elapsed(), None
@@ -95,7 +106,8 @@ class ReportWriter(Callback):
             trajectories = labelled_trajectories(pl_module, *self._first_rollout)
             write_snapshots(trajectories, folder / "rollout.png")
             write_animation(trajectories, folder / "rollout.gif")
-        _print_table(figures, folder)
+        _print_table(f"{figures['dataset']}: test", figures["test"])
+        Console().print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")
 
     def _elapsed(self) -> float:
         return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
@@ -104,10 +116,9 @@ class ReportWriter(Callback):
         self, trainer: Trainer, module: EmulatorModule, per_trajectory: Mapping[str, list[dict[str, float]]]
     ) -> dict[str, Any]:
         datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
-        logged = {key: float(value) for key, value in trainer.callback_metrics.items() if key.startswith("test/")}
         return {
             "dataset": datamodule.description,
-            "test": {key.removeprefix("test/"): value for key, value in sorted(logged.items())},
+            "test": _logged(trainer, "test/"),
             "per_trajectory": dict(per_trajectory),
             "training": {
                 "steps": self.trained_steps,
@@ -118,6 +129,7 @@ class ReportWriter(Callback):
                 "hardware": device_name(trainer.strategy.root_device),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
+            "curve": self.curve,
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
         }
 
@@ -170,15 +182,18 @@ def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
         part.write_text("".join(",".join(line) + "\n" for line in lines))
 
 
-def _print_table(figures: Mapping[str, Any], folder: Path) -> None:
-    test = figures["test"]
-    names = figure_names(test)
-    table = Table(title=f"{figures['dataset']}: test error ×10⁻³ (MSE in length², EMD in length)")
+def _logged(trainer: Trainer, prefix: str) -> dict[str, float]:
+    """What an evaluation has logged, by names without the prefix."""
+    logged = sorted(trainer.callback_metrics.items())
+    return {key.removeprefix(prefix): float(value) for key, value in logged if key.startswith(prefix)}
+
+
+def _print_table(what: str, errors: Mapping[str, float]) -> None:
+    names = figure_names(errors)
+    table = Table(title=f"{what} error ×10⁻³ (MSE in length², EMD in length)")
     table.add_column("predictor")
     for name in names:
         table.add_column(name, justify="right")
     for kind, label in PREDICTORS.items():
-        table.add_row(label, *table_row(test, kind))
-    console = Console()
-    console.print(table)
-    console.print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")
+        table.add_row(label, *table_row(errors, kind))
+    Console().print(table)

@@ -1,0 +1,58 @@
+"""Rollouts that keep gradients: of any loss with respect to the initial state, obstacles and gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.rollouts import check_inputs
+from nmpm.particles import Particles
+
+
+def recomputing_unroll(emulator: Emulator, particles: Particles, bundles: int) -> Iterator[Bundle]:
+    """`unroll` that keeps no activations between bundles: backward passes compute each bundle again.
+
+    Memory is that of one bundle and the states between bundles, for the time of one more forward pass.
+
+    Args:
+        emulator: Predicts m frames a call.
+        particles: The state to start from.
+        bundles: How many calls to make.
+    """
+    context = emulator.context(particles)
+    for _ in range(bundles):
+        bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
+        yield bundle
+        particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+
+
+def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
+    """Predict `frames` frames with gradients to the state: its positions, velocities, obstacles and gravity.
+
+    The trajectories of liquids are chaotic: over long rollouts gradients grow without bound and say less and less.
+    Optimise over the shortest horizon that the purpose allows, clip gradients, or average them over several slightly
+    different states of a batch.
+
+    Args:
+        emulator: In evaluation mode; its own parameters should not require gradients
+            (`emulator.requires_grad_(False)`), which saves time.
+        particles: The state to start from, see `Pretrained.state`, which keeps gradients of what it is given.
+        frames: How many frames to predict, at least 1.
+
+    Returns:
+        (B, frames, N, D) positions in domain length.
+
+    Raises:
+        ValueError: if `frames` is below 1.
+        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+    """
+    if frames < 1:
+        raise ValueError(f"A rollout with gradients has 1 or more frames, not {frames}.")
+    with torch.no_grad():
+        check_inputs(emulator, particles)
+    bundles = recomputing_unroll(emulator, particles, -(-frames // emulator.frames))
+    return torch.cat([bundle.position for bundle in bundles], dim=1)[:, :frames]

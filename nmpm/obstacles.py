@@ -1,0 +1,188 @@
+"""Obstacles with parameters that gradients reach: bodies filled with particles, as those of the training data are.
+
+An emulator sees the share of each grid cell that obstacle particles fill, which changes smoothly as they move. So a
+loss on a rollout has gradients with respect to a ramp's angle or a polygon's corners::
+
+    angle = torch.tensor(-0.4, requires_grad=True)
+    state = model.state(position, obstacle=Ramp((0.5, 0.4), length=0.3, thickness=0.02, angle=angle).particles(spacing))
+    loss = model.differentiable_rollout(state, frames=100)[:, -1].sub(target).norm(dim=-1).mean()
+    loss.backward()
+
+How many particles fill a body is counted from its sizes, and has no gradient.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nmpm.errors import ConfigError
+
+Number = float | Tensor
+Point = Sequence[Number] | Tensor
+
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+class Body(abc.ABC):
+    """An obstacle in two dimensions."""
+
+    @abc.abstractmethod
+    def particles(self, spacing: float) -> Tensor:
+        """Particles that fill the body, one per spacing².
+
+        Args:
+            spacing: Distance between them, in domain length: that of the scene's particles suits.
+
+        Returns:
+            (M, 2) float64 positions in domain length, differentiable with respect to the body's parameters.
+
+        Raises:
+            ConfigError: if the spacing is not positive, or the body is too small for a single particle.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Ramp(Body):
+    """A bar: a turned rectangle.
+
+    Args:
+        centre: (x, y) in domain length.
+        length: Of its longer side.
+        thickness: Of its shorter side.
+        angle: Of the longer side from the x axis, in radians.
+    """
+
+    centre: Point
+    length: Number
+    thickness: Number
+    angle: Number
+
+    @classmethod
+    def from_end(cls, end: Point, length: Number, thickness: Number, angle: Number) -> Ramp:
+        """A bar that starts at `end`, the middle of one of its short sides, and turns about it with the angle."""
+        angle = _tensor(angle)
+        along = torch.stack([torch.cos(angle), torch.sin(angle)])
+        return cls(_tensor(end) + _tensor(length) / 2 * along, length, thickness, angle)
+
+    def particles(self, spacing: float) -> Tensor:
+        _check_spacing(spacing)
+        angle = _tensor(self.angle)
+        along, across = (_lattice(_tensor(side), spacing) for side in (self.length, self.thickness))
+        local = torch.stack(torch.meshgrid(along, across, indexing="ij"), dim=-1).reshape(-1, 2)
+        cos, sin = torch.cos(angle), torch.sin(angle)
+        axes = torch.stack([torch.stack([cos, sin]), torch.stack([-sin, cos])])
+        return _tensor(self.centre) + local @ axes
+
+
+@dataclass(frozen=True, eq=False)
+class Disc(Body):
+    """A disc.
+
+    Args:
+        centre: (x, y) in domain length.
+        radius: In domain length.
+    """
+
+    centre: Point
+    radius: Number
+
+    def particles(self, spacing: float) -> Tensor:
+        """Particles on a spiral with equal area each (Vogel 1979), one per spacing²; see `Body.particles`."""
+        _check_spacing(spacing)
+        radius = _tensor(self.radius)
+        count = _count(math.pi * float(radius.detach()) ** 2 / spacing**2, "radius", radius)
+        index = torch.arange(count, dtype=torch.float64)
+        turn = index * _GOLDEN_ANGLE
+        unit = torch.stack([torch.cos(turn), torch.sin(turn)], dim=-1) * ((index + 0.5) / count).sqrt().unsqueeze(-1)
+        return _tensor(self.centre) + radius * unit
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon(Body):
+    """A convex polygon.
+
+    Args:
+        corners: (K, 2) in domain length, K at least 3, in order along the outline.
+
+    Raises:
+        ConfigError: if there are fewer corners, or the outline is not convex.
+    """
+
+    corners: Sequence[Point] | Tensor
+
+    def __post_init__(self) -> None:
+        corners = self._corners().detach()
+        if corners.dim() != 2 or corners.shape[0] < 3 or corners.shape[1] != 2:
+            raise ConfigError(f"A polygon has three or more corners (x, y); these have shape {tuple(corners.shape)}.")
+        sides = corners.roll(-1, 0) - corners
+        turns = _cross(sides, sides.roll(-1, 0))
+        if not ((turns > 0).all() or (turns < 0).all()):
+            raise ConfigError("A polygon's corners must go once around a convex outline: divide it into convex ones.")
+
+    def particles(self, spacing: float) -> Tensor:
+        """Particles of a lattice, each a fixed mean of three corners; see `Body.particles`."""
+        _check_spacing(spacing)
+        corners = self._corners()
+        weights = _fan_weights(corners.detach(), spacing)
+        if not len(weights):
+            raise ConfigError(f"No lattice point with spacing = {spacing} lies within the polygon.")
+        return weights @ corners
+
+    def _corners(self) -> Tensor:
+        if isinstance(self.corners, Tensor):
+            return _tensor(self.corners)
+        return torch.stack([_tensor(corner) for corner in self.corners])
+
+
+def _fan_weights(corners: Tensor, spacing: float) -> Tensor:
+    """(M, K) shares of the corners in the lattice points inside, by the triangles that the first corner makes."""
+    low, high = corners.amin(0), corners.amax(0)
+    axes = [_lattice(side, spacing) + side / 2 for side in high - low]
+    points = low + torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 2)
+    weights = corners.new_zeros(len(points), len(corners))
+    free = torch.ones(len(points), dtype=torch.bool)
+    for second in range(1, len(corners) - 1):
+        first, b, c = corners[0], corners[second] - corners[0], corners[second + 1] - corners[0]
+        offset, area = points - first, _cross(b, c)
+        beta, gamma = _cross(offset, c.expand_as(offset)) / area, _cross(b.expand_as(offset), offset) / area
+        inside = free & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
+        weights[inside, 0] = 1 - beta[inside] - gamma[inside]
+        weights[inside, second], weights[inside, second + 1] = beta[inside], gamma[inside]
+        free &= ~inside
+    return weights[~free]
+
+
+def _lattice(side: Tensor, spacing: float) -> Tensor:
+    """Places along a side, about `spacing` apart and half of that from its ends, counted from its middle."""
+    count = _count(float(side.detach()) / spacing, "side", side)
+    return ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * side
+
+
+def _count(number: float, name: str, value: Tensor) -> int:
+    if not (math.isfinite(number) and number > 0):
+        raise ConfigError(f"An obstacle's {name} = {float(value.detach()):g} must be a positive number.")
+    return max(1, round(number))
+
+
+def _check_spacing(spacing: float) -> None:
+    if not (math.isfinite(spacing) and spacing > 0):
+        raise ConfigError(f"spacing = {spacing} must be a positive number.")
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _tensor(value: Number | Point) -> Tensor:
+    """In float64, with gradients of what is a tensor."""
+    if isinstance(value, Tensor):
+        return value.to(torch.float64)
+    if isinstance(value, Sequence):
+        return torch.stack([_tensor(each) for each in value])
+    return torch.tensor(float(value), dtype=torch.float64)

@@ -1,0 +1,91 @@
+"""Space to depth: a network on a grid `patch` times as coarse, each of whose cells holds the channels of all its fine
+ones. Particles and grid still exchange at the fine resolution; the network does not pay for it.
+
+Source of the idea: Shi et al., Real-Time Single Image and Video Super-Resolution, CVPR 2016 (its sub-pixel layer).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from nmpm._support.specs import from_spec
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
+from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.unet import UNet
+
+
+@dataclass(frozen=True)
+class Patched(Processor):
+    """Recipe of a processor on patches of cells.
+
+    Args:
+        processor: The recipe of the network on the coarse grid.
+        patch: Cells of a patch along each axis.
+
+    Raises:
+        ConfigError: if the processor is not known, or the patch smaller than a cell.
+    """
+
+    processor: Processor = UNet(width=32, depth=2, perceptron=(32,))  # noqa: RUF009 (frozen)
+    patch: int = 2
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "processor", from_spec(self.processor, Processor))
+        if self.patch < 1:
+            raise ConfigError(f"Patched needs patches of at least 1 cell; got {self.patch}.")
+
+    def build(self, layout: GridLayout) -> GridProcessor:
+        cells = self.patch**layout.dim
+        channels = {"in_channels": cells * layout.in_channels, "out_channels": cells * layout.out_channels}
+        return PatchedNetwork(self.patch, self.processor.build(dataclasses.replace(layout, **channels)))
+
+    def check_grid(self, grid: Grid) -> None:
+        check_multiple(grid, self.patch, f"patches of {self.patch} cells")
+        shape = tuple(-(-cells // self.patch) for cells in grid.shape)
+        spacing = tuple(self.patch * width for width in grid.spacing)
+        self.processor.check_grid(dataclasses.replace(grid, shape=shape, spacing=spacing))
+
+
+class PatchedNetwork(GridProcessor):
+    """Patches to channels, the network, channels back to patches.
+
+    Args:
+        patch: Cells of a patch along each axis.
+        network: Maps (B, C_in * patch ** D, *S / patch) to (B, m, C_out * patch ** D, *S / patch).
+    """
+
+    def __init__(self, patch: int, network: GridProcessor) -> None:
+        super().__init__()
+        self.patch, self.network = patch, network
+
+    def forward(self, grid: Tensor) -> Tensor:
+        coarse = cells_to_channels(pad_to_multiple(grid, self.patch), self.patch)
+        fields = channels_to_cells(self.network(coarse).flatten(0, 1), self.patch)
+        out: Tensor = fields.unflatten(0, (grid.shape[0], -1))
+        return crop(out, grid.shape[2:], first=3)
+
+
+def cells_to_channels(grid: Tensor, patch: int) -> Tensor:
+    """(B, C, *S) → (B, C * patch ** D, *S / patch)."""
+    dim = grid.dim() - 2
+    for axis in range(dim + 1, 1, -1):
+        grid = grid.unflatten(axis, (-1, patch))
+    within, across = range(3, 2 * dim + 2, 2), range(2, 2 * dim + 2, 2)
+    coarse: Tensor = grid.permute(0, 1, *within, *across).flatten(1, dim + 1)
+    return coarse
+
+
+def channels_to_cells(fields: Tensor, patch: int) -> Tensor:
+    """(B, C * patch ** D, *S) → (B, C, *S * patch), the inverse of `cells_to_channels`."""
+    dim = fields.dim() - 2
+    split = fields.unflatten(1, (-1, *(patch,) * dim))
+    order = [place for axis in range(dim) for place in (2 + dim + axis, 2 + axis)]
+    joined: Tensor = split.permute(0, 1, *order)
+    for axis in range(2, dim + 2):
+        joined = joined.flatten(axis, axis + 1)
+    return joined

@@ -1,0 +1,96 @@
+"""Labelled trajectories from files: rollouts as `nmpm rollout` writes them, and datasets in the native format."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+
+from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.scene_inference import infer_scene
+from nmpm.errors import DataError
+from nmpm.scene import Scene
+from nmpm.viz.trajectories import LabelledTrajectories, material_names
+
+TOLERANCE = 1e-3
+"""Share of the box by which first frames may differ where one file is the prediction of the other."""
+
+
+def read_labelled(split: Split, index: int = 0, family: str | None = None) -> LabelledTrajectories:
+    """Reads a trajectory, labelled "prediction" or "recorded" (or "simulated", where nmpm's simulators made it).
+
+    Args:
+        split: The file.
+        index: Of the trajectory.
+        family: Meaning of type ids if the folder's metadata.json lacks it.
+
+    Raises:
+        DataError: if there is no such trajectory, or file or metadata cannot be read.
+    """
+    if not 0 <= index < len(split):
+        raise DataError(f"{split.path} contains trajectories 0 … {len(split) - 1}, not {index}.")
+    trajectory = split.read(index)
+    scene, names, static, label = _describe(split, trajectory, family)
+    moving = ~np.isin(trajectory.particle_type, sorted(static))
+    return LabelledTrajectories(
+        positions={label: trajectory.position[:, moving]},
+        material=material_names(trajectory.particle_type[moving], names),
+        bounds=scene.bounds,
+        dt=scene.dt,
+        domain=scene.domain,
+        obstacle=trajectory.position[0, ~moving],
+        periodic=scene.periodic,
+        gravity=scene.gravity,
+        title=f"{split.path.name}, trajectory {index}",
+    )
+
+
+def combine(
+    reference: LabelledTrajectories, other: LabelledTrajectories, names: tuple[str, str]
+) -> LabelledTrajectories:
+    """Two trajectories of the same particles, over the frames that both have.
+
+    Args:
+        reference: What errors are against.
+        other: What is compared with it.
+        names: Where they come from, for messages, and as labels where both have the same.
+
+    Raises:
+        DataError: if their particles differ in number, material or first position.
+    """
+    (first_label, first), (second_label, second) = (next(iter(each.positions.items())) for each in (reference, other))
+    both = f"{names[0]} and {names[1]}"
+    if first.shape[1:] != second.shape[1:]:
+        raise DataError(
+            f"{both} do not show the same particles: {first.shape[1]} moving ones in {first.shape[2]}-D, and"
+            f" {second.shape[1]} in {second.shape[2]}-D."
+        )
+    if not np.array_equal(reference.material, other.material):
+        raise DataError(f"{both} do not show the same particles: their materials differ.")
+    sides = np.ptp(np.array(reference.outer_bounds), axis=1)
+    apart = float(np.abs((first[0] - second[0]) / sides).max())
+    if apart > TOLERANCE:
+        raise DataError(
+            f"{both} do not start at the same positions: a particle is {apart:.2g} of the box's side apart. Is it the"
+            " same trajectory? --truth-trajectory chooses another."
+        )
+    frames = min(len(first), len(second))
+    labels = (first_label, second_label) if first_label != second_label else names
+    return dataclasses.replace(
+        reference, positions={labels[0]: first[:frames], labels[1]: second[:frames]}, title=other.title
+    )
+
+
+def _describe(
+    split: Split, trajectory: Trajectory, family: str | None
+) -> tuple[Scene, dict[int, str], frozenset[int], str]:
+    """Scene, names of type ids, static ids, label: from a rollout's own attributes, otherwise from metadata.json."""
+    if "scene" in trajectory.attributes:
+        names = json.loads(trajectory.attributes["particle_types"])
+        static = frozenset(int(index) for index in trajectory.attributes["static_types"])
+        scene = Scene.from_dict(json.loads(trajectory.attributes["scene"]))
+        return scene, {int(index): name for index, name in names.items()}, static, "prediction"
+    metadata = read_metadata(split.path.parent, family)
+    label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
+    return infer_scene(split.path.parent, family), dict(metadata.particle_types), metadata.static_types, label

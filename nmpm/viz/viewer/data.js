@@ -1,0 +1,30 @@
+// Reading the page's data: trajectories as differences of 16-bit positions from frame to frame, deflated.
+
+/** The page's description: title, labels, materials, box; see packing.py. */
+const scene = JSON.parse(document.getElementById("data").textContent);
+
+/** Inflates base64 text to bytes. */
+async function inflate(text) {
+  const packed = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** 16-bit positions (frames × particles × axes) from their differences, all low bytes before all high bytes. */
+function undoDifferences(bytes, frames) {
+  const count = bytes.length / 2;
+  const positions = new Uint16Array(count);
+  for (let i = 0; i < count; i++) positions[i] = bytes[i] | (bytes[count + i] << 8);
+  for (let i = count / frames; i < count; i++) positions[i] += positions[i - count / frames];
+  return positions;
+}
+
+/** Positions of one trajectory, in 65535ths of `scene.low` … `scene.high`. */
+async function readTrajectory(trajectory) {
+  return undoDifferences(await inflate(trajectory.positions), scene.frames);
+}
+
+/** #rrggbb as three numbers in [0, 1]. */
+function readColour(hex) {
+  return [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
+}

@@ -1,0 +1,73 @@
+// Where panels lie, and how the box is seen in them: one view for all panels.
+
+/** Rectangles (x, y, width, height) of `count` panels, in pixels from the canvas's upper left corner. */
+function panelRectangles(count, width, height, aspect) {
+  let best = null;
+  for (let columns = 1; columns <= count; columns++) {
+    const rows = Math.ceil(count / columns), w = width / columns, h = height / rows;
+    const size = Math.min(w, h * aspect); // width of the box in a panel
+    if (!best || size > best.size) best = { size, columns, w, h };
+  }
+  return Array.from({ length: count }, (_, i) =>
+    [(i % best.columns) * best.w, Math.floor(i / best.columns) * best.h, best.w, best.h].map(Math.round));
+}
+
+/** The camera: in 2-D it moves and zooms, in 3-D it turns and zooms. */
+class Camera {
+  constructor() {
+    this.reset();
+  }
+
+  reset() {
+    this.centre = scene.domain.map(([low, high]) => (low + high) / 2);
+    this.zoom = 1;
+    this.turn = 0.5;
+    this.tilt = 0.35;
+  }
+
+  get sizes() {
+    return scene.domain.map(([low, high]) => high - low);
+  }
+
+  /** Width over height of the box as it is seen. */
+  get aspect() {
+    return scene.dim === 2 ? this.sizes[0] / this.sizes[1] : 1.2;
+  }
+
+  /** Pixels to a unit of length, in 2-D. */
+  scale(width, height) {
+    const margin = 14;
+    return this.zoom * Math.min((width - margin) / this.sizes[0], (height - margin) / this.sizes[1]);
+  }
+
+  /** The matrix for a panel, and the diameter in pixels of a length of 1 at depth 1. */
+  view(width, height) {
+    if (scene.dim === 2) {
+      const scale = this.scale(width, height);
+      return { matrix: flatView(this.centre, scale, width, height), unit: scale };
+    }
+    const size = Math.hypot(...this.sizes), distance = (1.4 * size) / this.zoom;
+    const matrix = orbitView(this.centre, scene.up, this.turn, this.tilt, distance, size, width, height);
+    return { matrix, unit: height / (2 * Math.tan(0.35)) };
+  }
+
+  /** Follows a drag by (x, y) pixels in a panel. */
+  drag(x, y, width, height) {
+    if (scene.dim === 2) {
+      const scale = this.scale(width, height);
+      this.centre = [this.centre[0] - x / scale, this.centre[1] + y / scale];
+    } else {
+      this.turn -= x / 150;
+      this.tilt = Math.min(1.5, Math.max(-1.5, this.tilt + y / 150));
+    }
+  }
+
+  /** Zooms about a point, in pixels right and above of the panel's middle. */
+  zoomBy(factor, x, y, width, height) {
+    const before = this.scale(width, height);
+    this.zoom = Math.min(100, Math.max(0.3, this.zoom * factor));
+    if (scene.dim === 3) return;
+    const after = this.scale(width, height);
+    this.centre = [this.centre[0] + x / before - x / after, this.centre[1] + y / before - y / after];
+  }
+}

@@ -1,0 +1,182 @@
+"""The viewer's page: one HTML file without links, for any browser with WebGL 2."""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from nmpm.errors import ConfigError
+from nmpm.viz.camera import vertical_axis
+from nmpm.viz.colours import hex_code, material_colours, vary_brightness
+from nmpm.viz.output import check_output, check_suffix, replace_picture
+from nmpm.viz.spacing import particle_spacing
+from nmpm.viz.trajectories import Floats, LabelledTrajectories
+from nmpm.viz.viewer.packing import pack_bytes, pack_positions, quantize
+
+SCRIPTS = ("data.js", "matrices.js", "drawing.js", "layout.js", "curve.js", "viewer.js")
+COLOUR_SCALE = "viridis"
+TOP_PERCENTILE = 99.5
+"""Of speeds and errors: what the upper end of the colour scale stands for."""
+SAMPLED_FRAMES = 50
+
+
+class ViewerPage:
+    """A page that plays trajectories; the last expression of a notebook's cell shows it.
+
+    Args:
+        trajectories: What to play, side by side or overlaid; errors are against the first.
+        every: Shows every so many frames.
+
+    Raises:
+        ConfigError: if `every` is below 1.
+    """
+
+    def __init__(self, trajectories: LabelledTrajectories, every: int = 1) -> None:
+        if every < 1:
+            raise ConfigError(f"every = {every} must be at least 1.")
+        self._html = _fill(_describe(trajectories, every))
+
+    @property
+    def html(self) -> str:
+        """The page's text."""
+        return self._html
+
+    def write(self, path: Path | str) -> Path:
+        """Writes the page to a `.html` file; an existing one is replaced only when the new one is complete.
+
+        Raises:
+            ConfigError: if the suffix is another.
+            DataError: if the file cannot be written.
+        """
+        path = Path(path)
+        check_suffix(path, (".html",), "a page")
+        check_output(path)
+        with replace_picture(path) as temporary:
+            temporary.write_text(self._html, encoding="utf-8")
+        return path
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self._html, quote=True)
+        return (
+            f'<iframe srcdoc="{page}" sandbox="allow-scripts" style="width: 100%; height: 640px; border: 0"></iframe>'
+        )
+
+
+def _fill(description: dict[str, Any]) -> str:
+    """The page with style, scripts and data in it."""
+    folder = files(__package__)
+    # `</script>` in a label would end the data.
+    data = json.dumps(description, separators=(",", ":")).replace("<", "\\u003c")
+    script = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
+    style = folder.joinpath("style.css").read_text(encoding="utf-8")
+    page = folder.joinpath("page.html").read_text(encoding="utf-8")
+    for mark, content in {"/*STYLE*/": style, "/*SCRIPT*/": script, "/*DATA*/": data}.items():
+        before, after = page.split(mark)
+        page = before + content + after
+    return page
+
+
+def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
+    """All that the page's scripts read, as JSON."""
+    positions = {
+        label: trajectories.wrap(position[::every].astype(np.float64))
+        for label, position in trajectories.positions.items()
+    }
+    return {
+        "title": trajectories.title or "nmpm",
+        "every": every,
+        "dt": trajectories.dt * every,
+        **_describe_box(trajectories),
+        **_describe_looks(trajectories, list(positions.values())),
+        **_describe_motion(trajectories, positions, every),
+    }
+
+
+def _describe_box(trajectories: LabelledTrajectories) -> dict[str, Any]:
+    return {
+        "dim": trajectories.dim,
+        "bounds": [list(side) for side in trajectories.bounds],
+        "domain": [list(side) for side in trajectories.outer_bounds],
+        "period": _periods(trajectories),
+        "up": vertical_axis(trajectories),
+    }
+
+
+def _describe_looks(trajectories: LabelledTrajectories, positions: list[Floats]) -> dict[str, Any]:
+    """Colours and sizes; speeds in domain lengths per frame."""
+    colours = material_colours(trajectories.materials)
+    rgb = vary_brightness(np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8))
+    longest = max(high - low for low, high in trajectories.outer_bounds)
+    return {
+        "spacing": min(particle_spacing(positions[0][0]), longest / 20),
+        "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
+        "colours": pack_bytes(rgb),
+        "scale": [hex_code(colour) for colour in _colour_scale()],
+        "fastest": _fastest(trajectories, positions),
+        "worst": _worst(trajectories, positions),
+    }
+
+
+def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Floats], every: int) -> dict[str, Any]:
+    """Packed positions, and errors in domain lengths."""
+    obstacles = trajectories.obstacles.astype(np.float64)
+    corners = np.array(trajectories.outer_bounds).T
+    points = np.concatenate([corners, obstacles, *(each.reshape(-1, trajectories.dim) for each in positions.values())])
+    low, high = points.min(axis=0), points.max(axis=0)
+    frames = len(next(iter(positions.values())))
+    errors = {label: curve[::every] for label, curve in trajectories.rms_errors().items()}
+    return {
+        "frames": frames,
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "obstacles": pack_positions(quantize(obstacles, low, high)[None]),
+        "trajectories": [
+            {
+                "label": label,
+                "positions": pack_positions(quantize(position, low, high)),
+                "errors": [float(f"{error:.6g}") for error in errors.get(label, np.zeros(frames))],
+            }
+            for label, position in positions.items()
+        ],
+    }
+
+
+def _periods(trajectories: LabelledTrajectories) -> list[float]:
+    """The box's length along periodic axes, zero along the others."""
+    periodic = trajectories.periodic or (False,) * trajectories.dim
+    return [(high - low) * wraps for (low, high), wraps in zip(trajectories.bounds, periodic, strict=True)]
+
+
+def _colour_scale() -> list[tuple[int, int, int]]:
+    colours = matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))
+    return [(red, green, blue) for red, green, blue, _ in np.round(255 * colours).astype(int).tolist()]
+
+
+def _fastest(trajectories: LabelledTrajectories, positions: list[Floats]) -> float:
+    """Nearly the largest distance that particles move from one shown frame to the next."""
+    frames = np.unique(np.linspace(0, len(positions[0]) - 1, SAMPLED_FRAMES).astype(int)[1:])
+    return _top([_lengths(trajectories, part[frames] - part[frames - 1]) for part in positions])
+
+
+def _worst(trajectories: LabelledTrajectories, positions: list[Floats]) -> float:
+    """Nearly the largest distance between a particle and the same particle in the first trajectory."""
+    frames = np.unique(np.linspace(0, len(positions[0]) - 1, SAMPLED_FRAMES).astype(int))
+    return _top([_lengths(trajectories, other[frames] - positions[0][frames]) for other in positions[1:]])
+
+
+def _lengths(trajectories: LabelledTrajectories, difference: Floats) -> Floats:
+    """Lengths (..., N) of differences (..., N, D), the shortest where axes are periodic."""
+    period = np.array(_periods(trajectories))
+    wrapped = difference - period * np.round(difference / np.where(period > 0, period, 1.0))
+    return np.asarray(np.sqrt(np.square(wrapped).sum(axis=-1)))
+
+
+def _top(lengths: list[Floats]) -> float:
+    top = np.percentile(np.concatenate([part.ravel() for part in lengths]), TOP_PERCENTILE) if lengths else 0.0
+    return float(top) or 1.0

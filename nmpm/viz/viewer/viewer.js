@@ -1,0 +1,263 @@
+// The viewer: playing, choices, keys.
+
+const RATES = [5, 15, 30, 60, 120, 240];
+const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost", "accent"];
+const element = (id) => document.getElementById(id);
+
+class Viewer {
+  constructor(drawing, trajectories) {
+    Object.assign(this, { drawing, trajectories, frame: 0, playing: false, drawn: 0, camera: new Camera() });
+    this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+    this.fillChoices();
+    this.listen();
+    new ResizeObserver(() => this.show()).observe(element("scene"));
+    this.setColour("material");
+    this.seek(0);
+  }
+
+  get frames() { return scene.frames; }
+  get colour() { return element("colour").value; }
+  get layout() { return element("layout").value; }
+  get rate() { return Number(element("rate").value); }
+
+  fillChoices() {
+    const many = scene.trajectories.length > 1;
+    const names = ["material", "speed", ...(many ? ["error"] : [])];
+    element("title").textContent = document.title = scene.title;
+    element("colour").replaceChildren(...names.map((name) => new Option(name, name)));
+    element("rate").replaceChildren(...RATES.map((rate) =>
+      new Option(`${rate} frames/s (${Number((rate * scene.dt).toPrecision(2))} × real time)`, rate, rate === 60, rate === 60)));
+    element("layout-choice").hidden = !many;
+    element("errors").hidden = !many;
+    element("slider").max = scene.frames - 1;
+  }
+
+  listen() {
+    const on = (id, event, action) => element(id).addEventListener(event, action);
+    on("play", "click", () => this.toggle());
+    on("slider", "input", () => this.seek(Number(element("slider").value)));
+    on("colour", "change", () => this.setColour(this.colour));
+    on("layout", "change", () => this.show());
+    on("reset", "click", () => this.reset());
+    on("theme", "click", () => this.turnTheme());
+    on("help", "click", () => element("keys").showModal());
+    on("curve", "click", (event) => this.seek(frameAt(element("curve"), event.offsetX)));
+    on("scene", "pointerdown", (event) => element("scene").setPointerCapture(event.pointerId));
+    on("scene", "pointermove", (event) => event.buttons && this.drag(event));
+    on("scene", "wheel", (event) => this.zoom(event));
+    document.addEventListener("keydown", (event) => this.press(event));
+  }
+
+  press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || element("keys").open) return;
+    if (event.target.tagName === "SELECT" && event.key !== "Escape") return;
+    if (event.target.tagName === "BUTTON" && event.key === " ") return; // it presses the button
+    const step = event.shiftKey ? 10 : 1;
+    const actions = {
+      " ": () => this.toggle(), ArrowRight: () => this.seek(this.frame + step), ArrowLeft: () => this.seek(this.frame - step),
+      Home: () => this.seek(0), End: () => this.seek(this.frames - 1), "[": () => this.changeRate(-1), "]": () => this.changeRate(1),
+      c: () => this.setColour(next(element("colour"))), o: () => this.setLayout(next(element("layout"))),
+      r: () => this.reset(), t: () => this.turnTheme(), f: () => document.documentElement.requestFullscreen(),
+      "?": () => element("keys").showModal(),
+    };
+    const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+    if (!action) return;
+    event.preventDefault();
+    action();
+  }
+
+  toggle() {
+    this.playing = !this.playing;
+    element("play").textContent = this.playing ? "⏸" : "▶";
+    element("play").setAttribute("aria-label", this.playing ? "Pause" : "Play");
+    if (!this.playing) return;
+    let last = performance.now(), due = 0;
+    const tick = (now) => {
+      if (!this.playing) return;
+      due += ((now - last) / 1000) * this.rate;
+      last = now;
+      const steps = Math.floor(due);
+      due -= steps;
+      if (steps) this.seek((this.frame + steps) % this.frames);
+      requestAnimationFrame(tick);
+    };
+    requestAnimationFrame(tick);
+  }
+
+  seek(frame) {
+    this.frame = Math.min(Math.max(frame, 0), this.frames - 1);
+    element("slider").value = this.frame;
+    const at = this.frame * scene.every;
+    element("time").textContent = `frame ${at} of ${(this.frames - 1) * scene.every}, ${(this.frame * scene.dt).toFixed(3)} s`;
+    this.show();
+  }
+
+  setColour(name) {
+    element("colour").value = name;
+    this.showLegend();
+    this.show();
+  }
+
+  setLayout(name) {
+    if (scene.trajectories.length < 2) return;
+    element("layout").value = name;
+    this.show();
+  }
+
+  changeRate(by) {
+    const rates = element("rate");
+    rates.selectedIndex = Math.min(Math.max(rates.selectedIndex + by, 0), RATES.length - 1);
+  }
+
+  reset() {
+    this.camera.reset();
+    this.show();
+  }
+
+  turnTheme() {
+    this.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+    this.show();
+  }
+
+  setTheme(name) {
+    document.documentElement.dataset.theme = name;
+    const style = getComputedStyle(document.documentElement);
+    this.theme = Object.fromEntries(
+      THEME_COLOURS.map((colour) => [colour, readColour(style.getPropertyValue(`--${colour}`).trim())]));
+  }
+
+  /** The panels, in pixels of the page: which trajectories each shows, and where it lies. */
+  panels() {
+    const canvas = element("scene"), all = this.trajectories.map((_, index) => index);
+    const shown = this.layout === "overlay" ? [all] : all.map((index) => [index]);
+    const places = panelRectangles(shown.length, canvas.clientWidth, canvas.clientHeight - 26, this.camera.aspect);
+    return shown.map((indices, i) => {
+      const [x, y, width, height] = places[i];
+      return { indices, x, y: y + 26, width, height: height - (places.at(-1)[1] > 0 ? 26 : 0) };
+    });
+  }
+
+  /** Draws once before the next refresh of the screen, however often it is asked for. */
+  show() {
+    if (this.waiting) return;
+    this.waiting = true;
+    requestAnimationFrame(() => {
+      this.waiting = false;
+      this.draw();
+    });
+  }
+
+  draw() {
+    const canvas = element("scene"), ratio = devicePixelRatio;
+    canvas.width = Math.round(canvas.clientWidth * ratio);
+    canvas.height = Math.round(canvas.clientHeight * ratio);
+    const gl = this.drawing.gl;
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(...this.theme.page, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    const panels = this.panels();
+    panels.forEach((panel) => this.drawPanel(panel, canvas.height, ratio));
+    this.placeLabels(panels);
+    this.drawErrors();
+    this.drawn += 1;
+  }
+
+  drawPanel({ indices, x, y, width, height }, canvasHeight, ratio) {
+    const pixels = [x, canvasHeight / ratio - y - height, width, height].map((value) => Math.round(value * ratio));
+    const { matrix, unit } = this.camera.view(width, height);
+    const look = { mode: MODES[this.colour], top: this.top(), plain: [0, 0, 0, 1], diameter: 1.1 * scene.spacing * unit * ratio };
+    this.drawing.startPanel(pixels, matrix, this.theme);
+    this.drawing.drawObstacles(matrix, { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 1] });
+    for (const index of indices) {
+      const chosen = index === 0 ? this.referenceLook(look, indices.length > 1) : look;
+      this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, matrix, chosen);
+    }
+  }
+
+  /** How the first trajectory is drawn: grey under another; without error, of which it has none. */
+  referenceLook(look, under) {
+    if (under) return { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 0.7] };
+    return look.mode === MODES.error ? { ...look, mode: MODES.material } : look;
+  }
+
+  /** What the upper end of the colour scale stands for, in domain lengths. */
+  top() {
+    return this.colour === "speed" ? scene.fastest : scene.worst;
+  }
+
+  placeLabels(panels) {
+    element("labels").replaceChildren(...panels.map(({ indices, x, y, width }) => {
+      const label = document.createElement("span"), names = indices.map((index) => scene.trajectories[index].label);
+      label.textContent = names.length > 1 ? `${names.slice(1).join(", ")} over ${names[0]} (grey)` : names[0];
+      label.style.left = `${x + width / 2}px`;
+      label.style.top = `${y - 24}px`;
+      return label;
+    }));
+  }
+
+  drawErrors() {
+    const others = scene.trajectories.slice(1);
+    if (!others.length) return;
+    const colours = others.map((_, index) => (index === 0 ? this.theme.accent : this.theme.faint));
+    drawCurve(element("curve"), others.map(({ errors }) => errors), colours, this.frame, this.theme);
+    element("error-now").textContent = others
+      .map(({ label, errors }) => `${label}: ${digits(errors[this.frame])} from ${scene.trajectories[0].label}`).join("\n");
+  }
+
+  showLegend() {
+    const legend = element("legend");
+    if (this.colour === "material") {
+      legend.replaceChildren(...scene.materials.map(({ name, colour }) => {
+        const entry = document.createElement("span"), dot = document.createElement("i");
+        dot.style.background = colour;
+        entry.append(dot, name);
+        return entry;
+      }));
+      return;
+    }
+    const bar = document.createElement("canvas"), context = bar.getContext("2d");
+    bar.width = scene.scale.length;
+    bar.height = 1;
+    scene.scale.forEach((colour, at) => {
+      context.fillStyle = colour;
+      context.fillRect(at, 0, 1, 1);
+    });
+    const unit = this.colour === "speed" ? "length per second" : "length";
+    const end = this.colour === "speed" ? scene.fastest / scene.dt : scene.worst;
+    legend.replaceChildren("0", bar, `${Number(end.toPrecision(2))} ${unit} or more`);
+  }
+
+  panelUnder(event) {
+    return this.panels().find(({ x, y, width, height }) =>
+      event.offsetX >= x && event.offsetX < x + width && event.offsetY >= y && event.offsetY < y + height) ?? this.panels()[0];
+  }
+
+  drag(event) {
+    const { width, height } = this.panelUnder(event);
+    this.camera.drag(event.movementX, event.movementY, width, height);
+    this.show();
+  }
+
+  zoom(event) {
+    event.preventDefault();
+    const { x, y, width, height } = this.panelUnder(event);
+    const [right, above] = [event.offsetX - x - width / 2, y + height / 2 - event.offsetY];
+    this.camera.zoomBy(Math.exp(-event.deltaY / 500), right, above, width, height);
+    this.show();
+  }
+}
+
+/** The option after the chosen one, in a circle. */
+const next = (choice) => choice.options[(choice.selectedIndex + 1) % choice.options.length].value;
+
+async function start() {
+  const trajectories = await Promise.all(scene.trajectories.map(readTrajectory));
+  const obstacles = undoDifferences(await inflate(scene.obstacles), 1);
+  const drawing = new Drawing(element("scene"), await inflate(scene.colours), obstacles);
+  window.viewer = new Viewer(drawing, trajectories);
+  element("message").hidden = true;
+}
+
+start().catch((error) => {
+  element("message").textContent = error.message;
+});

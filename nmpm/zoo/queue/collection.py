@@ -1,0 +1,104 @@
+"""From the best weights of a dataset's trainings to its entry in the zoo."""
+
+from __future__ import annotations
+
+import filecmp
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nmpm._support.atomic import atomic_write
+from nmpm.data import catalog
+from nmpm.data.folder_lock import lock_folder
+from nmpm.errors import ZooError
+from nmpm.zoo.publish import replace
+from nmpm.zoo.queue.plan import Dataset
+from nmpm.zoo.queue.trainings import History
+from nmpm.zoo.registry import Zoo
+from nmpm.zoo.runs import BEST
+
+Command = Callable[[list[str]], int]
+"""Runs `nmpm` with these words and returns its exit status."""
+
+
+def collect(history: History, zoo: Path, run: Command) -> str:
+    """Test a dataset's best weights and make its entry of them, also while its training goes on.
+
+    An entry whose full-rollout error on the test split is lower is kept.
+
+    Args:
+        history: Of the dataset.
+        zoo: Folder of the zoo to write to.
+        run: Runs the test.
+
+    Returns:
+        What was done, in words.
+
+    Raises:
+        ZooError: if the test fails.
+    """
+    name, folder = history.dataset.name, history.folder / "collected"
+    with lock_folder(folder):
+        best = history.best()
+        if best is None:
+            return f"{name}: nothing is validated yet."
+        copy = folder / BEST
+        if copy.is_file() and filecmp.cmp(best.best, copy, shallow=False) and (folder / "merged.json").is_file():
+            report = _read(folder / "merged.json")
+        else:
+            (folder / "merged.json").unlink(missing_ok=True)
+            with atomic_write(copy) as part:
+                shutil.copyfile(best.best, part)
+            if run(best.test_command(folder)):
+                raise ZooError(f"{name}: the test of {copy} failed.")
+            report = _read(folder / "report.json")
+        report = _merged(report, history)
+        for file in ("merged.json", "report.json"):
+            with atomic_write(folder / file) as part:
+                part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        error, published = report["test"]["mse"], _published_error(name, zoo)
+        if published < error:
+            return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split; the entry with {1e3 * published:.4g} is kept."
+        replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
+        return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
+
+
+def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
+    """The report of a test with the time, steps and curve of all trainings before it."""
+    trainings = history.trainings
+    best = history.best() or trainings[-1]
+    until = trainings[: trainings.index(best) + 1]
+    training = report["training"] | {
+        "steps": sum(training.steps() for training in until),
+        "seconds": round(sum(training.seconds() for training in until), 1),
+        "precision": best.precision(),
+    }
+    return report | {"training": training, "curve": history.curve()}
+
+
+def _about(dataset: Dataset) -> str:
+    """How the data were simulated; empty for recorded data."""
+    generation = dataset.generation()
+    if generation is None:
+        return ""
+    name, options = generation
+    request = catalog.simulation_request(name, **{key: options[key] for key in options if key != "workers"})
+    counts, preset = request.counts, request.preset
+    return (
+        f"{counts['train']} trajectories to train on, {counts['valid']} to validate and {counts['test']} to test, of"
+        f" {preset.frames + 1} frames, from nmpm's own {preset.generator}. Seed {request.seed}."
+    )
+
+
+def _published_error(name: str, zoo: Path) -> float:
+    try:
+        return float(Zoo.card(name, zoo)["test"]["mse"])
+    except (ZooError, KeyError, TypeError, ValueError):
+        return float("inf")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content

@@ -1,0 +1,157 @@
+"""What the queue trains, read from its YAML file, and the commands of its trainings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Self
+
+from nmpm._support.bounded_files import read_yaml
+from nmpm._support.shipped import find_config
+from nmpm.errors import ConfigError
+from nmpm.zoo.registry import check_name
+
+VALIDATIONS = 30
+"""Validations in a training: points of the curve on the card."""
+
+
+@dataclass(frozen=True)
+class Extension:
+    """How a training goes on from its best weights.
+
+    Args:
+        hours: Of each extension.
+        rate: Factor on the configuration's learning rate.
+        gain: Relative improvement of the validation error per extension below which a dataset stops.
+        limit: Hours of all trainings of a dataset.
+    """
+
+    hours: float = 1.0
+    rate: float = 0.5
+    gain: float = 0.03
+    limit: float = 5.0
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset of the queue.
+
+    Args:
+        name: Of its folder and of its entry in the zoo.
+        config: Configuration of `nmpm fit`, as `--config` takes it.
+        hours: Of the first training.
+        publish: Whether its model goes into the zoo.
+        options: Further values of the configuration, by dotted keys.
+        about: What the card says of the data, beside their name.
+    """
+
+    name: str
+    config: str
+    hours: float
+    publish: bool = True
+    options: Mapping[str, Any] = field(default_factory=dict)
+    about: str = ""
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
+        if self.hours <= 0:
+            raise ConfigError(f"{self.name}: hours = {self.hours} must be positive.")
+
+    def generation(self) -> tuple[str, dict[str, Any]] | None:
+        """Name and options of the simulated data, as `nmpm.data.catalog.ensure` takes them; None for recorded data."""
+        data = self._configuration().get("data", {}) | {
+            key.removeprefix("data."): value for key, value in self.options.items() if key.startswith("data.")
+        }
+        if data.get("path") is not None or data.get("name") is None or data.get("source", "disk") != "disk":
+            return None
+        return str(data["name"]), dict(data.get("generate") or {})
+
+    def learning_rate(self) -> float:
+        """The configuration's.
+
+        Raises:
+            ConfigError: if it states none.
+        """
+        try:
+            return float(self._configuration()["model"]["optimizer"]["init_args"]["lr"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(f"{self.config}: model.optimizer.init_args.lr is needed to extend a training.") from error
+
+    def _configuration(self) -> dict[str, Any]:
+        return read_yaml(find_config(self.config))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Datasets in the order in which they are trained."""
+
+    datasets: tuple[Dataset, ...]
+    extension: Extension = Extension()
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The plan of a YAML file.
+
+        Raises:
+            ConfigError: if it lacks a key or has an unknown one, or a name occurs twice.
+            DataError: if it cannot be read.
+        """
+        content = read_yaml(path)
+        try:
+            datasets = tuple(Dataset(**entry) for entry in content["datasets"])
+            extension = Extension(**content.get("extension", {}))
+        except (KeyError, TypeError) as error:
+            raise ConfigError(f"{path}: {error}; see the comments in the queue.yaml that comes with nmpm.") from error
+        names = [dataset.name for dataset in datasets]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        unknown = sorted(set(content) - {"datasets", "extension"})
+        if twice or unknown:
+            raise ConfigError(f"{path}: {', '.join(twice or unknown)}: {'occurs twice' if twice else 'unknown key'}.")
+        return cls(datasets, extension)
+
+    def select(self, names: list[str]) -> Plan:
+        """The plan with these datasets only, in its own order; all of them where no name is given.
+
+        Raises:
+            ConfigError: if there is no dataset of a name.
+        """
+        known = {dataset.name for dataset in self.datasets}
+        unknown = sorted(set(names) - known)
+        if unknown:
+            raise ConfigError(f"The queue has no {', '.join(unknown)}; it has {', '.join(sorted(known))}.")
+        return Plan(tuple(d for d in self.datasets if not names or d.name in names), self.extension)
+
+
+def first_training(dataset: Dataset) -> list[str]:
+    """The words of `nmpm fit` for a dataset's first training, without its folder and device."""
+    return _words(dataset.config, dataset.hours, dataset.options)
+
+
+def extended_training(dataset: Dataset, extension: Extension, best: Path) -> list[str]:
+    """The words of `nmpm fit` for a training from the best weights so far, at a lower learning rate."""
+    rate = extension.rate * dataset.learning_rate()
+    start = {"model.optimizer.init_args.lr": rate, "start_from": str(best)}
+    return _words(dataset.config, extension.hours, {**dataset.options, **start})
+
+
+def _words(config: str, hours: float, options: Mapping[str, Any]) -> list[str]:
+    # Time alone ends the training, so that the learning rate comes down with it; configurations may state steps too.
+    budget = {
+        "trainer.max_steps": -1,
+        "trainer.max_time": _duration(3600 * hours),
+        "trainer.val_check_interval": _duration(3600 * hours / VALIDATIONS),
+    }
+    words = ["fit", "--config", config]
+    for key, value in {**budget, **options}.items():
+        words += [f"--{key}", value if isinstance(value, str) else json.dumps(value)]
+    return words
+
+
+def _duration(seconds: float) -> str:
+    """Seconds as DD:HH:MM:SS, at least one."""
+    whole = timedelta(seconds=max(1, round(seconds)))
+    hours, rest = divmod(whole.seconds, 3600)
+    return f"{whole.days:02}:{hours:02}:{rest // 60:02}:{rest % 60:02}"

@@ -1,0 +1,192 @@
+"""How far the trainings of a dataset are, read from their folders alone, so that a process may die at any time."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nmpm._support.atomic import atomic_write
+from nmpm._support.bounded_files import read_yaml
+from nmpm._support.shipped import find_config
+from nmpm.errors import DataError
+from nmpm.training.checkpoints import read_checkpoint
+from nmpm.zoo.queue.plan import Dataset, Extension, extended_training, first_training
+from nmpm.zoo.runs import BEST
+
+LAST = BEST.with_name("last.ckpt")
+WORDS = "words.json"
+CONFIG = "queued.yaml"
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training of a dataset: a run's folder with the command that it was started by.
+
+    Args:
+        folder: Of the run.
+    """
+
+    folder: Path
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has ended with its test."""
+        return (self.folder / "report.json").is_file()
+
+    @property
+    def best(self) -> Path:
+        """The checkpoint of the lowest validation error; may not exist yet."""
+        return self.folder / BEST
+
+    def start(self, words: list[str]) -> None:
+        """Write down its command and its configuration, which later changes of the shipped one do not touch."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(find_config(words[words.index("--config") + 1]), self.folder / CONFIG)
+        with atomic_write(self.folder / WORDS) as part:
+            part.write_text(json.dumps(words, indent=1), encoding="utf-8")
+
+    def command(self) -> list[str]:
+        """The words of `nmpm fit` that start it or go on with it."""
+        words = [*self._words(), "--trainer.default_root_dir", str(self.folder)]
+        if (self.folder / LAST).is_file():
+            return [*words, "--ckpt_path", "last"]
+        for left in (path for path in self.folder.glob("*") if path.name not in (WORDS, CONFIG)):
+            shutil.rmtree(left) if left.is_dir() else left.unlink()  # of a process that died before a checkpoint
+        return words
+
+    def test_command(self, folder: Path) -> list[str]:
+        """The words of `nmpm test` for the best weights, a copy of which lies in another folder.
+
+        In float32, as `Zoo.load` runs them.
+        """
+        words = self._words()
+        if "--start_from" in words:
+            at = words.index("--start_from")
+            del words[at : at + 2]
+        own = {"default_root_dir": str(folder), "precision": "32-true", "logger": "false"}
+        options = [word for key, value in own.items() for word in (f"--trainer.{key}", value)]
+        return ["test", *words[1:], *options, "--ckpt_path", "best", "--verbose", "false"]
+
+    def curve(self) -> list[list[float]]:
+        """Seconds of training, steps and MSE of each validation so far."""
+        return [list(point) for point in self._record().get("curve", [])]
+
+    def error(self) -> float:
+        """The lowest validation MSE so far; infinite before the first validation."""
+        return min((point[2] for point in self.curve()), default=float("inf"))
+
+    def seconds(self) -> float:
+        """Of training so far, as of its last checkpoint."""
+        record = self._record()
+        return float(record.get("training", record).get("seconds", record.get("trained_seconds", 0.0)))
+
+    def steps(self) -> int:
+        """Of training so far, as of its last checkpoint."""
+        record = self._record()
+        return int(record.get("training", record).get("steps", record.get("trained_steps", 0)))
+
+    def precision(self) -> str:
+        """Of the training, as its command or else its configuration states it."""
+        words = self._words()
+        if "--trainer.precision" in words:
+            return words[words.index("--trainer.precision") + 1]
+        return str(read_yaml(self.folder / CONFIG).get("trainer", {}).get("precision", "32-true"))
+
+    def _words(self) -> list[str]:
+        words: list[str] = json.loads((self.folder / WORDS).read_text(encoding="utf-8"))
+        words[words.index("--config") + 1] = str(self.folder / CONFIG)
+        return words
+
+    def _record(self) -> dict[str, Any]:
+        """The report; before there is one, what the report's writer has in the last checkpoint."""
+        if self.finished:
+            report: dict[str, Any] = json.loads((self.folder / "report.json").read_text(encoding="utf-8"))
+            return report
+        found: list[dict[str, Any]] = [{}]
+        for path in (self.folder / LAST, self.best):
+            try:
+                found.append(read_checkpoint(path).get("callbacks", {}).get("Report", {}))
+            except DataError:  # missing, or damaged
+                continue
+        return max(found, key=lambda state: state.get("trained_seconds", 0.0))
+
+
+@dataclass(frozen=True)
+class History:
+    """The trainings of a dataset.
+
+    Args:
+        dataset: What is trained.
+        folder: Of the dataset's trainings, called 1, 2, ….
+        extension: How the trainings after the first one are made, and when they stop.
+    """
+
+    dataset: Dataset
+    folder: Path
+    extension: Extension
+
+    @property
+    def trainings(self) -> list[Training]:
+        """Those that have been started, in order."""
+        found: list[Training] = []
+        while (path := self.folder / str(len(found) + 1) / WORDS).is_file():
+            found.append(Training(path.parent))
+        return found
+
+    def best(self) -> Training | None:
+        """The training of the lowest validation error; None before the first validation."""
+        validated = [training for training in self.trainings if training.best.is_file() and training.curve()]
+        return min(validated, key=Training.error, default=None)
+
+    def next_round(self) -> int | None:
+        """Number of the training to start or to go on with, from 1; None when the dataset stops."""
+        trainings = self.trainings
+        if trainings and not trainings[-1].finished:
+            return len(trainings)
+        return None if trainings and self.stops() else len(trainings) + 1
+
+    def stops(self) -> bool:
+        """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
+        trainings, extension = self.trainings, self.extension
+        hours = self.dataset.hours + len(trainings) * extension.hours  # with one extension more
+        if hours > extension.limit + 1e-9 or extension.hours <= 0:
+            return True
+        if len(trainings) < 2:
+            return False
+        before = min(training.error() for training in trainings[:-1])
+        return trainings[-1].error() > (1 - extension.gain) * before
+
+    def open(self, number: int) -> Training:
+        """The training of that number, started if it has not been."""
+        trainings = self.trainings
+        if number <= len(trainings):
+            return trainings[number - 1]
+        training, best = Training(self.folder / str(number)), self.best()
+        training.start(
+            first_training(self.dataset) if best is None else extended_training(self.dataset, self.extension, best.best)
+        )
+        return training
+
+    def hours_left(self) -> tuple[float, float]:
+        """Hours of training that are left without further extensions, and with all that the limit allows."""
+        trainings, extension = self.trainings, self.extension
+        if not trainings:
+            left, planned = self.dataset.hours, self.dataset.hours
+        else:
+            planned = self.dataset.hours + (len(trainings) - 1) * extension.hours
+            length = self.dataset.hours if len(trainings) == 1 else extension.hours
+            left = 0.0 if trainings[-1].finished else max(length - trainings[-1].seconds() / 3600, 0.0)
+        if self.next_round() is None:
+            return left, left
+        return left, left + max(extension.limit - planned, 0.0)
+
+    def curve(self) -> list[list[float]]:
+        """Seconds, steps and validation MSE over all trainings, one after the other."""
+        points, seconds, steps = [], 0.0, 0
+        for training in self.trainings:
+            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in training.curve()]
+            seconds, steps = seconds + training.seconds(), steps + training.steps()
+        return points

@@ -1,0 +1,105 @@
+import dataclasses
+
+import pytest
+import torch
+
+from nmpm.emulator import Emulator, EmulatorRecipe, differentiable_rollout, rollout
+from nmpm.emulator.constraints import Constraints
+from nmpm.errors import DataError
+from nmpm.obstacles import Disc, Ramp
+from nmpm.particles import Particles
+from nmpm.processors import UNet
+from tests.scenes import box, cloud
+
+FRAMES = 5  # of which the last bundle is cut
+
+
+def emulator(**constraints) -> Emulator:
+    """In float64, for finite differences; smooth: its linear interpolation has kinks, which they rarely meet."""
+    torch.manual_seed(0)
+    scene = box(obstacles=True, gravity=None, gravity_varies=True)
+    recipe = EmulatorRecipe(scene, 16, frames=2, processor=UNet(4, 1), constraints=Constraints(**constraints))
+    return recipe.build().double().eval().requires_grad_(False)
+
+
+def state(angle: torch.Tensor, **changes: torch.Tensor) -> Particles:
+    particles = cloud(box(obstacles=True), 12)
+    obstacle = Ramp((0.5, 0.35), 0.3, 0.03, angle).particles(0.03).unsqueeze(0)
+    fields = {
+        "position": particles.position.double(),
+        "velocity": particles.velocity.double(),
+        "gravity": torch.tensor([[0.0, -6e-5]], dtype=torch.float64),
+        "obstacle": obstacle,
+        "obstacle_mask": torch.ones(obstacle.shape[:2], dtype=torch.bool),
+    }
+    return dataclasses.replace(particles, **(fields | changes))
+
+
+def loss(model: Emulator, particles: Particles) -> torch.Tensor:
+    return differentiable_rollout(model, particles, FRAMES)[:, -1].sub(0.5).square().sum()
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "gravity"])
+def test_gradients_of_the_state_are_those_of_finite_differences(name):
+    model, angle = emulator(solids=False), torch.tensor(0.4, dtype=torch.float64)
+    value = getattr(state(angle), name).clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda given: loss(model, state(angle, **{name: given})), value, eps=1e-7, atol=1e-5, fast_mode=True
+    )
+
+
+def test_gradients_of_a_ramps_angle_are_those_of_finite_differences():
+    model = emulator(solids=False)
+    angle = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda given: loss(model, state(given)), angle, eps=1e-7, atol=1e-6)
+    loss(model, state(angle)).backward()
+    assert angle.grad.abs() > 1e-9
+
+
+def test_gradients_of_a_discs_place_are_finite_and_not_zero_with_contact():
+    model = emulator()
+    centre = torch.tensor([0.5, 0.4], dtype=torch.float64, requires_grad=True)
+    obstacle = Disc(centre, 0.08).particles(0.03).unsqueeze(0)
+    mask = torch.ones(obstacle.shape[:2], dtype=torch.bool)
+    particles = state(torch.tensor(0.0), obstacle=obstacle, obstacle_mask=mask)
+    loss(model, particles).backward()
+    assert centre.grad.isfinite().all()
+    assert centre.grad.abs().sum() > 0
+
+
+def test_positions_are_those_of_a_rollout():
+    model, particles = emulator(), state(torch.tensor(0.3))
+    with_gradients = differentiable_rollout(model, particles, FRAMES)
+    torch.testing.assert_close(with_gradients, rollout(model, particles, FRAMES), rtol=0, atol=1e-12)
+    assert with_gradients.shape[1] == FRAMES
+
+
+def test_what_a_bundle_keeps_is_recomputed():
+    """The graph holds states, not activations: its tensors do not grow with the network's width."""
+
+    def kept(width: int) -> int:
+        torch.manual_seed(0)
+        recipe = EmulatorRecipe(box(), 16, frames=2, processor=UNet(width, 1))
+        model, total = recipe.build().eval().requires_grad_(False), 0
+
+        def pack(tensor: torch.Tensor) -> torch.Tensor:
+            nonlocal total
+            total += tensor.numel()
+            return tensor
+
+        particles = cloud(box())
+        particles = dataclasses.replace(particles, position=particles.position.requires_grad_())
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            differentiable_rollout(model, particles, 8)
+        return total
+
+    assert kept(4) == kept(16)
+
+
+def test_states_are_checked():
+    model, particles = emulator(), state(torch.tensor(0.0))
+    with pytest.raises(ValueError, match="not 0"):
+        differentiable_rollout(model, particles, 0)
+    outside = dataclasses.replace(particles, position=particles.position + 1)
+    with pytest.raises(DataError, match="outside of the domain"):
+        differentiable_rollout(model, outside, 2)

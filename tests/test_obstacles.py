@@ -1,0 +1,92 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.errors import ConfigError
+from nmpm.obstacles import Disc, Polygon, Ramp
+from nmpm.sim.mpm.ramps import Ramp as SimulatedRamp
+
+SQUARE = [(0.2, 0.3), (0.6, 0.3), (0.6, 0.5), (0.2, 0.5)]
+
+
+@settings(deadline=None)
+@given(st.floats(-3, 3), st.floats(0.05, 0.4), st.floats(0.01, 0.05), st.floats(0.004, 0.02))
+def test_ramps_are_filled_as_those_of_the_simulator(angle, length, thickness, spacing):
+    ramp = Ramp((0.5, 0.4), length, thickness, angle).particles(spacing)
+    simulated = SimulatedRamp((0.5, 0.4), length, thickness, angle).particles(spacing)
+    np.testing.assert_allclose(ramp.numpy(), simulated, atol=1e-12)
+
+
+def test_a_ramp_turns_about_its_end():
+    end = torch.tensor([0.3, 0.6])
+    for angle in (-0.7, 0.0, 1.1):
+        particles = Ramp.from_end(end, length=0.2, thickness=0.01, angle=angle).particles(0.01)
+        along = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+        torch.testing.assert_close((particles - end) @ along, torch.arange(20, dtype=torch.float64) * 0.01 + 0.005)
+
+
+def test_discs_have_one_particle_per_spacing_squared_and_no_particle_outside():
+    particles = Disc((0.5, 0.4), 0.1).particles(0.01)
+    distance = (particles - torch.tensor([0.5, 0.4])).norm(dim=-1)
+    assert len(particles) == round(math.pi * 100)
+    assert distance.max() < 0.1
+    assert (distance < 0.05).sum() == pytest.approx(len(particles) / 4, abs=1)
+    torch.testing.assert_close(particles.mean(0), torch.tensor([0.5, 0.4], dtype=torch.float64), atol=1e-3, rtol=0)
+
+
+def test_a_rectangle_as_polygon_is_the_ramp_that_it_is():
+    polygon = Polygon(SQUARE).particles(0.02)
+    ramp = Ramp((0.4, 0.4), 0.4, 0.2, 0.0).particles(0.02)
+    torch.testing.assert_close(polygon.sort(dim=0).values, ramp.sort(dim=0).values)
+
+
+@settings(deadline=None)
+@given(st.integers(3, 8), st.floats(0, 6))
+def test_polygons_are_filled_evenly_either_way_round(corners, turn):
+    angles = turn + 2 * math.pi * torch.arange(corners, dtype=torch.float64) / corners
+    outline = 0.5 + 0.2 * torch.stack([torch.cos(angles), torch.sin(angles)], dim=-1)
+    area = corners / 2 * 0.2**2 * math.sin(2 * math.pi / corners)
+    there, back = Polygon(outline).particles(0.01), Polygon(outline.flip(0)).particles(0.01)
+    assert len(there) == pytest.approx(area / 0.01**2, rel=0.12)
+    torch.testing.assert_close(there.mean(0), back.mean(0), atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters"),
+    [
+        (lambda angle, length: Ramp((0.5, 0.4), length, 0.03, angle), (0.3, 0.2)),
+        (lambda x, length: Ramp.from_end((x, 0.4), length, 0.03, x), (0.3, 0.2)),
+        (lambda x, radius: Disc((x, 0.4), radius), (0.5, 0.06)),
+    ],
+)
+def test_gradients_are_those_of_finite_differences(make, parameters):
+    values = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in parameters]
+    assert torch.autograd.gradcheck(lambda *given: make(*given).particles(0.013), values)
+
+
+def test_particles_of_a_polygon_follow_every_affine_motion_of_its_corners():
+    corners = torch.tensor(SQUARE, dtype=torch.float64)
+    motion = torch.tensor([[0.3, -1.0], [0.4, 2.0]], dtype=torch.float64)
+    particles, moved = torch.autograd.functional.jvp(
+        lambda given: Polygon(given).particles(0.02), corners, corners @ motion + 1.0
+    )
+    torch.testing.assert_close(moved, particles @ motion + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Disc((0.5, 0.5), 0.0).particles(0.01), "radius = 0"),
+        (lambda: Ramp((0.5, 0.5), float("nan"), 0.1, 0.0).particles(0.01), "side = nan"),
+        (lambda: Disc((0.5, 0.5), 0.1).particles(0.0), "spacing = 0"),
+        (lambda: Polygon(SQUARE[:2]), "three or more corners"),
+        (lambda: Polygon([SQUARE[0], SQUARE[2], SQUARE[1], SQUARE[3]]), "convex"),
+    ],
+)
+def test_impossible_bodies_are_refused(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()

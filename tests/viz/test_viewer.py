@@ -1,0 +1,127 @@
+import base64
+import json
+import re
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm import view
+from nmpm.cli import main
+from nmpm.data.format import Trajectory, write_metadata, write_split
+from nmpm.errors import ConfigError, DataError
+from nmpm.viz import LabelledTrajectories
+from nmpm.viz.viewer.packing import STEPS, pack_positions, quantize
+from tests.conftest import made_up_metadata, made_up_trajectory
+
+
+def unpack(text: str, shape: tuple[int, ...]) -> np.ndarray:
+    raw = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8).astype(np.uint16)
+    low, high = raw.reshape(2, -1)
+    return (low | high << 8).reshape(shape).cumsum(axis=0, dtype=np.uint16)
+
+
+def description(page) -> dict:
+    return json.loads(re.search(r'type="application/json">(.*?)</script>', page.html, re.DOTALL)[1])
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(1, 9), st.sampled_from([2, 3]))
+def test_positions_come_back_within_half_a_step(seed, frames, count, dim):
+    rng = np.random.default_rng(seed)
+    low, high = np.sort(rng.normal(scale=10, size=(2, dim)), axis=0) + np.array([[-1e-3], [1e-3]])
+    position = rng.uniform(low, high, size=(frames, count, dim))
+    steps = unpack(pack_positions(quantize(position, low, high)), position.shape)
+    assert np.all(np.abs(low + steps * (high - low) / STEPS - position) <= 0.5001 * (high - low) / STEPS)
+
+
+def test_the_page_describes_frames_box_and_errors(falling):
+    shown = description(view(falling))
+    assert [each["label"] for each in shown["trajectories"]] == list(falling.positions)
+    assert (shown["frames"], shown["dim"], shown["dt"]) == (falling.frame_count, falling.dim, falling.dt)
+    label, errors = next(iter(falling.rms_errors().items()))
+    assert shown["trajectories"][1]["label"] == label
+    assert shown["trajectories"][1]["errors"] == pytest.approx(errors, rel=1e-5)
+
+
+def test_every_second_frame_takes_twice_the_time(falling):
+    shown = description(view(falling, every=2))
+    assert (shown["frames"], shown["every"]) == ((falling.frame_count + 1) // 2, 2)
+    assert shown["dt"] == pytest.approx(2 * falling.dt)
+    with pytest.raises(ConfigError, match="every = 0"):
+        view(falling, every=0)
+
+
+def test_the_page_loads_nothing_from_elsewhere(falling):
+    page = view(falling).html
+    assert not re.findall(r"""(?:src|href)=|url\(|https?://|import\(""", page)
+
+
+def test_names_cannot_leave_the_data():
+    hostile = "</script><script>alert(1)</script>"
+    trajectories = LabelledTrajectories(
+        {hostile: np.full((2, 1, 2), 0.5)}, np.array([hostile]), bounds=((0, 1), (0, 1)), dt=1.0, title=hostile
+    )
+    page = view(trajectories)
+    assert "alert(1)</script>" not in page.html
+    assert description(page)["title"] == hostile
+    assert "<script>alert" not in page._repr_html_()
+
+
+def test_a_notebook_shows_the_page_in_a_frame(falling):
+    shown = view(falling)._repr_html_()
+    assert shown.startswith("<iframe srcdoc=")
+    assert 'sandbox="allow-scripts"' in shown
+
+
+@pytest.fixture
+def dataset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_metadata(tmp_path, made_up_metadata())
+    truth = made_up_trajectory(6, 5, statics=2)
+    write_split(tmp_path / "test.h5", [made_up_trajectory(6, 5, seed=9), truth])
+    longer = made_up_trajectory(8, 5, statics=2)
+    moved = np.r_[truth.position[:2], longer.position[2:] + 0.01]
+    write_split(tmp_path / "out.h5", [Trajectory(moved, truth.particle_type, {})])
+    return tmp_path
+
+
+def test_view_compares_with_the_truth_over_common_frames(dataset, capsys):
+    assert main(["view", "out.h5", "test.h5", "--truth-trajectory", "1"]) == 0
+    assert re.match(r"wrote out.html \(0\.\d MB\)", capsys.readouterr().out)
+    shown = description(view(dataset / "out.h5"))
+    assert shown["frames"] == 8
+    page = (dataset / "out.html").read_text(encoding="utf-8")
+    compared = json.loads(re.search(r'type="application/json">(.*?)</script>', page, re.DOTALL)[1])
+    assert compared["frames"] == 6
+    errors = compared["trajectories"][1]["errors"]
+    assert errors[:2] == [0, 0]
+    assert all(error > 0 for error in errors[2:])
+
+
+@pytest.mark.usefixtures("dataset")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["view", "out.h5", "test.h5"], "do not start at the same positions"),
+        (["view", "nowhere.h5"], "nowhere.h5"),
+        (["view", "out.h5", "--out", "page.png"], "must end in .html"),
+        (["view", "out.h5", "--out", "missing/page.html"], "missing"),
+        (["view", "out.h5", "--every", "0"], "--every 0"),
+        (["view", "out.h5", "--trajectory", "3"], "trajectories 0 … 0"),
+    ],
+)
+def test_mistakes_are_one_line_and_write_nothing(words, message, dataset, capsys):
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(dataset.glob("*.html"))
+
+
+def test_other_particles_are_refused(dataset):
+    write_split(dataset / "fewer.h5", [made_up_trajectory(6, 4)])
+    with pytest.raises(DataError, match="5 moving ones in 2-D, and 4"):
+        view(dataset / "fewer.h5", truth=dataset / "test.h5")

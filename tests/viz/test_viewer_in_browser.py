@@ -1,0 +1,159 @@
+"""The viewer's page in headless Chromium: what a person clicks, presses and sees."""
+
+import io
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nmpm import view
+from nmpm.viz import LabelledTrajectories
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+OPTIONS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
+WATER = (38, 112, 200)
+
+
+def wait_until(page, condition):
+    """Waits for a JavaScript condition (the page's policy forbids playwright's own way, which evaluates text)."""
+    for _ in range(200):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(25)
+    pytest.fail(f"not within 5 s: {condition}")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed")
+    with playwright.sync_playwright() as running:
+        chromium = running.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def open_page(browser, tmp_path):
+    """Writes and opens a page; fails at the end if it logged an error."""
+    context = browser.new_context(viewport={"width": 900, "height": 640})
+    errors = []
+
+    def opened(trajectories):
+        path = view(trajectories).write(tmp_path / "page.html")
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.goto(path.as_uri())
+        wait_until(page, "window.viewer && viewer.drawn > 0")
+        return page
+
+    yield opened
+    context.close()
+    assert not errors
+
+
+def one_particle(frames=40, dim=2):
+    """A large particle that crosses the box along x; its prediction stays where it was."""
+    position = np.full((frames, 1, dim), 0.5)
+    position[:, 0, 0] = np.linspace(0.1, 0.9, frames)
+    labels = {"simulated": position, "prediction": np.repeat(position[:1], frames, axis=0)}
+    return LabelledTrajectories(labels, np.array(["water"]), bounds=((0.0, 1.0),) * dim, dt=0.01)
+
+
+def picture(page):
+    """The canvas as it is on the screen, (height, width, 3)."""
+    drawn = page.evaluate("viewer.drawn")
+    page.evaluate("viewer.show()")
+    wait_until(page, f"viewer.drawn > {drawn}")
+    return np.asarray(Image.open(io.BytesIO(page.locator("#scene").screenshot())).convert("RGB")).astype(int)
+
+
+def water_columns(page):
+    """Mean column of the water-coloured pixels of each panel, as a share of the panel's width."""
+    pixels = picture(page)
+    blue = np.abs(pixels - WATER).sum(axis=2) < 40
+    half = pixels.shape[1] // 2
+    return [float(np.nonzero(part)[1].mean() / half) for part in (blue[:, :half], blue[:, half:])]
+
+
+def test_playing_advances_and_the_button_stops(open_page):
+    page = open_page(one_particle())
+    page.click("#play")
+    wait_until(page, "viewer.frame > 5")
+    page.click("#play")
+    stopped = page.evaluate("viewer.frame")
+    page.wait_for_timeout(200)
+    assert page.evaluate("viewer.frame") == stopped
+    assert page.locator("#play").get_attribute("aria-label") == "Play"
+
+
+def test_particles_are_drawn_where_they_are(open_page):
+    page = open_page(one_particle())
+    left, right = water_columns(page)
+    page.keyboard.press("End")
+    moved, still = water_columns(page)
+    assert left == pytest.approx(right, abs=0.01)
+    assert still == pytest.approx(right, abs=0.01)
+    assert moved - left == pytest.approx(1 - 2 * left, abs=0.02)  # from one side to the other, by symmetry
+    assert moved > 0.8
+
+
+def test_keys_seek_and_choose(open_page):
+    page = open_page(one_particle())
+    for key, frame in (("ArrowRight", 1), ("Shift+ArrowRight", 11), ("ArrowLeft", 10), ("End", 39), ("Home", 0)):
+        page.keyboard.press(key)
+        assert page.evaluate("viewer.frame") == frame
+    assert "frame 0 of 39" in page.locator("#time").inner_text()
+    for colour in ("speed", "error", "material"):
+        page.keyboard.press("c")
+        assert page.evaluate("viewer.colour") == colour
+    page.keyboard.press("o")
+    wait_until(page, "document.querySelectorAll('#labels span').length === 1")
+    assert "prediction over simulated" in page.locator("#labels").inner_text()
+    before = page.evaluate("document.documentElement.dataset.theme")
+    page.keyboard.press("t")
+    assert {before, page.evaluate("document.documentElement.dataset.theme")} == {"light", "dark"}
+
+
+def test_the_error_and_its_curve_follow_the_frame(open_page):
+    page = open_page(one_particle())
+    page.keyboard.press("End")
+    wait_until(page, "document.getElementById('error-now').textContent.includes('0.8 ')")
+    box = page.locator("#curve").bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
+    assert page.evaluate("viewer.frame") == pytest.approx(19.5, abs=1)
+
+
+def test_the_wheel_zooms_and_reset_shows_all(open_page):
+    page = open_page(one_particle())
+    whole = picture(page)
+    page.mouse.move(225, 300)
+    page.mouse.wheel(0, -300)
+    wait_until(page, "viewer.camera.zoom > 1.5")
+    assert np.abs(picture(page) - whole).sum() > 0
+    page.click("#reset")
+    assert page.evaluate("viewer.camera.zoom") == 1
+
+
+def test_dragging_turns_a_box_of_three_dimensions(open_page):
+    page = open_page(one_particle(dim=3))
+    before = picture(page)
+    page.mouse.move(200, 300)
+    page.mouse.down()
+    page.mouse.move(260, 320, steps=4)
+    page.mouse.up()
+    assert page.evaluate("viewer.camera.turn") != 0.5
+    assert np.abs(picture(page) - before).sum() > 0
+
+
+def test_a_single_trajectory_has_no_error_to_show(open_page):
+    alone = one_particle()
+    page = open_page(
+        LabelledTrajectories({"recorded": alone.positions["simulated"]}, alone.material, alone.bounds, 0.01)
+    )
+    assert page.locator("#errors").is_hidden()
+    assert page.locator("#layout-choice").is_hidden()
+    assert page.locator("#colour option").count() == 2

@@ -1,0 +1,190 @@
+"""The training of the zoo: rounds, extensions, interruptions by kill -9, locks, and the entries that come of it."""
+
+import csv
+import json
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from nmpm.errors import ConfigError
+from nmpm.zoo import Zoo
+from nmpm.zoo.queue.plan import Dataset, Extension, Plan, extended_training, first_training
+from nmpm.zoo.queue.trainings import History
+
+SCRIPT = Path(__file__).parents[2] / "zoo" / "train.py"
+if not SCRIPT.is_file():
+    pytest.skip("the script is not part of this distribution", allow_module_level=True)
+TINY = {
+    "model.unroll": 1, "model.cells": 16, "model.processor.width": 4, "model.processor.depth": 1, "model.mirror": [],
+    "data.batch_size": 2, "trainer.precision": "32-true", "trainer.enable_progress_bar": False,
+    "trainer.log_every_n_steps": 1, "resume.every_n_train_steps": 5, "model.schedule.warmup": 1,
+}  # fmt: skip
+
+
+@pytest.fixture
+def queue(make_dataset, tmp_path, monkeypatch):
+    """Writes a queue of one dataset in the working directory; `hours` of its first training."""
+    monkeypatch.chdir(tmp_path)
+    sizes = ((40, 9),) * 2
+    data = str(make_dataset(train=sizes, valid=sizes, test=sizes))
+
+    def write(hours: float, /, **extension: float) -> Path:
+        entry = {"name": "small", "config": "waterdrop.yaml", "hours": hours, "options": TINY | {"data.path": data}}
+        path = tmp_path / "queue.yaml"
+        path.write_text(yaml.safe_dump({"extension": extension or {"hours": 0}, "datasets": [entry]}))
+        return path
+
+    return write
+
+
+def words(queue: Path, *more: str) -> list[str]:
+    return ["--queue", str(queue), "--runs", "runs", "--zoo", "zoo", "--device", "cpu", *more]
+
+
+def train(queue: Path, *more: str) -> int:
+    return runpy.run_path(str(SCRIPT))["main"](words(queue, *more))
+
+
+def finished(folder: Path, *errors: float) -> None:
+    """What trainings of half an hour each leave, with these validation errors."""
+    for number, error in enumerate(errors, 1):
+        run = folder / str(number)
+        (run / "checkpoints").mkdir(parents=True)
+        (run / "checkpoints" / "best.ckpt").touch()
+        (run / "words.json").write_text("[]")
+        report = {"training": {"seconds": 1800.0, "steps": 10}, "curve": [[900.0, 5, 2 * error], [1800.0, 10, error]]}
+        (run / "report.json").write_text(json.dumps(report))
+
+
+@pytest.mark.parametrize(
+    ("errors", "following"),
+    [([], 1), ([0.5], 2), ([0.5, 0.48], 3), ([0.5, 0.49], None), ([0.5, 0.6], None), ([0.5, 0.4, 0.2, 0.1], None)],
+    ids=str,
+)
+def test_a_dataset_is_extended_until_that_gains_too_little_or_its_hours_are_over(tmp_path, errors, following):
+    finished(tmp_path, *errors)
+    extension = Extension(hours=0.5, gain=0.03, limit=2.0)
+    history = History(Dataset("small", "goop.yaml", 0.5), tmp_path, extension)
+    assert history.next_round() == following
+    least, most = history.hours_left()
+    assert least == (0.0 if errors else 0.5)
+    assert most == (0.0 if following is None else 2.0 - 0.5 * len(errors))
+
+
+def test_the_curve_goes_on_over_the_trainings_and_the_best_of_them_is_taken(tmp_path):
+    finished(tmp_path, 0.5, 0.25, 0.75)
+    history = History(Dataset("small", "goop.yaml", 0.5), tmp_path, Extension())
+    assert history.best().folder.name == "2"
+    assert history.curve()[:4] == [[900.0, 5, 1.0], [1800.0, 10, 0.5], [2700.0, 15, 0.5], [3600.0, 20, 0.25]]
+
+
+def test_time_alone_ends_a_training_and_an_extension_starts_at_a_lower_rate():
+    dataset = Dataset("goop", "goop.yaml", 26.5, options={"data.batch_size": 2})
+    first = first_training(dataset)
+    assert first[:3] == ["fit", "--config", "goop.yaml"]
+    options = dict(zip(first[3::2], first[4::2], strict=True))
+    assert options["--trainer.max_steps"] == "-1"
+    assert options["--trainer.max_time"] == "01:02:30:00"
+    assert options["--data.batch_size"] == "2"
+    later = extended_training(dataset, Extension(hours=1, rate=0.5), Path("best.ckpt"))
+    options = dict(zip(later[3::2], later[4::2], strict=True))
+    assert options["--trainer.max_time"] == "00:01:00:00"
+    assert float(options["--model.optimizer.init_args.lr"]) == pytest.approx(0.003)
+    assert options["--start_from"] == "best.ckpt"
+
+
+def test_the_shipped_queue_is_read_and_simulates_what_its_configurations_say():
+    plan = Plan.read(SCRIPT.with_name("queue.yaml"))
+    simulated = {dataset.name: dataset.generation() for dataset in plan.datasets}
+    assert simulated["dambreak2d"] == ("dambreak2d", {"counts": {"train": 40, "valid": 4, "test": 10}})
+    assert simulated["waterdrop-simulated"] == ("waterdrop", {})
+    assert Dataset("waterdrop", "waterdrop.yaml", 1).generation() is None
+
+
+def test_mistakes_in_a_queue_are_named(queue, tmp_path):
+    path = queue(1.0)
+    with pytest.raises(ConfigError, match=r"has no lava; it has small"):
+        Plan.read(path).select(["lava"])
+    content = yaml.safe_load(path.read_text())
+    for change, complaint in (
+        ({"datasets": [dict(content["datasets"][0]) | {"options": {}} for _ in range(2)]}, "small: occurs twice"),
+        ({"dataset": []}, "dataset: unknown key"),
+        ({"datasets": [{"name": "small"}]}, "config"),
+        ({"datasets": [content["datasets"][0] | {"hours": 0}]}, "hours = 0 must be positive"),
+    ):
+        path.write_text(json.dumps(content | change))
+        with pytest.raises(ConfigError, match=complaint):
+            Plan.read(path)
+
+
+def test_trainings_and_an_extension_become_an_entry_with_their_curve(queue, capsys):
+    path = queue(2 / 3600, hours=1 / 3600, gain=-9.0, limit=3.1 / 3600)
+    assert train(path) == 0
+    assert "Failed: none" in capsys.readouterr().out
+    card = Zoo.card("small", "zoo")
+    runs = [json.loads(Path(f"runs/small/{n}/report.json").read_text()) for n in (1, 2)]
+    assert [len(run["curve"]) >= 1 for run in runs] == [True, True]
+    assert len(card["curve"]) == sum(len(run["curve"]) for run in runs)
+    assert card["curve"] == sorted(card["curve"])
+    assert card["training"]["precision"] == "32-true"
+    assert card["training"]["steps"] <= sum(run["training"]["steps"] for run in runs)
+    assert Zoo.load("small", "zoo").emulator.calibrated
+    before = {file: file.stat().st_mtime_ns for file in Path("runs").rglob("*.ckpt")}
+    assert train(path) == 0  # nothing is left
+    assert before == {file: file.stat().st_mtime_ns for file in Path("runs").rglob("*.ckpt")}
+
+
+def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    folder = Path("zoo/small")
+    card = yaml.safe_load((folder / "card.yaml").read_text())
+    card["test"]["mse"] = 0.0
+    (folder / "card.yaml").write_text(yaml.safe_dump(card))
+    capsys.readouterr()
+    assert train(path, "--collect") == 0
+    assert "is kept" in capsys.readouterr().out
+    assert Zoo.card("small", "zoo")["test"]["mse"] == 0.0
+
+
+def test_a_dataset_that_another_process_has_is_left_to_it(queue, capsys):
+    path = queue(1 / 3600)
+    script = runpy.run_path(str(SCRIPT))
+    with script["taken"](Path("runs/small")) as mine:
+        assert mine
+        assert script["main"](words(path)) == 0
+    assert "nothing is left to take" in capsys.readouterr().out
+    assert not Path("runs/small/1").exists()
+
+
+@pytest.mark.slow
+def test_a_killed_queue_goes_on_within_its_time_and_the_rate_comes_down_once(queue):
+    path = queue(8 / 3600)
+    last = Path("runs/small/1/checkpoints/last.ckpt")
+    command = [sys.executable, str(SCRIPT), *words(path, "--threads", "1")]
+    first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    end = time.monotonic() + 120
+    while not last.is_file() and time.monotonic() < end:
+        time.sleep(0.1)
+    time.sleep(1)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.wait()
+    assert last.is_file()
+    assert train(path) == 0
+    training = json.loads(Path("runs/small/1/report.json").read_text())["training"]
+    assert training["seconds"] >= 8
+    rates = []
+    for table in sorted(Path("runs/small/1/logs").glob("version_*/metrics.csv")):
+        with table.open() as file:
+            rates.append([float(row["lr-SOAP"]) for row in csv.DictReader(file) if row.get("lr-SOAP")])
+    assert len(rates) == 2
+    assert rates[1][-1] < 0.05 * max(rates[0])
+    assert rates[1] == sorted(rates[1], reverse=True)
+    assert max(rates[1]) <= max(rates[0])

@@ -1,0 +1,219 @@
+"""Train the models of the zoo, one dataset after the other, and make their entries.
+
+    python zoo/train.py                      # all of queue.yaml, in its order
+    python zoo/train.py --threads 1          # once per core, or with --device cuda:0, cuda:1 once per GPU
+    python zoo/train.py goop wbcsph --hours 8
+    python zoo/train.py --status
+    python zoo/train.py --collect            # make entries of the best weights so far, also while others train
+
+A dataset is simulated first if it is missing. Everything lies in `runs/zoo/NAME`; after any interruption, kill -9 too,
+the same command goes on from the last checkpoint. Several of these processes share the work: each takes a dataset that
+no other one has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import fcntl
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nmpm.zoo.queue.plan import Dataset, Plan
+    from nmpm.zoo.queue.trainings import History
+
+HERE = Path(__file__).parent
+
+
+def parse(words: list[str] | None = None) -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="datasets to train (default: all of the queue)")
+    parser.add_argument("--queue", type=Path, default=HERE / "queue.yaml", help="what to train (zoo/queue.yaml)")
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs/zoo"), help="folder of the trainings (default: runs/zoo)"
+    )
+    parser.add_argument("--zoo", type=Path, default=HERE, help="folder of the entries (default: that of this script)")
+    parser.add_argument("--hours", type=float, help="stop after this time; the next call goes on")
+    parser.add_argument("--threads", type=int, help="processor threads of this process (default: all)")
+    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1, mps")
+    parser.add_argument("--status", action="store_true", help="print how far each dataset is, and train nothing")
+    parser.add_argument("--collect", action="store_true", help="make entries of the best weights, and train nothing")
+    return parser.parse_args(words)
+
+
+def main(words: list[str] | None = None) -> int:
+    """Run the queue; the exit status is 0 if nothing failed, 130 after an interruption."""
+    chosen = parse(words)
+    if chosen.threads is not None:  # before numerical libraries are imported
+        for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+            os.environ[variable] = str(chosen.threads)
+    from nmpm.errors import NmpmError
+    from nmpm.zoo.queue.plan import Plan
+
+    try:
+        plan = Plan.read(chosen.queue).select(chosen.names)
+        if chosen.status:
+            return print_status(plan, chosen.runs)
+        if chosen.collect:
+            return max([collect_entry(history, chosen.zoo) for history in histories(plan, chosen.runs)], default=0)
+        with interruptions(chosen.hours):
+            return train_all(plan, chosen)
+    except NmpmError as error:
+        say(f"error: {error}")
+        return 1
+    except KeyboardInterrupt:
+        say("stopped; the same command goes on.")
+        return 130
+
+
+def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
+    """Train until no dataset is left that this process could take."""
+    failed: set[str] = set()
+    while True:
+        done = False
+        for history, number in ready(plan, chosen.runs, failed):
+            with taken(history.folder) as mine:
+                if not mine or history.next_round() != number:
+                    continue
+                done = True
+                say(f"{history.dataset.name}, training {number}. {remaining(plan, chosen.runs)}")
+                if not train(history, number, chosen):
+                    failed.add(history.dataset.name)
+            break
+        if not done:
+            names = ", ".join(sorted(failed)) or "none"
+            say(f"nothing is left to take. {remaining(plan, chosen.runs)} Failed: {names}.")
+            return 1 if failed else 0
+
+
+def ready(plan: Plan, runs: Path, failed: set[str]) -> Iterator[tuple[History, int]]:
+    """Datasets with the number of their next training: all first ones, then all second ones, …."""
+    rounds = [(number, order, history) for order, history in enumerate(histories(plan, runs))
+              if (number := history.next_round()) is not None and history.dataset.name not in failed]  # fmt: skip
+    yield from ((history, number) for number, _, history in sorted(rounds, key=lambda entry: entry[:2]))
+
+
+def train(history: History, number: int, chosen: argparse.Namespace) -> bool:
+    """Simulate what is missing, train, and make the entry; False where something failed."""
+    from nmpm.cli import main as nmpm
+    from nmpm.errors import NmpmError
+
+    try:
+        simulate(history.dataset, chosen.threads)
+        words = [*history.open(number).command(), *device_options(chosen.device)]
+        status = nmpm(words)
+    except NmpmError as error:
+        say(f"{history.dataset.name}: {error}")
+        return False
+    except Exception:
+        say(f"{history.dataset.name}: {traceback.format_exc()}")
+        return False
+    if status == 130:
+        raise KeyboardInterrupt
+    return status == 0 and collect_entry(history, chosen.zoo) == 0
+
+
+def simulate(dataset: Dataset, threads: int | None) -> None:
+    """Simulate the dataset if it is missing, a trajectory per thread at a time."""
+    from nmpm.data.catalog import ensure
+
+    generation = dataset.generation()
+    if generation is not None:
+        name, options = generation
+        say(f"{dataset.name}: data in {ensure(name, **{'workers': threads, **options})}.")
+
+
+def collect_entry(history: History, zoo: Path) -> int:
+    """Make the entry of the best weights so far; the exit status."""
+    from nmpm.cli import main as nmpm
+    from nmpm.errors import NmpmError
+    from nmpm.zoo.queue.collection import collect
+
+    if not history.dataset.publish:
+        return 0
+    try:
+        say(collect(history, zoo, nmpm))
+    except NmpmError as error:
+        say(f"{history.dataset.name}: {error}")
+        return 1
+    return 0
+
+
+def device_options(device: str) -> list[str]:
+    """Words of `nmpm fit` for one device."""
+    kind, _, index = device.partition(":")
+    return ["--trainer.accelerator", kind, "--trainer.devices", f"[{index}]" if index else "1"]
+
+
+def histories(plan: Plan, runs: Path) -> list[History]:
+    """How far each dataset is."""
+    from nmpm.zoo.queue.trainings import History
+
+    return [History(dataset, runs / dataset.name, plan.extension) for dataset in plan.datasets]
+
+
+def remaining(plan: Plan, runs: Path) -> str:
+    """Hours of training that are left, in words."""
+    hours = [history.hours_left() for history in histories(plan, runs)]
+    least, most = (sum(column) for column in zip(*hours, strict=True)) if hours else (0.0, 0.0)
+    return f"Left: {least:.1f} h of training, {most:.1f} h if every dataset is extended to its limit."
+
+
+def print_status(plan: Plan, runs: Path) -> int:
+    """A line per dataset."""
+    for history in histories(plan, runs):
+        trainings, best = history.trainings, history.best()
+        hours = sum(training.seconds() for training in trainings) / 3600
+        error = "not validated" if best is None else f"validation MSE {1e3 * best.error():.4g} ×10⁻³"
+        state = "stopped" if history.next_round() is None else f"training {history.next_round()}"
+        sys.stdout.write(f"{history.dataset.name:<22} {state:<12} {hours:5.2f} h  {error}\n")
+    sys.stdout.write(f"{remaining(plan, runs)}\n")
+    return 0
+
+
+@contextlib.contextmanager
+def taken(folder: Path) -> Iterator[bool]:
+    """Whether this process has the dataset to itself; the lock ends with the process, however it ends."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+        else:
+            yield True
+
+
+@contextlib.contextmanager
+def interruptions(hours: float | None) -> Iterator[None]:
+    """Stop at SIGTERM as at Ctrl-C, and by SIGTERM to itself when the time is over: trainings write a checkpoint."""
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    timer = None if hours is None else threading.Timer(3600 * hours, os.kill, (os.getpid(), signal.SIGTERM))
+    try:
+        if timer is not None:
+            timer.daemon = True
+            timer.start()
+        yield
+    finally:
+        if timer is not None:
+            timer.cancel()
+        signal.signal(signal.SIGTERM, former)
+
+
+def say(text: str) -> None:
+    """Write a line with the time of day."""
+    sys.stdout.write(f"\n[{time.strftime('%F %T')}] {text}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
