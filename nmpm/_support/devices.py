@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import platform
+from pathlib import Path
+
 import torch
 
 from nmpm._support.messages import one_line
@@ -35,3 +38,20 @@ def find_device(name: torch.device | str = "auto") -> torch.device:
             f"This machine has no device {str(device)!r}; it has {', '.join(h for h in here if h != 'meta')}."
         )
     return device
+
+
+def device_name(device: torch.device) -> str:
+    """The model of a device: of the GPU, or of the processor with the number of threads that torch uses."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "cpu":
+        return f"{_processor()}, {torch.get_num_threads()} threads"
+    return device.type
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

@@ -21,6 +21,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from nmpm._support.devices import device_name
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
 from nmpm.cli.options import check_folder
@@ -31,7 +32,7 @@ from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from nmpm.training.callbacks.progress import Progress
-from nmpm.training.callbacks.report import ReportWriter, device_name
+from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.module import EmulatorModule

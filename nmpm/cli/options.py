@@ -13,7 +13,10 @@ from nmpm.errors import ConfigError
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
 
-MODEL = "a model of the zoo (see nmpm zoo list), or a path: a run, a checkpoint, or an entry's folder"
+MODEL = (
+    "a model of the zoo (see nmpm zoo list); a path: a run, a checkpoint, or an entry's folder; or an id of the Hugging"
+    " Face hub, owner/repository@revision"
+)
 """Help for arguments that `nmpm.zoo.load_model` takes."""
 
 

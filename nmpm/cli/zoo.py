@@ -1,18 +1,20 @@
-"""`nmpm zoo list | card NAME | add RUN NAME`."""
+"""`nmpm zoo list | card NAME | add RUN NAME | verify NAME | refresh NAME | push NAME ID | pull ID`."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+from nmpm.cli.options import add_device_option, check_device
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
 
 
-def run(words: list[str]) -> None:
-    """Run a zoo command, e.g. ["zoo", "list"]."""
+def run(words: list[str]) -> int | None:
+    """Run a zoo command, e.g. ["zoo", "list"]; the exit status."""
     parser = argparse.ArgumentParser(prog="nmpm zoo", description="The pretrained models.")
     parser.add_argument("--root", type=Path, help=_ROOT)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -23,24 +25,51 @@ def run(words: list[str]) -> None:
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="name of the new model, e.g. goop/mine")
     add.add_argument("--about", default="", help="description of the data and their origin, for the card")
-    for command in (listing, card, add):
+    verify = commands.add_parser("verify", help="measure the figures of cards again; 1 if one is not confirmed")
+    verify.add_argument("name", nargs="?", help="(default: every model)")
+    verify.add_argument("--full", action="store_true", help="all test scenes to their end (default: a few, 100 frames)")
+    verify.add_argument("--data", type=Path, metavar="FOLDER", help="test data, of models of recorded data")
+    add_device_option(verify)
+    refresh = commands.add_parser("refresh", help="write READMEs, charts and the table of --root's models again")
+    refresh.add_argument("name", nargs="?", help="(default: every model)")
+    refresh.add_argument("--measure", action="store_true", help="time rollouts on this machine for the cards")
+    push = commands.add_parser("push", help="upload a model to the Hugging Face hub")
+    push.add_argument("name")
+    push.add_argument("repository", help="owner/repository, created if missing")
+    push.add_argument("--private", action="store_true", help="of a new repository")
+    pull = commands.add_parser("pull", help="download a model of the Hugging Face hub")
+    pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
+    pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
+    refresh.add_argument("--twin", action="store_true", help="simulate test scenes beside themselves, for the cards")
+    for command in (listing, card, add, verify, refresh, push, pull):
         command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
     chosen = parser.parse_args(words[1:])
-    {"list": _list, "card": _card, "add": _add}[chosen.command](chosen)
+    actions: dict[str, Callable[[argparse.Namespace], int | None]] = {
+        "list": _list,
+        "card": _card,
+        "add": _add,
+        "verify": _verify,
+        "refresh": _refresh,
+        "push": _push,
+        "pull": _pull,
+    }
+    return actions[chosen.command](chosen)
 
 
 def _list(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ZooError
+    from nmpm.zoo.lifecycle import lifecycle
     from nmpm.zoo.registry import Zoo
 
     for name in Zoo.list(chosen.root):
         own = "yours" if chosen.root is None and Zoo.folder(name).is_relative_to(user_zoo()) else ""
         try:
-            text = _summary(Zoo.card(name, chosen.root))
+            card = Zoo.card(name, chosen.root)
+            state, text = str(lifecycle(card)), _summary(card)
         except ZooError as error:
-            text = str(error)
-        sys.stdout.write(f"{name:<20} {own:<6} {text}\n")
+            state, text = "", str(error)
+        sys.stdout.write(f"{name:<20} {own:<6} {state:<10} {text}\n")
 
 
 def _summary(card: Mapping[str, Any]) -> str:
@@ -63,3 +92,63 @@ def _add(chosen: argparse.Namespace) -> None:
 
     folder = add(chosen.run, chosen.name, chosen.root, chosen.about)
     sys.stdout.write(f"added {folder}\n")
+
+
+def _verify(chosen: argparse.Namespace) -> int:
+    """Verify a model, which must be possible; or all, of which those of recorded data may be left out."""
+    from nmpm.errors import ConfigError
+    from nmpm.zoo.registry import Zoo
+    from nmpm.zoo.verification import verify
+
+    check_device(chosen.device)
+    failed = 0
+    for name in Zoo.list(chosen.root) if chosen.name is None else [chosen.name]:
+        sys.stdout.write(f"{name}\n")
+        try:
+            for check in verify(Zoo.load(name, chosen.root, chosen.device), chosen.full, chosen.data):
+                sys.stdout.write(f"  {check}\n")
+                failed += not check.passed
+        except ConfigError as error:
+            if chosen.name is not None:
+                raise
+            sys.stdout.write(f"  not verified: {error}\n")
+    sys.stdout.write(f"{failed} figures are not confirmed.\n" if failed else "All that was measured is confirmed.\n")
+    return 1 if failed else 0
+
+
+def _refresh(chosen: argparse.Namespace) -> None:
+    from nmpm._support.shipped import user_zoo
+    from nmpm.zoo.index import refresh, write_index
+    from nmpm.zoo.registry import Zoo
+
+    root = user_zoo() if chosen.root is None else chosen.root
+    for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
+        refresh(Zoo.folder(name, root), chosen.measure, chosen.twin)
+    sys.stdout.write(f"wrote {write_index(root)}\n")
+
+
+def _push(chosen: argparse.Namespace) -> None:
+    from nmpm.zoo.hub import push
+    from nmpm.zoo.registry import Zoo
+
+    found = push(Zoo.folder(chosen.name, chosen.root), chosen.repository, chosen.private)
+    sys.stdout.write(f"pushed {found}; load it by that id.\n")
+
+
+def _pull(chosen: argparse.Namespace) -> None:
+    from nmpm._support.shipped import user_zoo
+    from nmpm.errors import ConfigError
+    from nmpm.zoo.entries import load_entry
+    from nmpm.zoo.hub import HubId, download, pull
+    from nmpm.zoo.registry import check_name
+
+    identifier = HubId.parse(chosen.id)
+    if identifier is None:
+        raise ConfigError(f"{chosen.id} is not owner/repository@revision; the revision may be a commit, or main.")
+    if chosen.name is None:
+        folder = download(identifier)
+        load_entry(folder)
+    else:
+        root = user_zoo() if chosen.root is None else chosen.root
+        folder = pull(identifier, root / check_name(chosen.name))
+    sys.stdout.write(f"{identifier} is in {folder}\n")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from nmpm.evaluation.comparison import PREDICTORS, figure_names
+from nmpm.zoo.intervals import bootstrap_interval
+from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {
     "energy": "energy (kinetic plus potential energy never exceeds that of the first state)",
@@ -36,12 +38,12 @@ def stress_line(card: Mapping[str, Any]) -> str:
     return "; ".join(f"{kind}: {_stress_outcome(digest)}" for kind, digest in kinds.items())
 
 
-def readme(card: Mapping[str, Any], pictured: bool) -> str:
+def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
     """The README of an entry, as Markdown.
 
     Args:
         card: The content of `card.yaml`.
-        pictured: Whether the entry has a `rollout.png`.
+        files: Names of the files of the entry; pictures among them are shown.
     """
     training, test = card["training"], card["test"]
     names = figure_names(test)
@@ -50,13 +52,17 @@ def readme(card: Mapping[str, Any], pictured: bool) -> str:
         "",
         f"An emulator of: {card['dataset']}. {card.get('about', '')}".rstrip(),
         "",
+        *_lifecycle_lines(card),
         f"Test error ×10⁻³ of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
         " length² (`mse`: over all frames), exact earth mover's distance (`emd`) in domain length.",
         "",
         f"| predictor | {' | '.join(names)} |",
         f"|---|{'---:|' * len(names)}",
         *(f"| {label} | {' | '.join(_errors(test, kind))} |" for kind, label in PREDICTORS.items()),
+        *_interval_row(card, names),
         "",
+        *_twin_lines(card),
+        *_speed_lines(card),
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
         f"{training['precision']}; {training['parameters']:,} parameters; one run.",
         "",
@@ -70,8 +76,61 @@ def readme(card: Mapping[str, Any], pictured: bool) -> str:
         "positions = model.rollout(model.example(), frames=400)  # (1, 400, N, D)",
         "```",
     ]
-    lines += ["", "![rollout](rollout.png)"] if pictured else []
+    pictures = {"chart.png": "errors over frames and over training", "rollout.png": "rollout"}
+    lines += [line for name, text in pictures.items() if name in files for line in ("", f"![{text}]({name})")]
     return "\n".join(lines) + "\n"
+
+
+def intervals(card: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """The 95% interval of each figure's mean over test scenes, for those that every scene has; empty for one scene."""
+    rows = card.get("per_trajectory") or []
+    names = [name for name in (rows[0] if len(rows) > 1 else ()) if all(name in row for row in rows)]
+    return {name: bootstrap_interval([row[name] for row in rows]) for name in names}
+
+
+def twin_ratio(card: Mapping[str, Any], name: str) -> str:
+    """A figure of the model over the simulator's own uncertainty, to 2 digits; empty where that is not measured."""
+    twin, test = card.get("twin") or {}, card.get("test") or {}
+    known = name in twin and name in test and twin[name] > 0
+    return f"{test[name] / twin[name]:.2g}" if known else ""
+
+
+def _twin_lines(card: Mapping[str, Any]) -> list[str]:
+    twin = card.get("twin")
+    if not twin:
+        return []
+    names = [name for name in ("mse@100", "mse") if name in twin]
+    figures = ", ".join(f"`{n}` {1e3 * twin[n]:.3g} ×10⁻³ (the model: {twin_ratio(card, n)} times that)" for n in names)
+    return [
+        f"The simulator with {twin['substeps']} substeps a frame beside itself with {twin['own_substeps']}: {figures}.",
+        "",
+    ]
+
+
+def _speed_lines(card: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"{entry['hardware']}: {entry['ms_per_frame']:.3g} ms per frame of one scene of {entry['particles']} particles,"
+        f" {entry['best_ms_per_frame']:.3g} ms in batches of {entry['best_batch']}"
+        + (f"; {entry['memory_mb']:.0f} MB at the peak." if entry.get("memory_mb") is not None else ".")
+        for entry in card.get("speed") or ()
+    ]
+    return [line for text in lines for line in (text, "")]
+
+
+def _lifecycle_lines(card: Mapping[str, Any]) -> list[str]:
+    """What keeps a model from being relied on."""
+    texts = {
+        "preview": f"**Preview**: its full-rollout error is not {FACTOR:g} times lower than a trivial predictor's.",
+        "superseded": f"**Superseded** by `{card.get('superseded_by')}`.",
+    }
+    state = lifecycle(card)
+    return [texts[state], ""] if state in texts else []
+
+
+def _interval_row(card: Mapping[str, Any], names: list[str]) -> list[str]:
+    found = intervals(card)
+    cells = [f"{1e3 * found[name][0]:.3g} – {1e3 * found[name][1]:.3g}" if name in found else "" for name in names]
+    return [f"| model, 95% over scenes | {' | '.join(cells)} |"] if found else []
 
 
 def _errors(test: Mapping[str, float], kind: str) -> Iterator[str]:

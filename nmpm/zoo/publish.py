@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,17 @@ from nmpm.emulator import Emulator
 from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module
 from nmpm.zoo.cards import readme, stress_digest
+from nmpm.zoo.charts import write_chart
+from nmpm.zoo.golden import golden_rollout
+from nmpm.zoo.index import write_index
+from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
 from nmpm.zoo.registry import check_name
 from nmpm.zoo.runs import BEST
 
 STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
 """Files of `nmpm stress --report`, with and without constraints, by the key of the card."""
+COPIED = ("rollout.png", "errors.csv")
+"""Files of a run that its entry keeps."""
 
 
 def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -> Path:
@@ -46,6 +52,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
     """
     target = _target(check_name(name), root)
     _publish(run, name, target, about)
+    write_index(user_zoo() if root is None else Path(root))
     return target
 
 
@@ -58,6 +65,7 @@ def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
         if target.exists():
             os.replace(target, Path(old) / "old")
         os.replace(Path(old) / "new", target)
+    write_index(root)
     return target
 
 
@@ -66,19 +74,19 @@ def _publish(run: Path, name: str, target: Path, about: str) -> None:
     for needed in (checkpoint, report):
         if not needed.is_file():
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
-    emulator = load_module(checkpoint).emulator
+    emulator = load_module(checkpoint).emulator.eval().requires_grad_(False)
     weights = save({key: value.contiguous() for key, value in emulator.state_dict().items()})
-    picture = run / "rollout.png"
+    files = [path for path in (run / file for file in COPIED) if path.is_file()]
     try:
         card = _card(name, about, _read_json(report), emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
         present = {key: run / file for key, file in STRESS_REPORTS.items() if (run / file).is_file()}
         card |= {key: stress_digest(_read_json(path)) for key, path in present.items()}
-        text = readme(card, pictured=picture.is_file())
+        text = readme(card, [path.name for path in files])
     except (KeyError, TypeError) as error:
         raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
     texts = {"config.yaml": _yaml(emulator.recipe.to_dict()), "card.yaml": _yaml(card), "README.md": text}
     try:
-        _write(target, weights, texts, picture)
+        _write(target, weights, texts, files)
     except OSError as error:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
 
@@ -108,15 +116,16 @@ def _writable_zoo(zoo: Path) -> Path:
     return zoo
 
 
-def _write(target: Path, weights: bytes, texts: Mapping[str, str], picture: Path) -> None:
+def _write(target: Path, weights: bytes, texts: Mapping[str, str], files: Sequence[Path]) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(prefix=".adding-", dir=target.parent))
     try:
         (part / "model.safetensors").write_bytes(weights)
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")
-        if picture.is_file():
-            shutil.copyfile(picture, part / picture.name)
+        for file in files:
+            shutil.copyfile(file, part / file.name)
+        write_chart(part)
         part.chmod(0o755)
         os.replace(part, target)
     finally:
@@ -124,19 +133,23 @@ def _write(target: Path, weights: bytes, texts: Mapping[str, str], picture: Path
 
 
 def _card(name: str, about: str, figures: Mapping[str, Any], emulator: Emulator) -> dict[str, Any]:
-    return {
+    card = {
+        "format": CARD_FORMAT,
         "name": name,
+        "lifecycle": "",
         "dataset": figures["dataset"],
         "about": about,
         "license": "MIT",
         "test": figures["test"],
         "per_trajectory": figures["per_trajectory"]["model"],
         "training": figures["training"],
-        **({"curve": figures["curve"]} if figures.get("curve") else {}),
+        **{key: figures[key] for key in ("curve", "simulation", "particles") if figures.get(key)},
         "constraints": dataclasses.asdict(emulator.constraints),
         "obstacles": emulator.scene.obstacles,
         "versions": figures["versions"],
+        "golden": golden_rollout(emulator),
     }
+    return card | {"lifecycle": lifecycle(card)}
 
 
 def _read_json(path: Path) -> dict[str, Any]:

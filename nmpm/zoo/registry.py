@@ -19,14 +19,17 @@ from typing import Any
 
 import torch
 
-from nmpm._support.devices import find_device
+from nmpm._support.devices import device_name, find_device
 from nmpm._support.limits import NAME_LENGTH
 from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import shipped_folder, user_zoo
 from nmpm.errors import ZooError
+from nmpm.zoo.choice import Limits, choose, stated_milliseconds
 from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.hub import HubId, download
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.runs import BEST, load_checkpoint
+from nmpm.zoo.speed import measure_speed
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]*(/[a-z0-9][a-z0-9_-]*)?")
 
@@ -69,8 +72,52 @@ class Zoo:
         return read_card(Zoo.folder(name, root))
 
     @staticmethod
-    def load(name: str | Path, root: Root = None, device: torch.device | str = "cpu") -> Pretrained:
-        """A pretrained model, or one of your own; see `load_model`."""
+    def variants(name: str, root: Root = None) -> builtins.list[str]:
+        """Names of the models of a dataset: `name` itself and `name/…`.
+
+        Raises:
+            ZooError: if there is none.
+        """
+        found = [known for known in Zoo.list(root) if known == name or known.startswith(f"{name}/")]
+        if not found:
+            raise _unknown_model(name, root)
+        return found
+
+    @staticmethod
+    def load(
+        name: str | Path,
+        root: Root = None,
+        device: torch.device | str = "cpu",
+        *,
+        variant: str | None = None,
+        max_mse: float | None = None,
+        max_ms_per_frame: float | None = None,
+        hardware: str | None = None,
+        calibrate: bool = False,
+    ) -> Pretrained:
+        """A pretrained model, or one of your own; see `load_model`.
+
+        With a limit, the one of `Zoo.variants(name)` that keeps it: the most accurate within a time, or the fastest
+        within an error.
+
+        Args:
+            name: As for `load_model`.
+            root: As for `load_model`.
+            device: As for `load_model`.
+            variant: "fast" for `name/fast`.
+            max_mse: Largest full-rollout MSE of its card, in length².
+            max_ms_per_frame: Largest time per frame of one scene, as the cards state it for `hardware`.
+            hardware: As cards name it; this machine's when left out.
+            calibrate: Time the variants on `device` now instead.
+
+        Raises:
+            ZooError: as `load_model`; or if no variant is within the limits, or their times are not known.
+        """
+        if variant is not None:
+            name = f"{name}/{variant}"
+        limits = Limits(max_mse, max_ms_per_frame, hardware)
+        if limits:
+            return _load_within(str(name), limits, root, find_device(device), calibrate)
         return load_model(name, device, root)
 
 
@@ -79,7 +126,8 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
 
     Args:
         model: One of `Zoo.list()`; or, if there is none of that name, the path of a zoo entry, of a run (of which the
-            best checkpoint is taken) or of a checkpoint. `./goop` is always a path.
+            best checkpoint is taken) or of a checkpoint; or "owner/repository@revision" of the Hugging Face hub.
+            `./goop` is always a path.
         device: Where to compute: "cpu", "cuda", "mps", or "auto" for the fastest.
         root: Folder of a zoo, in which alone the name is looked up: with it, `model` cannot be a path.
 
@@ -97,9 +145,23 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
         found = load_entry(Zoo.folder(name))
     elif path.suffix == ".ckpt" or _exists(path):
         found = _load_path(path)
+    elif (identifier := HubId.parse(name)) is not None:
+        found = load_entry(download(identifier))
     else:
         raise _unknown_model(name)
     return found.to(target)
+
+
+def _load_within(name: str, limits: Limits, root: Root, device: torch.device, calibrate: bool) -> Pretrained:
+    cards = {variant: Zoo.card(variant, root) for variant in Zoo.variants(name, root)}
+    machine = limits.hardware or device_name(device)
+
+    def milliseconds(variant: str) -> float | None:
+        if calibrate:
+            return float(measure_speed(load_model(variant, device, root))["ms_per_frame"])
+        return stated_milliseconds(cards[variant], machine)
+
+    return load_model(choose(cards, limits, milliseconds), device, root)
 
 
 def check_name(name: str) -> str:
@@ -128,7 +190,7 @@ def _load_path(path: Path) -> Pretrained:
 
 def _unknown_model(name: str, root: Root = None) -> ZooError:
     known = Zoo.list(root)
-    near = suggestion(name[:NAME_LENGTH], known)
+    near = suggestion(name[:NAME_LENGTH], sorted({*known, *(other.partition("/")[0] for other in known)}))
     path = " No such path exists either." if root is None else ""
     shown = one_line(repr(name), NAME_LENGTH)
     return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(known) or 'none'}.{near}{path}")

@@ -3,7 +3,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nmpm.training.callbacks.report import ReportWriter, device_name
+from nmpm._support.devices import device_name
+from nmpm.training.callbacks.report import ReportWriter
 
 
 def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):

@@ -69,7 +69,7 @@ def test_errors_have_three_digits(run):
 def test_cards_of_version_0_1_are_readable(name):
     golden = Path(__file__).parents[1] / "golden" / "zoo"
     card = Zoo.card(name, golden)
-    assert f"# {name}" in readme(card, pictured=False)
+    assert f"# {name}" in readme(card)
     assert "free: not run" in stress_line(card)
 
 

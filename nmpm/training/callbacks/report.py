@@ -17,6 +17,7 @@ from rich.table import Table
 from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.devices import device_name
 from nmpm._support.version import __version__
 from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
 from nmpm.metrics import MSE
@@ -130,6 +131,8 @@ class ReportWriter(Callback):
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "curve": self.curve,
+            **_simulation(datamodule),
+            **({} if self._first_rollout is None else {"particles": int(self._first_rollout[0].mask[0].sum())}),
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
         }
 
@@ -150,21 +153,11 @@ def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Ten
     return LabelledTrajectories.from_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
 
 
-def device_name(device: torch.device) -> str:
-    """The model of a device: of the GPU, or of the processor with the number of threads that torch uses."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    if device.type == "cpu":
-        return f"{_processor()}, {torch.get_num_threads()} threads"
-    return device.type
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+def _simulation(datamodule: Any) -> dict[str, Any]:
+    """How the data were simulated, as far as their metadata say: preset, trajectories per split, seed, revision."""
+    source = getattr(datamodule, "data_source", None)
+    stated = source.metadata.extra.get("simulation") if source is not None else None
+    return {"simulation": stated} if isinstance(stated, dict) else {}
 
 
 def _gather_ranks(metric: MSE) -> tuple[list[dict[str, float]], list[Tensor]]:

@@ -9,15 +9,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from nmpm._support.atomic import atomic_write
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
+from nmpm.data.generate import SimulationRequest
 from nmpm.errors import ZooError
+from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.publish import replace
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.trainings import History
 from nmpm.zoo.registry import Zoo
 from nmpm.zoo.runs import BEST
+from nmpm.zoo.twin import measure_twin
 
 Command = Callable[[list[str]], int]
 """Runs `nmpm` with these words and returns its exit status."""
@@ -62,7 +68,31 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         if published < error:
             return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split; the entry with {1e3 * published:.4g} is kept."
         replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
+        refresh(zoo / name, measure=True)
+        if history.dataset.generation() is not None:
+            _add_twin(zoo / name, history)
+        write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
+
+
+def _add_twin(entry: Path, history: History) -> None:
+    """Put the simulator's own uncertainty on an entry's card; measured once, as it does not depend on the model."""
+    kept = history.folder / "twin.json"
+    if not kept.is_file():
+        data = catalog.dataset_folder(*_request(history.dataset))
+        found = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None)
+        with atomic_write(kept) as part:
+            part.write_text(json.dumps(found.to_dict(), indent=1), encoding="utf-8")
+    card = read_card(entry) | {"twin": _read(kept)}
+    with atomic_write(entry / CARD) as part:
+        part.write_text(yaml.safe_dump(card, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
+    refresh(entry)
+
+
+def _request(dataset: Dataset) -> tuple[str, SimulationRequest]:
+    """Name and request of simulated data."""
+    name, options = dataset.generation() or ("", {})
+    return name, catalog.simulation_request(name, **{key: options[key] for key in options if key != "workers"})
 
 
 def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
@@ -80,11 +110,9 @@ def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
 
 def _about(dataset: Dataset) -> str:
     """How the data were simulated; empty for recorded data."""
-    generation = dataset.generation()
-    if generation is None:
+    if dataset.generation() is None:
         return ""
-    name, options = generation
-    request = catalog.simulation_request(name, **{key: options[key] for key in options if key != "workers"})
+    _, request = _request(dataset)
     counts, preset = request.counts, request.preset
     return (
         f"{counts['train']} trajectories to train on, {counts['valid']} to validate and {counts['test']} to test, of"

@@ -179,7 +179,7 @@ class History:
             planned = self.dataset.hours + (len(trainings) - 1) * extension.hours
             length = self.dataset.hours if len(trainings) == 1 else extension.hours
             left = 0.0 if trainings[-1].finished else max(length - trainings[-1].seconds() / 3600, 0.0)
-        if self.next_round() is None:
+        if self.next_round() is None or extension.hours <= 0:
             return left, left
         return left, left + max(extension.limit - planned, 0.0)
 

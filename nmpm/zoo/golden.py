@@ -1,0 +1,53 @@
+"""A short rollout that an entry's card states, to notice that weights, statistics or code have changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator import Emulator, rollout
+from nmpm.errors import ConfigError
+from nmpm.zoo.pretrained import Pretrained
+
+FRAMES = 32
+COUNT = 300
+PROBES = 8
+"""Particles whose last positions are stated."""
+TOLERANCE = 1e-3
+"""Largest distance from a stated position, in cells: other processors and versions of torch round differently."""
+
+
+def golden_rollout(emulator: Emulator) -> dict[str, Any]:
+    """The last positions of some particles in a rollout of thrown blocks, with what determines it."""
+    count = fitting_count(Pretrained(emulator, {}), COUNT)
+    return {"seed": 0, "count": count, "frames": FRAMES, "position": _positions(emulator, 0, count, FRAMES).tolist()}
+
+
+def fitting_count(model: Pretrained, count: int) -> int:
+    """The number of particles, halved until a block of them fits into the box."""
+    while count > 1:
+        try:
+            model.example(count=count)
+        except ConfigError:
+            count //= 2
+        else:
+            break
+    return count
+
+
+def golden_distance(model: Pretrained, golden: Mapping[str, Any]) -> float:
+    """Largest distance of a model's rollout from a stated one, in cells."""
+    found = _positions(model.emulator, golden["seed"], golden["count"], golden["frames"])
+    spacing = torch.tensor(model.emulator.grid.spacing, dtype=torch.float64)
+    return float(((found - torch.tensor(golden["position"], dtype=torch.float64)) / spacing).norm(dim=-1).max())
+
+
+def _positions(emulator: Emulator, seed: int, count: int, frames: int) -> Tensor:
+    """(PROBES, D) positions, rounded to 1e-7."""
+    state = Pretrained(emulator, {}).example(seed, count)
+    last = rollout(emulator, state.to(emulator.device), frames)[0, -1].double().cpu()
+    chosen = torch.linspace(0, len(last) - 1, PROBES).long()
+    return last[chosen].mul(1e7).round().div(1e7)

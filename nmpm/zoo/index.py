@@ -1,0 +1,106 @@
+"""The table of all models of a zoo, and entries brought up to date with the code that writes cards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nmpm._support.atomic import atomic_write
+from nmpm.errors import ZooError
+from nmpm.zoo.cards import intervals, readme, twin_ratio
+from nmpm.zoo.charts import write_chart
+from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.golden import golden_rollout
+from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
+from nmpm.zoo.registry import Zoo
+from nmpm.zoo.speed import measure_speed
+from nmpm.zoo.twin import measure_twin
+
+HEAD = """\
+# The zoo
+
+Pretrained models, one folder each: `card.yaml` (what it is and how good), `config.yaml` (how it is built),
+`model.safetensors` (weights and statistics) and a README. `nmpm zoo list` lists them, `nmpm zoo verify` measures them
+again, `nmpm zoo add RUN NAME` adds one and `python zoo/train.py` trains them all. `nmpm zoo refresh` writes this table.
+
+Errors are full-rollout MSE ×10⁻³ in domain length², over test scenes, with the 95% interval of their mean; beside them
+the better of two trivial predictors, nothing moves and free fall. *Twins*: the error over that of the simulator with
+other time steps beside itself. Milliseconds are per frame of one scene.
+"""
+COLUMNS = ("model", "state", "data", "MSE", "95%", "at 100 frames", "twins", "trivial", "trained", "ms per frame")
+
+
+def write_index(root: Path) -> Path:
+    """Write the table of a zoo's models, `README.md` in its folder; entries with a damaged card are left out."""
+    rows = []
+    for name in Zoo.list(root):
+        try:
+            rows.append(_row(name, Zoo.card(name, root)))
+        except ZooError:
+            continue
+    table = [f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}", *rows]
+    path = root / "README.md"
+    with atomic_write(path) as part:
+        part.write_text("\n".join([HEAD, *table]) + "\n", encoding="utf-8")
+    return path
+
+
+def refresh(folder: Path, measure: bool = False, twin: bool = False, data: Path | None = None) -> None:
+    """Write again what is derived from an entry's card and weights: lifecycle, README and chart.
+
+    A golden rollout is added where the card has none; one that there is stays, as it would hide a change.
+
+    Args:
+        folder: Of the entry.
+        measure: Whether to time rollouts on this machine for the card.
+        twin: Whether to measure what the simulator of the data is uncertain about, which takes as long as half a
+            simulation of the test scenes, and that simulation too without `data`.
+        data: Folder of the dataset.
+
+    Raises:
+        ZooError: if a file is missing or damaged.
+        ConfigError: if a twin is asked for and the data are recorded.
+    """
+    model = load_entry(folder)
+    card = {"format": CARD_FORMAT} | read_card(folder)
+    card |= {"lifecycle": lifecycle(card)}
+    card.setdefault("golden", golden_rollout(model.emulator))
+    if measure:
+        found = measure_speed(model)
+        others = [entry for entry in card.get("speed", []) if entry["hardware"] != found["hardware"]]
+        card["speed"] = [*others, found]
+    if twin:
+        card["twin"] = measure_twin(model, data).to_dict()
+    with atomic_write(folder / CARD) as part:
+        part.write_text(yaml.safe_dump(card, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
+    write_chart(folder)
+    with atomic_write(folder / "README.md") as part:
+        part.write_text(readme(card, [path.name for path in folder.iterdir()]), encoding="utf-8")
+
+
+def _row(name: str, card: Mapping[str, Any]) -> str:
+    test, training = card.get("test") or {}, card.get("training") or {}
+    interval = intervals(card).get("mse")
+    trivial = [test[key] for key in ("still/mse", "free_fall/mse") if key in test]
+    cells = {
+        "model": f"[{name}]({name}/README.md)",
+        "state": lifecycle(card),
+        "data": str(card.get("dataset", "")),
+        "MSE": _thousandths(test.get("mse")),
+        "95%": "" if interval is None else f"{_thousandths(interval[0])} – {_thousandths(interval[1])}",
+        "at 100 frames": _thousandths(test.get("mse@100")),
+        "twins": twin_ratio(card, "mse"),
+        "trivial": _thousandths(min(trivial, default=None)),
+        "trained": f"{training['seconds'] / 3600:.1f} h" if "seconds" in training else "",
+        "ms per frame": "; ".join(
+            f"{entry['ms_per_frame']:.2g} ({entry['hardware']})" for entry in card.get("speed", [])
+        ),
+    }
+    return f"| {' | '.join(cells[column] for column in COLUMNS)} |"
+
+
+def _thousandths(value: float | None) -> str:
+    return "" if value is None else f"{1e3 * value:.3g}"

@@ -1,0 +1,70 @@
+"""The test scenes of a model, simulated from their seeds or read from the folder of its data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from nmpm.data.format import Split, Trajectory, read_metadata, split_paths
+from nmpm.data.generate import SimulationRequest, preset_metadata
+from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader, SplitRecordings
+from nmpm.errors import ConfigError
+from nmpm.particles import Window
+from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
+from nmpm.zoo.pretrained import Pretrained
+
+
+def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None) -> Iterator[Window]:
+    """The test scenes in the order of the card, one at a time, with so many frames to predict; all where None.
+
+    Raises:
+        ConfigError: if they cannot be had: recorded data without `data`, or simulated by another revision.
+        DataError: if the data cannot be read.
+    """
+    if data is not None:
+        paths, metadata = split_paths(data), read_metadata(data, "deepmind")
+        if "test" not in paths:
+            raise ConfigError(f"{data} has no test.h5.")
+        for window in EvaluationLoader(SplitRecordings(Split(paths["test"]), metadata, model.scene), 1):
+            yield window if frames is None else _first_frames(window, frames + 2)
+        return
+    preset, request = simulation_of(model)
+    shorter = preset if frames is None else preset.with_frames(frames + 1)
+    reader = RecordingReader(preset_metadata(preset), model.scene)
+    for index in range(request.counts["test"]):
+        seed = request.trajectory_seed("test", index)
+        run = shorter.simulate(seed)
+        stored = Trajectory(run.position, run.particle_type, run.attributes)
+        yield collate([reader.recording(stored, f"{preset.name}, seed {seed}")], model.scene)
+
+
+def _first_frames(window: Window, frames: int) -> Window:
+    return Window(
+        window.frames[:, :frames],
+        window.material,
+        window.mask,
+        window.obstacle,
+        window.obstacle_mask,
+        window.gravity,
+    )
+
+
+def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
+    """The simulator of a model's data, and what was simulated; cards of version 0.1 state the preset's name only."""
+    stated: Any = model.card.get("simulation")
+    if isinstance(stated, Mapping):
+        preset = preset_from_dict(dict(stated["preset"]))
+        if stated.get("revision") != preset.revision:
+            raise ConfigError(
+                f"{model.name}: its data are of revision {stated.get('revision')} of the simulator, which is now"
+                f" {preset.revision} and gives other trajectories."
+            )
+        return preset, SimulationRequest(preset, stated["counts"], stated["seed"])
+    if model.preset not in preset_names():
+        raise ConfigError(f"{model.name} was tested on recorded data ({model.card.get('dataset')}): give their folder.")
+    preset = load_preset(str(model.preset))
+    count = len(model.card["per_trajectory"])
+    return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": count})

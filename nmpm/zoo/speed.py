@@ -1,0 +1,67 @@
+"""Time and memory of a model's rollouts on this machine."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import torch
+
+from nmpm._support.devices import device_name
+from nmpm.emulator import rollout
+from nmpm.particles import Particles
+from nmpm.zoo.golden import fitting_count
+from nmpm.zoo.pretrained import Pretrained
+
+BATCHES = (1, 4, 16)
+REPETITIONS = 5
+PARTICLES = 1000
+
+
+def measure_speed(model: Pretrained) -> dict[str, Any]:
+    """Time rollouts of a thrown block of about as many particles as the test scenes have, as far as they fit.
+
+    Returns:
+        `hardware`, `particles`, `ms_per_frame` of one scene, the `best_batch` of `BATCHES` with its
+        `best_ms_per_frame` and scene, and `memory_mb`, the peak on a GPU beside the weights, None elsewhere.
+    """
+    count = fitting_count(model, int(model.card.get("particles", PARTICLES)))
+    state = model.example(count=count).to(model.emulator.device)
+    times = {batch: _milliseconds(model, _repeated(state, batch)) / batch for batch in BATCHES}
+    best = min(times, key=lambda batch: times[batch])
+    return {
+        "hardware": device_name(model.emulator.device),
+        "particles": state.position.shape[1],
+        "ms_per_frame": round(times[1], 4),
+        "best_batch": best,
+        "best_ms_per_frame": round(times[best], 4),
+        "memory_mb": _peak_memory(model, state),
+    }
+
+
+def _repeated(state: Particles, batch: int) -> Particles:
+    return Particles(
+        **{name: value.expand(batch, *value.shape[1:]).contiguous() for name, value in vars(state).items()}
+    )
+
+
+def _milliseconds(model: Pretrained, state: Particles) -> float:
+    """Median milliseconds per frame, for all scenes of the batch together, over two bundles."""
+    frames, found = 2 * model.emulator.frames, []
+    for _ in range(REPETITIONS + 1):
+        start = time.perf_counter()
+        rollout(model.emulator, state, frames)[:, -1].sum().item()  # waits for the device
+        found.append(1e3 * (time.perf_counter() - start) / frames)
+    return statistics.median(found[1:])
+
+
+def _peak_memory(model: Pretrained, state: Particles) -> float | None:
+    """Peak of the MB that a rollout of two bundles allocates on a GPU; None elsewhere, where nothing counts them."""
+    device = model.emulator.device
+    if device.type != "cuda":
+        return None
+    torch.cuda.reset_peak_memory_stats(device)
+    before = float(torch.cuda.memory_allocated(device))
+    rollout(model.emulator, state, 2 * model.emulator.frames)
+    return round((float(torch.cuda.max_memory_allocated(device)) - before) / 2**20, 1)

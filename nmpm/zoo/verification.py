@@ -1,0 +1,105 @@
+"""Measure the figures of a card again: the golden rollout, and errors on test scenes simulated from their seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from nmpm.errors import ConfigError
+from nmpm.metrics import MSE
+from nmpm.particles import Window
+from nmpm.zoo.golden import TOLERANCE, golden_distance
+from nmpm.zoo.intervals import bootstrap_interval
+from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.scenes import iterate_test_scenes
+
+SHORT_SCENES, SHORT_FRAMES = 2, 100
+RELATIVE = 0.1
+"""Relative difference of a scene's MSE at 100 frames and before that is tolerated, as rounding differs."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A stated figure beside the measured one.
+
+    Args:
+        name: What was measured.
+        stated: On the card.
+        measured: Now.
+        lowest, highest: Of the measured values that pass.
+    """
+
+    name: str
+    stated: float
+    measured: float
+    lowest: float
+    highest: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the measured value is within the tolerance."""
+        return self.lowest <= self.measured <= self.highest
+
+    def __str__(self) -> str:
+        outcome = "pass" if self.passed else "FAIL"
+        return (
+            f"{outcome}  {self.name}: {self.measured:.4g}; the card states {self.stated:.4g}, passes from"
+            f" {self.lowest:.4g} to {self.highest:.4g}"
+        )
+
+
+def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> Iterator[Check]:
+    """Measure a model's card again.
+
+    Args:
+        model: Of the zoo, whose card states `per_trajectory` errors of its test scenes in their order.
+        full: All test scenes to their end, the mean within the 95% interval over scenes, instead of the first 100
+            frames of the first few, each within 10%.
+        data: Folder of recorded data that the model was tested on; simulated scenes need none.
+
+    Raises:
+        ConfigError: if the test scenes cannot be had: recorded data without `data`, or a card that states no errors.
+        DataError: if the data cannot be read.
+    """
+    golden = model.card.get("golden")
+    if isinstance(golden, Mapping):
+        distance = golden_distance(model, golden)
+        yield Check("golden rollout, largest distance in cells", 0.0, distance, 0.0, TOLERANCE)
+    rows = model.card.get("per_trajectory")
+    if not isinstance(rows, Sequence) or not rows:
+        raise ConfigError(f"{model.name}: its card states no errors of single test scenes.")
+    frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
+    errors = [_errors(model, window) for window in islice(iterate_test_scenes(model, frames, data), count)]
+    if full:
+        yield from _means(rows, errors)
+    else:
+        yield from _scenes(rows, errors)
+
+
+def _scenes(rows: Sequence[Mapping[str, float]], errors: Sequence[Mapping[str, float]]) -> Iterator[Check]:
+    for index, (row, found) in enumerate(zip(rows, errors, strict=False)):
+        for name in (name for name in row if "@" in name and name != "mse@1" and name in found):
+            stated = row[name]
+            bounds = ((1 - RELATIVE) * stated, (1 + RELATIVE) * stated)
+            yield Check(f"test scene {index}, {name}", stated, found[name], *bounds)
+
+
+def _means(rows: Sequence[Mapping[str, float]], errors: Sequence[Mapping[str, float]]) -> Iterator[Check]:
+    for name in (name for name in rows[0] if name != "mse@1"):
+        stated = [row[name] for row in rows if name in row]
+        found = [row[name] for row in errors if name in row]
+        low, high = bootstrap_interval(stated)
+        mean = math.nan if len(found) < len(stated) else float(np.mean(found))
+        yield Check(f"{name} over {len(stated)} test scenes", float(np.mean(stated)), mean, low, high)
+
+
+def _errors(model: Pretrained, window: Window) -> dict[str, float]:
+    metric = MSE()
+    device = model.emulator.device
+    metric.update(window, model.rollout(window.initial.to(device), window.target.shape[1]).cpu())
+    return metric.per_trajectory()[0]

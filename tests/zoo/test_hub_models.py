@@ -1,0 +1,122 @@
+"""Models on the hub, tried against a fake of it: pushed, pulled, loaded by id, offline, damaged, private, cut short."""
+
+import huggingface_hub
+import pytest
+import torch
+import yaml
+from huggingface_hub import constants
+from huggingface_hub.utils import _http
+
+from nmpm.cli import main
+from nmpm.errors import ZooError
+from nmpm.zoo import Zoo, load_model
+from nmpm.zoo.hub import HubId, download, hub_metadata, pull, push
+from tests.zoo.fake_hub import serve
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with serve() as server:
+        monkeypatch.setattr(constants, "ENDPOINT", server.url)
+        template = server.url + "/{repo_id}/resolve/{revision}/{filename}"
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub-cache"))
+        monkeypatch.setattr(constants, "HF_HUB_DISABLE_PROGRESS_BARS", True)
+        monkeypatch.setenv("HF_TOKEN", "hf_token")
+        yield server
+
+
+def test_a_pushed_model_is_loaded_by_its_id_rolled_out_and_pulled(hub, root, tmp_path, capsys):
+    assert main(["zoo", "push", "small", "lab/small", "--root", str(root)]) == 0
+    identifier = capsys.readouterr().out.split()[1].rstrip(";")
+    assert identifier == f"lab/small@{hub.commits['lab/small'][0][0]}"
+    state = Zoo.load("small", root).example(count=50)
+    expected = Zoo.load("small", root).rollout(state, 8)
+    assert torch.equal(Zoo.load(identifier).rollout(state, 8), expected)
+    assert main(["rollout", identifier, "--frames", "4", "--particles", "50"]) == 0
+    assert main(["zoo", "pull", identifier, "small/mine"]) == 0
+    assert torch.equal(Zoo.load("small/mine").rollout(state, 8), expected)
+    assert main(["zoo", "pull", identifier, "small/mine"]) == 1
+    assert "exists: choose another name" in capsys.readouterr().err
+
+
+def test_a_revision_stays_what_it_was(hub, root, small, write_entry):
+    first = push(root / "small", "lab/small")
+    small.input_std.fill_(3.0)
+    write_entry(root / "small", small)
+    second = push(root / "small", "lab/small")
+    assert first.revision != second.revision
+    assert (load_model(str(first)).emulator.input_std == 2.0).all()
+    assert (load_model(str(second)).emulator.input_std == 3.0).all()
+    assert (load_model("lab/small@main").emulator.input_std == 3.0).all()
+
+
+def test_a_cached_model_loads_offline_and_others_say_why_not(hub, root, monkeypatch):
+    identifier = push(root / "small", "lab/small")
+    load_model(str(identifier))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    _http.close_session()
+    try:
+        asked = len(hub.requests)
+        load_model(str(identifier))
+        assert len(hub.requests) == asked
+        with pytest.raises(ZooError, match="not in the cache"):
+            load_model("lab/other@main")
+    finally:
+        monkeypatch.undo()
+        _http.close_session()
+
+
+def test_a_download_that_is_cut_short_leaves_nothing_behind(hub, root):
+    identifier = push(root / "small", "lab/small")
+    hub.cut.add("model.safetensors")
+    with pytest.raises(ZooError):
+        load_model(str(identifier))
+    hub.cut.clear()
+    assert load_model(str(identifier)).name == "small"
+
+
+def test_weights_that_are_not_those_of_the_card_are_refused(hub, root):
+    push(root / "small", "lab/small")
+    oid = hub.commit("lab/small", {"model.safetensors": b"other"})
+    with pytest.raises(ZooError, match="SHA-256"):
+        load_model(f"lab/small@{oid}")
+    with pytest.raises(ZooError, match="SHA-256"):
+        pull(HubId("lab/small", oid), root / "pulled")
+    assert not (root / "pulled").exists()
+
+
+def test_private_and_unknown_models_and_revisions(hub, root, monkeypatch):
+    identifier = push(root / "small", "lab/hidden", private=True)
+    assert download(identifier).is_dir()
+    monkeypatch.delenv("HF_TOKEN")
+    monkeypatch.setattr(huggingface_hub.utils._headers, "get_token", lambda: None)
+    for unknown in ("lab/hidden@main", "lab/nothing@main"):
+        with pytest.raises(ZooError, match="The hub has no model"):
+            load_model(unknown)
+    push(root / "small", "lab/small")
+    with pytest.raises(ZooError, match="no revision lava"):
+        load_model("lab/small@lava")
+    hub.commits["lab/empty"] = [("a" * 40, {"README.md": b""})]
+    with pytest.raises(ZooError, match="it has no card"):
+        load_model("lab/empty@main")
+
+
+def test_without_a_revision_nothing_is_fetched(hub):
+    with pytest.raises(ZooError, match="holds no model 'lab/small'"):
+        load_model("lab/small")
+    assert main(["zoo", "pull", "lab/small"]) == 1
+    assert hub.requests == []
+
+
+def test_the_hub_is_told_library_licence_and_results(hub, root):
+    card = {"name": "goop", "license": "MIT", "dataset": "goop, simulated by nmpm"}
+    metadata = hub_metadata(card | {"test": {"mse": 0.1, "still/mse": 1.0}})
+    assert (metadata["library_name"], metadata["license"]) == ("nmpm", "mit")
+    result = metadata["model-index"][0]["results"][0]
+    assert result["dataset"]["name"] == "goop"
+    assert result["metrics"] == [{"type": "mse", "name": "rollout mse", "value": 0.1}]
+    push(root / "small", "lab/small")
+    readme = hub.commits["lab/small"][0][1]["README.md"].decode()
+    assert yaml.safe_load(readme.split("---")[1])["library_name"] == "nmpm"
