@@ -3,6 +3,7 @@
     python zoo/train.py                      # all of queue.yaml, in its order
     python zoo/train.py --threads 1          # once per core, or with --device cuda:0, cuda:1 once per GPU
     python zoo/train.py goop wbcsph --hours 8
+    python zoo/train.py --data waterdrop=FOLDER   # with recorded data
     python zoo/train.py --status
     python zoo/train.py --collect            # make entries of the best weights so far, also while others train
 
@@ -42,6 +43,9 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
         "--runs", type=Path, default=Path("runs/zoo"), help="folder of the trainings (default: runs/zoo)"
     )
     parser.add_argument("--zoo", type=Path, default=HERE, help="folder of the entries (default: that of this script)")
+    parser.add_argument(
+        "--data", action="append", default=[], metavar="NAME=FOLDER", help="recorded data of a dataset; repeatable"
+    )
     parser.add_argument("--hours", type=float, help="stop after this time; the next call goes on")
     parser.add_argument("--threads", type=int, help="processor threads of this process (default: all)")
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1, mps")
@@ -60,7 +64,8 @@ def main(words: list[str] | None = None) -> int:
     from nmpm.zoo.queue.plan import Plan
 
     try:
-        plan = Plan.read(chosen.queue).select(chosen.names)
+        data = dict(entry.split("=", 1) if "=" in entry else (entry, "") for entry in chosen.data)
+        plan = Plan.read(chosen.queue).with_data(data).select(chosen.names)
         if chosen.status:
             return print_status(plan, chosen.runs)
         if chosen.collect:
@@ -97,8 +102,8 @@ def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
 
 def ready(plan: Plan, runs: Path, failed: set[str]) -> Iterator[tuple[History, int]]:
     """Datasets with the number of their next training: all first ones, then all second ones, …."""
-    rounds = [(number, order, history) for order, history in enumerate(histories(plan, runs))
-              if (number := history.next_round()) is not None and history.dataset.name not in failed]  # fmt: skip
+    waiting = (h for h in histories(plan, runs) if h.dataset.name not in failed and not h.waits_for())
+    rounds = [(number, order, h) for order, h in enumerate(waiting) if (number := h.next_round()) is not None]
     yield from ((history, number) for number, _, history in sorted(rounds, key=lambda entry: entry[:2]))
 
 
@@ -175,7 +180,8 @@ def print_status(plan: Plan, runs: Path) -> int:
         hours = sum(training.seconds() for training in trainings) / 3600
         error = "not validated" if best is None else f"validation MSE {1e3 * best.error():.4g} ×10⁻³"
         state = "stopped" if history.next_round() is None else f"training {history.next_round()}"
-        sys.stdout.write(f"{history.dataset.name:<22} {state:<12} {hours:5.2f} h  {error}\n")
+        state = f"needs {history.waits_for()}" if history.waits_for() else state
+        sys.stdout.write(f"{history.dataset.name:<22} {state:<27} {hours:5.2f} h  {error}\n")
     sys.stdout.write(f"{remaining(plan, runs)}\n")
     return 0
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import torch
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.recording import RecordingReader
+from nmpm.errors import ConfigError
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.sim import Preset
@@ -39,10 +42,16 @@ class Twin:
         return {"substeps": self.substeps, "own_substeps": self.own, **self.errors}
 
 
-def twin_substeps(preset: Preset) -> int:
-    """Half as many substeps; the fewest that are stable where that is more; twice as many where there is no choice."""
-    fewer = max(-(-preset.substeps // 2), preset.stable_substeps)
-    return fewer if fewer < preset.substeps else 2 * preset.substeps
+def twin_of(preset: Preset) -> Preset:
+    """The preset with half as many substeps; with the fewest that the solver accepts where those are too few for it.
+
+    Where it accepts no fewer, with twice as many.
+    """
+    for substeps in (-(-preset.substeps // 2), preset.stable_substeps):
+        if substeps < preset.substeps:
+            with suppress(ConfigError):
+                return dataclasses.replace(preset, substeps=substeps)
+    return dataclasses.replace(preset, substeps=2 * preset.substeps)
 
 
 def measure_twin(model: Pretrained, data: Path | None = None) -> Twin:
@@ -56,10 +65,10 @@ def measure_twin(model: Pretrained, data: Path | None = None) -> Twin:
         ConfigError: if the data are not simulated, or by another revision of the simulator.
     """
     preset, request = simulation_of(model)
-    substeps = twin_substeps(preset)
-    rows = list(_rows(model, preset, preset.with_substeps(substeps), request.trajectory_seed, data))
+    other = twin_of(preset)
+    rows = list(_rows(model, preset, other, request.trajectory_seed, data))
     names = [name for name in rows[0] if all(name in row for row in rows)]
-    return Twin(substeps, preset.substeps, {name: float(np.mean([row[name] for row in rows])) for name in names})
+    return Twin(other.substeps, preset.substeps, {name: float(np.mean([row[name] for row in rows])) for name in names})
 
 
 def _rows(

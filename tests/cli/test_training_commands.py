@@ -214,7 +214,7 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
 
     assert torch.equal(model.rollout(state, 20), rollout(trained, state, 20))
     assert {p.name for p in (tmp_path / "zoo/drop/tiny").iterdir()} == {
-        *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png")
+        *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png", "errors.csv", "chart.png")
     }
 
 

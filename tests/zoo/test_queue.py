@@ -15,7 +15,7 @@ import yaml
 
 from nmpm.errors import ConfigError
 from nmpm.zoo import Zoo
-from nmpm.zoo.queue.plan import Dataset, Extension, Plan, extended_training, first_training
+from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
 from nmpm.zoo.queue.trainings import History
 
 SCRIPT = Path(__file__).parents[2] / "zoo" / "train.py"
@@ -87,13 +87,13 @@ def test_the_curve_goes_on_over_the_trainings_and_the_best_of_them_is_taken(tmp_
 
 def test_time_alone_ends_a_training_and_an_extension_starts_at_a_lower_rate():
     dataset = Dataset("goop", "goop.yaml", 26.5, options={"data.batch_size": 2})
-    first = first_training(dataset)
+    first = new_training(dataset)
     assert first[:3] == ["fit", "--config", "goop.yaml"]
     options = dict(zip(first[3::2], first[4::2], strict=True))
     assert options["--trainer.max_steps"] == "-1"
     assert options["--trainer.max_time"] == "01:02:30:00"
     assert options["--data.batch_size"] == "2"
-    later = extended_training(dataset, Extension(hours=1, rate=0.5), Path("best.ckpt"))
+    later = continued_training(dataset, 1, 0.5, Path("best.ckpt"))
     options = dict(zip(later[3::2], later[4::2], strict=True))
     assert options["--trainer.max_time"] == "00:01:00:00"
     assert float(options["--model.optimizer.init_args.lr"]) == pytest.approx(0.003)
@@ -106,6 +106,25 @@ def test_the_shipped_queue_is_read_and_simulates_what_its_configurations_say():
     assert simulated["dambreak2d"] == ("dambreak2d", {"counts": {"train": 40, "valid": 4, "test": 10}})
     assert simulated["waterdrop-simulated"] == ("waterdrop", {})
     assert Dataset("waterdrop", "waterdrop.yaml", 1).generation() is None
+
+
+def test_a_dataset_waits_for_its_data_and_for_the_training_that_it_starts_from(tmp_path):
+    plan = Plan.read(SCRIPT.with_name("queue.yaml"))
+
+    def waterdrop(plan: Plan) -> History:
+        dataset = plan.select(["waterdrop"]).datasets[0]
+        return History(dataset, tmp_path / dataset.name, plan.extension)
+
+    assert waterdrop(plan).waits_for() == "--data waterdrop=FOLDER"
+    given = waterdrop(plan.with_data({"waterdrop": str(tmp_path)}))
+    assert given.waits_for() == "waterdrop-simulated"
+    finished(tmp_path / "waterdrop-simulated", 0.5)
+    assert given.waits_for() == ""
+    words = json.loads((given.open(1).folder / "words.json").read_text())
+    assert words[words.index("--start_from") + 1] == str(tmp_path / "waterdrop-simulated/1/checkpoints/best.ckpt")
+    assert words[words.index("--data.path") + 1] == str(tmp_path)
+    with pytest.raises(ConfigError, match="has no lava"):
+        plan.with_data({"lava": "folder"})
 
 
 def test_mistakes_in_a_queue_are_named(queue, tmp_path):

@@ -20,11 +20,13 @@ from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.publish import replace
 from nmpm.zoo.queue.plan import Dataset
-from nmpm.zoo.queue.trainings import History
+from nmpm.zoo.queue.trainings import History, Training
 from nmpm.zoo.registry import Zoo
 from nmpm.zoo.runs import BEST
 from nmpm.zoo.twin import measure_twin
 
+MERGED = "merged.json"
+"""The report of the test with what all trainings took."""
 Command = Callable[[list[str]], int]
 """Runs `nmpm` with these words and returns its exit status."""
 
@@ -50,18 +52,8 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         best = history.best()
         if best is None:
             return f"{name}: nothing is validated yet."
-        copy = folder / BEST
-        if copy.is_file() and filecmp.cmp(best.best, copy, shallow=False) and (folder / "merged.json").is_file():
-            report = _read(folder / "merged.json")
-        else:
-            (folder / "merged.json").unlink(missing_ok=True)
-            with atomic_write(copy) as part:
-                shutil.copyfile(best.best, part)
-            if run(best.test_command(folder)):
-                raise ZooError(f"{name}: the test of {copy} failed.")
-            report = _read(folder / "report.json")
-        report = _merged(report, history)
-        for file in ("merged.json", "report.json"):
+        report = _merged(_tested(best, folder, run), history)
+        for file in (MERGED, "report.json"):
             with atomic_write(folder / file) as part:
                 part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         error, published = report["test"]["mse"], _published_error(name, zoo)
@@ -73,6 +65,21 @@ def collect(history: History, zoo: Path, run: Command) -> str:
             _add_twin(zoo / name, history)
         write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
+
+
+def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
+    """The report of a test of the best weights in a folder; the former one where they are the same weights."""
+    copy, merged = folder / BEST, folder / MERGED
+    if copy.is_file() and filecmp.cmp(best.best, copy, shallow=False) and merged.is_file():
+        report = _read(merged)
+        if "particles" in report:  # else of an earlier version
+            return report
+    merged.unlink(missing_ok=True)
+    with atomic_write(copy) as part:
+        shutil.copyfile(best.best, part)
+    if run(best.test_command(folder)):
+        raise ZooError(f"The test of {copy} failed.")
+    return _read(folder / "report.json")
 
 
 def _add_twin(entry: Path, history: History) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,6 +15,8 @@ from nmpm._support.shipped import find_config
 from nmpm.errors import ConfigError
 from nmpm.zoo.registry import check_name
 
+OPEN = "???"
+"""What a configuration says instead of a value that is to be given."""
 VALIDATIONS = 30
 """Validations in a training: points of the curve on the card."""
 
@@ -46,6 +49,7 @@ class Dataset:
         publish: Whether its model goes into the zoo.
         options: Further values of the configuration, by dotted keys.
         about: What the card says of the data, beside their name.
+        start: Another dataset of the queue, whose best weights the first training starts from, at the extension's rate.
     """
 
     name: str
@@ -54,6 +58,7 @@ class Dataset:
     publish: bool = True
     options: Mapping[str, Any] = field(default_factory=dict)
     about: str = ""
+    start: str = ""
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -62,12 +67,21 @@ class Dataset:
 
     def generation(self) -> tuple[str, dict[str, Any]] | None:
         """Name and options of the simulated data, as `nmpm.data.catalog.ensure` takes them; None for recorded data."""
-        data = self._configuration().get("data", {}) | {
-            key.removeprefix("data."): value for key, value in self.options.items() if key.startswith("data.")
-        }
+        data = self._data()
         if data.get("path") is not None or data.get("name") is None or data.get("source", "disk") != "disk":
             return None
         return str(data["name"]), dict(data.get("generate") or {})
+
+    @property
+    def lacks_data(self) -> bool:
+        """Whether the configuration leaves the folder of recorded data open."""
+        data = self._data()
+        return data.get("path") == OPEN and data.get("name") is None
+
+    def _data(self) -> dict[str, Any]:
+        """The values under `data`."""
+        own = {key.removeprefix("data."): value for key, value in self.options.items() if key.startswith("data.")}
+        return {**self._configuration().get("data", {}), **own}
 
     def learning_rate(self) -> float:
         """The configuration's.
@@ -112,6 +126,19 @@ class Plan:
             raise ConfigError(f"{path}: {', '.join(twice or unknown)}: {'occurs twice' if twice else 'unknown key'}.")
         return cls(datasets, extension)
 
+    def with_data(self, folders: Mapping[str, str]) -> Plan:
+        """The plan with the folders of recorded data, by the datasets' names.
+
+        Raises:
+            ConfigError: if there is no dataset of a name.
+        """
+        self.select(list(folders))
+        found = tuple(
+            dataclasses.replace(d, options={**d.options, "data.path": folders[d.name]}) if d.name in folders else d
+            for d in self.datasets
+        )
+        return Plan(found, self.extension)
+
     def select(self, names: list[str]) -> Plan:
         """The plan with these datasets only, in its own order; all of them where no name is given.
 
@@ -125,16 +152,15 @@ class Plan:
         return Plan(tuple(d for d in self.datasets if not names or d.name in names), self.extension)
 
 
-def first_training(dataset: Dataset) -> list[str]:
-    """The words of `nmpm fit` for a dataset's first training, without its folder and device."""
+def new_training(dataset: Dataset) -> list[str]:
+    """The words of `nmpm fit` for a training from random weights, without its folder and device."""
     return _words(dataset.config, dataset.hours, dataset.options)
 
 
-def extended_training(dataset: Dataset, extension: Extension, best: Path) -> list[str]:
-    """The words of `nmpm fit` for a training from the best weights so far, at a lower learning rate."""
-    rate = extension.rate * dataset.learning_rate()
-    start = {"model.optimizer.init_args.lr": rate, "start_from": str(best)}
-    return _words(dataset.config, extension.hours, {**dataset.options, **start})
+def continued_training(dataset: Dataset, hours: float, rate: float, best: Path) -> list[str]:
+    """The words of `nmpm fit` for a training from the weights of a checkpoint, at `rate` times the learning rate."""
+    start = {"model.optimizer.init_args.lr": rate * dataset.learning_rate(), "start_from": str(best)}
+    return _words(dataset.config, hours, {**dataset.options, **start})
 
 
 def _words(config: str, hours: float, options: Mapping[str, Any]) -> list[str]:

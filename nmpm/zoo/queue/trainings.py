@@ -13,7 +13,7 @@ from nmpm._support.bounded_files import read_yaml
 from nmpm._support.shipped import find_config
 from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
-from nmpm.zoo.queue.plan import Dataset, Extension, extended_training, first_training
+from nmpm.zoo.queue.plan import Dataset, Extension, continued_training, new_training
 from nmpm.zoo.runs import BEST
 
 LAST = BEST.with_name("last.ckpt")
@@ -165,10 +165,24 @@ class History:
         if number <= len(trainings):
             return trainings[number - 1]
         training, best = Training(self.folder / str(number)), self.best()
+        hours, rate = (self.dataset.hours if number == 1 else self.extension.hours), self.extension.rate
+        if number == 1 and self.dataset.start:
+            best = self._origin().best()
         training.start(
-            first_training(self.dataset) if best is None else extended_training(self.dataset, self.extension, best.best)
+            new_training(self.dataset) if best is None else continued_training(self.dataset, hours, rate, best.best)
         )
         return training
+
+    def waits_for(self) -> str:
+        """What must be there before the first training, in words; empty where nothing is missing."""
+        if self.dataset.lacks_data:
+            return f"--data {self.dataset.name}=FOLDER"
+        origin = self._origin().trainings
+        return "" if not self.dataset.start or (origin and origin[0].finished) else self.dataset.start
+
+    def _origin(self) -> History:
+        """The trainings that the first one starts from."""
+        return History(self.dataset, self.folder.parent / self.dataset.start, self.extension)
 
     def hours_left(self) -> tuple[float, float]:
         """Hours of training that are left without further extensions, and with all that the limit allows."""
