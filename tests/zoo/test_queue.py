@@ -165,12 +165,22 @@ def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
     assert train(path) == 0
     folder = Path("zoo/small")
     card = yaml.safe_load((folder / "card.yaml").read_text())
-    card["test"]["mse"] = 0.0
-    (folder / "card.yaml").write_text(yaml.safe_dump(card))
-    capsys.readouterr()
+    about = card["about"]
+    changed = (
+        card | {"about": "a better one", "curve": [[1.0, 1, 0.0]]},
+        {key: value for key, value in card.items() if key != "curve"} | {"test": card["test"] | {"mse": 0.0}},
+    )
+    for better, split in zip(changed, ("validation", "test"), strict=True):
+        (folder / "card.yaml").write_text(yaml.safe_dump(better))
+        capsys.readouterr()
+        assert train(path, "--collect") == 0
+        assert f"kept, as its {split} error 0" in capsys.readouterr().out
+        assert (folder / "card.yaml").read_text() == yaml.safe_dump(better)
+    worse_in_validation = card | {"test": card["test"] | {"mse": 0.0}, "curve": [[1.0, 1, 1e9]]}
+    (folder / "card.yaml").write_text(yaml.safe_dump(worse_in_validation))
     assert train(path, "--collect") == 0
-    assert "is kept" in capsys.readouterr().out
-    assert Zoo.card("small", "zoo")["test"]["mse"] == 0.0
+    assert Zoo.card("small", "zoo")["test"]["mse"] > 0
+    assert Zoo.card("small", "zoo")["about"] == about
 
 
 def test_a_dataset_that_another_process_has_is_left_to_it(queue, capsys):

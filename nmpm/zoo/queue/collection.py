@@ -34,7 +34,8 @@ Command = Callable[[list[str]], int]
 def collect(history: History, zoo: Path, run: Command) -> str:
     """Test a dataset's best weights and make its entry of them, also while its training goes on.
 
-    An entry whose full-rollout error on the test split is lower is kept.
+    An entry whose validation error is lower is kept, so that the test split chooses nothing. Only for an entry whose
+    card has no validation errors, from before the queue, those of the test are compared.
 
     Args:
         history: Of the dataset.
@@ -56,9 +57,9 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         for file in (MERGED, "report.json"):
             with atomic_write(folder / file) as part:
                 part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        error, published = report["test"]["mse"], _published_error(name, zoo)
-        if published < error:
-            return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split; the entry with {1e3 * published:.4g} is kept."
+        error = report["test"]["mse"]
+        if (reason := _reason_to_keep(name, zoo, best.error(), error)) is not None:
+            return f"{name}: the entry is kept, as {reason}."
         replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
         refresh(zoo / name, measure=True)
         if history.dataset.generation() is not None:
@@ -127,11 +128,19 @@ def _about(dataset: Dataset) -> str:
     )
 
 
-def _published_error(name: str, zoo: Path) -> float:
+def _reason_to_keep(name: str, zoo: Path, validation: float, test: float) -> str | None:
+    """Why the published entry is better than weights with these errors; None if it is not, or there is none."""
     try:
-        return float(Zoo.card(name, zoo)["test"]["mse"])
+        card = Zoo.card(name, zoo)
+        split, found = "validation", validation
+        published = min((float(point[2]) for point in card.get("curve", [])), default=None)
+        if published is None:
+            split, found, published = "test", test, float(card["test"]["mse"])
     except (ZooError, KeyError, TypeError, ValueError):
-        return float("inf")
+        return None
+    if published >= found:
+        return None
+    return f"its {split} error {1e3 * published:.4g} ×10⁻³ is below {1e3 * found:.4g}"
 
 
 def _read(path: Path) -> dict[str, Any]:
