@@ -44,9 +44,8 @@ def run(words: list[str]) -> None:
     _check(chosen)
     out = chosen.out or Path("trade") / Path(chosen.dataset).name
     check_folder("--out", out)
-    from nmpm.evaluation.trade import make_choices
-
     from nmpm._support.devices import find_device
+    from nmpm.evaluation.trade import make_choices
 
     sweep = _sweep(chosen)
     scenes = _scenes(chosen.dataset, sweep.scenes)
@@ -133,7 +132,13 @@ def _measure(choices: list[Choice], scenes: Scenes, sweep: Sweep, out: Path, kee
 
     from nmpm.evaluation.trade import Store, count_steps, measure
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("ETA"), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
         task = progress.add_task("trade", total=count_steps(choices, scenes, sweep))
         return measure(

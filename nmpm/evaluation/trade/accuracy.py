@@ -77,7 +77,7 @@ def shown_frame(scenes: Scenes) -> int:
 
 
 def thumbnail(scenes: Scenes, position: Tensor) -> str:
-    """Positions (N, D) along the first two axes in 256 steps of the domain, as base64; not all of very many particles."""
+    """Positions (N, D) along the first two axes in 256 steps of the domain, as base64; a part of many particles."""
     every = -(-position.shape[0] // _SHOWN)
     low, high = position.new_tensor(scenes.scene.domain)[:2].T
     steps = ((position[::every, :2] - low) / (high - low) * 255).round().clamp(0, 255).to(torch.uint8)

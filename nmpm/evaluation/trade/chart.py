@@ -8,6 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from nmpm._support.atomic import atomic_write
 from nmpm.evaluation.trade.choice import Kind
 from nmpm.evaluation.trade.frontier import Standing, describe_measure, standings
@@ -71,9 +73,10 @@ def _draw_points(axes: Any, points: Sequence[Point], where: Mapping[str, Standin
     ordered = sorted(points, key=lambda point: point.milliseconds)
     times = [point.milliseconds for point in ordered]
     means = [where[point.name].mean for point in ordered]
-    down = [where[p.name].mean - where[p.name].low for p in ordered], [where[p.name].high - where[p.name].mean for p in ordered]
-    left = [p.milliseconds - p.quartiles[0] for p in ordered], [p.quartiles[2] - p.milliseconds for p in ordered]
-    axes.errorbar(times, means, yerr=down, xerr=left, linestyle="none", ms=6, elinewidth=0.7, alpha=0.9, **style)
+    ends = [(where[p.name].mean - where[p.name].low, where[p.name].high - where[p.name].mean) for p in ordered]
+    spread = [(p.milliseconds - p.quartiles[0], p.quartiles[2] - p.milliseconds) for p in ordered]
+    lengths = {"yerr": np.transpose(ends), "xerr": np.transpose(spread)}
+    axes.errorbar(times, means, **lengths, linestyle="none", ms=6, elinewidth=0.7, alpha=0.9, **style)
     members = [p for p in ordered if where[p.name].member]
     axes.plot(
         [p.milliseconds for p in members], [where[p.name].mean for p in members], linestyle="none", marker="o", ms=13,

@@ -25,7 +25,7 @@ MEASURES: Mapping[str, str] = MappingProxyType(
 
 POOLS: Mapping[str, Callable[[Point], bool]] = MappingProxyType(
     {
-        "everything": lambda point: True,
+        "everything": lambda _: True,
         "no simulator": lambda point: point.kind is not Kind.SIMULATOR,
     }
 )
@@ -77,7 +77,7 @@ def standings(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str,
         return {}
     errors = np.stack([point.errors[measure] for point in known])
     found = {
-        point.name: Standing(float(row.mean()), *map(float, bounds))
+        point.name: Standing(float(row.mean()), float(bounds[0]), float(bounds[1]))
         for point, row, bounds in zip(known, errors, intervals(errors, seed), strict=True)
     }
     rivals = [point for point in known if point.competes]
@@ -158,9 +158,7 @@ def compare_with_simulator(points: Sequence[Point], measure: str) -> list[Compar
     known = [point for point in points if point.competes and math.isfinite(point.mean(measure))]
     simulators = [point for point in known if point.kind is Kind.SIMULATOR]
     models = [point for point in known if point.kind is Kind.MODEL and point.batch == 1]
-    return [
-        _compare(model, simulators, measure) for model in sorted(models, key=lambda model: model.mean(measure))
-    ]
+    return [_compare(model, simulators, measure) for model in sorted(models, key=lambda model: model.mean(measure))]
 
 
 def _compare(model: Point, simulators: Sequence[Point], measure: str) -> Comparison:

@@ -1,4 +1,4 @@
-"""Emulators as choices: a trained model in one precision, with or without its constraints, on a finer or coarser grid."""
+"""Emulators as choices: a trained model in a precision, with or without constraints, on finer or coarser grids."""
 
 from __future__ import annotations
 

@@ -101,7 +101,9 @@ def collect_points(
 ) -> list[Point]:
     """The points of choices, of all that the store knows."""
     return [
-        _point(choice, known_accuracy(choice, scenes, measures, store), known_times(choice, scenes, timing, store), scenes)
+        _point(
+            choice, known_accuracy(choice, scenes, measures, store), known_times(choice, scenes, timing, store), scenes
+        )
         for choice in choices
     ]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,7 +49,7 @@ class SimulatorChoice(Choice):
         (index,) = indices
         recorded = scenes.recordings[index].frames[:2]
         start = self._nudged(self.preset.draw(scenes.seeds[index]), scenes.seeds[index])
-        follow = _followed(recorded[0], start)
+        follow: Callable[[Tensor], Tensor] = _followed(recorded[0], start)
 
         def run(frames: int) -> Tensor:
             simulated = self.preset.simulate_from(start, frames + 1).position[:, : len(start.position)]

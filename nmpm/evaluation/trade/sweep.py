@@ -198,9 +198,7 @@ def _simulators(settings: SimulatorSettings, preset: Preset) -> Iterator[Choice]
                 changed = dataclasses.replace(coarse, substeps=substeps)
             except ConfigError:  # an elastic wave crosses a cell in less than a substep
                 continue
-            yield SimulatorChoice(
-                _simulator_name(factor, substeps), changed, _simulator_settings(factor, substeps)
-            )
+            yield SimulatorChoice(_simulator_name(factor, substeps), changed, _simulator_settings(factor, substeps))
 
 
 def _simulator_name(factor: int, substeps: int) -> str:

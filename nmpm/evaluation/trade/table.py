@@ -20,14 +20,14 @@ SETTINGS = ("model", "precision", "constraints", "cells", "coarser", "substeps",
 
 COLUMNS = (
     "dataset", "scenes", "particles", "kind", "name", *SETTINGS, "batch", "threads", "device", "hardware", "clock",
-    "ms_per_frame", "ms_lower_quartile", "ms_upper_quartile", "ratio_to_reference", "ms_per_second", "frames_per_second",
-    "memory_mb", "stable", "failed_scenes", "failure", "error", "value", "low", "high", "pareto", "pareto_probability",
+    "ms_per_frame", "ms_lower_quartile", "ms_upper_quartile", "ratio_to_reference", "ms_per_second",
+    "frames_per_second", "memory_mb", "stable", "failed_scenes", "failure", "error", "value", "low", "high", "pareto", "pareto_probability",
 )  # fmt: skip
 """Columns of `csv_text`: one row for each point and error."""
 
 
 def csv_text(points: Sequence[Point], scenes: Scenes) -> str:
-    """One row for each point and error, tidy: every value has its column; numbers in plain decimals, length and seconds.
+    """One row for each point and error, tidy; lengths in domain length, empty where a value is not known.
 
     Points that failed in a scene have their errors' columns empty.
     """
