@@ -22,6 +22,8 @@ _MARKERS: Mapping[Kind, dict[str, Any]] = MappingProxyType(
         Kind.SIMULATOR: {"marker": "s", "color": "#c8642a", "markerfacecolor": "none", "label": "simulator"},
     }
 )
+_OFFSETS = {Kind.MODEL: (7, -11), Kind.SIMULATOR: (7, 5)}  # of names, in points
+_FAR = 100  # a line further below all points than this factor is named in the title, not drawn
 _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
     {
         Kind.TRIVIAL: {"linestyle": "--", "color": "0.45"},
@@ -33,10 +35,10 @@ _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
 def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str = "mse") -> None:
     """Write a PNG: emulators and simulator settings as points with bootstrap intervals, the others as lines.
 
-    Simulator settings are joined; points that predict several scenes at once are left out, as are unstable ones. Filled
-    rings mark the Pareto set.
+    Points that predict several scenes at once are left out, as are unstable ones. Rings mark the Pareto set.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     where = standings(points, measure)
     figure = Figure(figsize=(9, 5.6), layout="constrained")
@@ -44,9 +46,13 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
     shown = [p for p in points if p.stable and p.batch == 1 and p.name in where and math.isfinite(p.milliseconds)]
     for kind, style in _MARKERS.items():
         _draw_points(axes, [p for p in shown if p.kind is kind and not p.exact], where, style)
-    for point in shown:
-        if point.kind in _LINES and not point.exact:
-            _draw_line(axes, point, where[point.name], _LINES[point.kind])
+    lines = [p for p in shown if p.kind in _LINES and where[p.name].mean > 0]
+    least = min((where[p.name].low for p in shown if p.kind in _MARKERS and where[p.name].low > 0), default=0.0)
+    near = [p for p in lines if where[p.name].mean > least / _FAR]
+    for point in near:
+        _draw_line(axes, point, where[point.name], _LINES[point.kind])
+    far = "; ".join(f"{p.name}: {where[p.name].mean:.1g}" for p in lines if p not in near)
+    below = f"\n(below the picture: {far})" if far else ""
     for point in (p for p in shown if p.exact and p.kind is Kind.SIMULATOR):
         axes.axvline(point.milliseconds, color="#c8642a", lw=1)
         axes.annotate(
@@ -57,8 +63,12 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
     machine = "" if one is None else f"; {one.hardware}, {shown[0].threads} thread, {one.clock}"
     axes.set(
         xscale="log", yscale="log", xlabel=f"milliseconds per frame, one scene at a time{machine}",
-        ylabel=describe_measure(measure), title=f"{scenes.name}: time and error on {len(scenes)} test scenes",
+        ylabel=describe_measure(measure), title=f"{scenes.name}: time and error on {len(scenes)} test scenes" + below,
     )  # fmt: skip
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
     axes.grid(visible=True, which="major", color="0.9", lw=0.7)
     axes.set_axisbelow(True)
     axes.legend(loc="best", frameon=False)
@@ -84,7 +94,12 @@ def _draw_points(axes: Any, points: Sequence[Point], where: Mapping[str, Standin
     )  # fmt: skip
     for point, time, mean in zip(ordered, times, means, strict=True):
         axes.annotate(
-            _short(point), (time, mean), xytext=(6, 4), textcoords="offset points", fontsize=6.5, color=style["color"]
+            _short(point),
+            (time, mean),
+            xytext=_OFFSETS[point.kind],
+            textcoords="offset points",
+            fontsize=7,
+            color=style["color"],
         )
 
 

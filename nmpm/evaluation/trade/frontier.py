@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import compress
 from types import MappingProxyType
 
 import numpy as np
@@ -39,7 +40,7 @@ class Standing:
     Args:
         mean: Over scenes.
         low, high: Bootstrap interval of 95%.
-        member: Whether it is in the Pareto set of all choices.
+        member: Whether it is in the Pareto set: of one scene at a time if its batch is 1, else of all choices.
         probability: Of that, under resampling of the scenes.
     """
 
@@ -80,13 +81,13 @@ def standings(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str,
         point.name: Standing(float(row.mean()), float(bounds[0]), float(bounds[1]))
         for point, row, bounds in zip(known, errors, intervals(errors, seed), strict=True)
     }
-    rivals = [point for point in known if point.competes]
-    rows = errors[[point.competes for point in known]]
-    times = np.array([point.milliseconds for point in rivals])
-    members = pareto_members(times, rows.mean(1))
-    for point, member, share in zip(rivals, members, pareto_probabilities(times, rows, seed), strict=True):
-        one = found[point.name]
-        found[point.name] = Standing(one.mean, one.low, one.high, bool(member), float(share))
+    for most in (math.inf, 1):  # points of one scene at a time compete among themselves: their times are latencies
+        chosen = [point.competes and point.batch <= most for point in known]
+        rivals = list(compress(known, chosen))
+        times, rows = np.array([point.milliseconds for point in rivals]), errors[chosen]
+        members, shares = pareto_members(times, rows.mean(1)), pareto_probabilities(times, rows, seed)
+        for point, member, share in zip(rivals, members, shares, strict=True):
+            found[point.name] = replace(found[point.name], member=bool(member), probability=float(share))
     return found
 
 

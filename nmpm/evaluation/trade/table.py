@@ -21,7 +21,8 @@ SETTINGS = ("model", "precision", "constraints", "cells", "coarser", "substeps",
 COLUMNS = (
     "dataset", "scenes", "particles", "kind", "name", *SETTINGS, "batch", "threads", "device", "hardware", "clock",
     "ms_per_frame", "ms_lower_quartile", "ms_upper_quartile", "ratio_to_reference", "ms_per_second",
-    "frames_per_second", "memory_mb", "stable", "failed_scenes", "failure", "error", "value", "low", "high", "pareto", "pareto_probability",
+    "frames_per_second", "memory_mb", "stable", "failed_scenes", "failure",
+    "error", "value", "low", "high", "pareto", "pareto_probability",
 )  # fmt: skip
 """Columns of `csv_text`: one row for each point and error."""
 
