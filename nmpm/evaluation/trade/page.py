@@ -64,8 +64,8 @@ def _describe_point(point: Point) -> dict[str, Any]:
         "threads": point.threads,
         "device": point.device,
         "time per frame": f"{point.milliseconds:.3g} ms ({point.quartiles[0]:.3g} to {point.quartiles[2]:.3g})",
-        "time per second of the scene": f"{point.milliseconds_per_second:.3g} ms",
-        "frames per second": f"{point.frames_per_second:.3g}",
+        "time per second of the scene": f"{point.milliseconds_per_second:.0f} ms",
+        "frames per second": f"{point.frames_per_second:.0f}",
         "peak memory": "not known" if memory is None else f"{memory / 1e6:.3g} MB",
     }
     return {

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -49,7 +50,7 @@ class SimulatorChoice(Choice):
         (index,) = indices
         recorded = scenes.recordings[index].frames[:2]
         start = self._nudged(self.preset.draw(scenes.seeds[index]), scenes.seeds[index])
-        follow: Callable[[Tensor], Tensor] = _followed(recorded[0], start)
+        follow = follow_nearest(recorded[0], start.position)
 
         def run(frames: int) -> Tensor:
             simulated = self.preset.simulate_from(start, frames + 1).position[:, : len(start.position)]
@@ -67,20 +68,14 @@ class SimulatorChoice(Choice):
         return dataclasses.replace(start, position=np.clip(start.position + noise, low, high))
 
 
-@dataclass(frozen=True)
-class _Nearest:
-    """Paths (T, N, D) of recorded particles that move like their nearest simulated ones (T, M, D)."""
+def follow_nearest(first: Tensor, start: NDArray[Any]) -> Callable[[Tensor], Tensor]:
+    """From simulated paths (T, M, D) to paths (T, N, D) of the recorded particles.
 
-    first: Tensor
-    nearest: Tensor
-
-    def __call__(self, simulated: Tensor) -> Tensor:
-        return self.first + (simulated - simulated[0])[:, self.nearest]
-
-
-def _followed(first: Tensor, start: InitialState) -> Any:
-    """From simulated paths to those of the recorded particles, which start at `first`, (N, D)."""
-    if first.shape == start.position.shape:
+    Args:
+        first: (N, D) initial positions of the recorded particles.
+        start: (M, D) those of the simulated ones: the same, or else a recorded particle moves like the nearest.
+    """
+    if first.shape == start.shape:
         return lambda simulated: simulated
-    _, nearest = cKDTree(start.position).query(first.numpy())
-    return _Nearest(first, torch.from_numpy(nearest))
+    nearest = torch.from_numpy(cKDTree(start).query(first.numpy())[1])
+    return lambda simulated: first + (simulated - simulated[0])[:, nearest]
