@@ -194,11 +194,18 @@ def _simulators(settings: SimulatorSettings, preset: Preset) -> Iterator[Choice]
         for substeps in sorted(asked | {coarse.stable_substeps}, reverse=True):
             if (factor, substeps) == (1, preset.substeps):
                 continue
-            try:
-                changed = dataclasses.replace(coarse, substeps=substeps)
-            except ConfigError:  # an elastic wave crosses a cell in less than a substep
-                continue
-            yield SimulatorChoice(_simulator_name(factor, substeps), changed, _simulator_settings(factor, substeps))
+            changed = _with_substeps(coarse, substeps)
+            if changed is not None:
+                name = _simulator_name(factor, substeps)
+                yield SimulatorChoice(name, changed, _simulator_settings(factor, substeps))
+
+
+def _with_substeps(preset: Preset, substeps: int) -> Preset | None:
+    """The preset with so many substeps, stable or not; None if it refuses, as a wave then skips cells or particles."""
+    try:
+        return dataclasses.replace(preset, substeps=substeps)
+    except ConfigError:
+        return None
 
 
 def _simulator_name(factor: int, substeps: int) -> str:
@@ -211,11 +218,11 @@ def _simulator_settings(factor: int, substeps: int) -> dict[str, str | int | flo
 
 
 def _floors(floors: Floors, preset: Preset) -> Iterator[Choice]:
-    if floors.twin:
-        substeps = math.ceil(floors.twin * preset.substeps)
-        twin = dataclasses.replace(preset, substeps=substeps)
-        settings = _simulator_settings(1, substeps)
-        yield SimulatorChoice(f"twin: {substeps} of {preset.substeps} substeps", twin, settings, kind=Kind.FLOOR)
+    substeps = math.ceil(floors.twin * preset.substeps)
+    twin = _with_substeps(preset, substeps) if floors.twin else None
+    if twin is not None:
+        name, settings = f"twin: {substeps} of {preset.substeps} substeps", _simulator_settings(1, substeps)
+        yield SimulatorChoice(name, twin, settings, kind=Kind.FLOOR)
     if floors.nudge:
         settings = _simulator_settings(1, preset.substeps) | {"nudge": floors.nudge}
         name = f"simulator nudged by {floors.nudge:g}"

@@ -11,7 +11,7 @@ import torch
 
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.machine import clock_for, describe_device, peak_bytes
-from nmpm.evaluation.trade.choice import Choice
+from nmpm.evaluation.trade.choice import Choice, digest
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 
@@ -81,14 +81,12 @@ def measure_times(
         timing: Rounds and frames.
         store: Keeps each round's times as soon as the round is complete.
     """
-    runners = [_Runner(choice, _key(choice, scenes, timing)) for choice in choices]
-    for runner in runners:
-        runner.known = store.read("times", runner.key)
+    runners = _make_runners(choices, scenes, timing, store)
     warm: set[int] = set()
     for turn in range(timing.rounds):
         missing = [runner for runner in runners if runner.lacks(turn)]
         needed = [runner for runner in runners if runner in missing or (missing and runner.choice is reference)]
-        yield from (None for _ in range(len(runners) - len(needed)))
+        yield from (None for _ in range(len(choices) - len(needed)))
         spent: dict[int, float | None] = {}
         shift = turn % max(1, len(needed))
         for runner in needed[shift:] + needed[:shift]:
@@ -101,6 +99,12 @@ def measure_times(
             if milliseconds is not None:
                 runner.known[str(turn)] = [milliseconds, base]
             store.write("times", runner.key, runner.known)
+
+
+def _make_runners(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store) -> list[_Runner]:
+    """One for each choice; one for choices that are the same, such as the twin and that number of substeps."""
+    keys = {digest(key): (choice, key) for choice in reversed(choices) for key in [_key(choice, scenes, timing)]}
+    return [_Runner(choice, key, store.read("times", key)) for choice, key in reversed(keys.values())]
 
 
 def known_times(choice: Choice, scenes: Scenes, timing: Timing, store: Store) -> Times:

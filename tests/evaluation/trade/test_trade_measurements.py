@@ -181,6 +181,14 @@ def test_a_model_of_other_scenes_is_rejected(scenes):
         make_choices(tiny_sweep(), scenes, {"other": tiny_emulator(other)})
 
 
+def test_settings_that_a_simulator_refuses_are_left_out(scenes):
+    least = dataclasses.replace(scenes.preset, substeps=scenes.preset.coarsened(1)._wave_substeps)
+    strict = dataclasses.replace(scenes, preset=least)
+    names = [choice.name for choice in make_choices(tiny_sweep(), strict, {})]
+    assert not any(name.startswith("twin") for name in names)
+    assert f"simulator, {least.substeps} substeps" in names
+
+
 def test_without_a_simulator_models_and_trivial_predictors_remain(scenes):
     recorded = dataclasses.replace(scenes, preset=None, seeds=())
     kinds = {choice.kind for choice in make_choices(tiny_sweep(), recorded, {"one": tiny_emulator(scenes.scene)})}
