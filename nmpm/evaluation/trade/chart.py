@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -22,7 +23,13 @@ _MARKERS: Mapping[Kind, dict[str, Any]] = MappingProxyType(
         Kind.SIMULATOR: {"marker": "s", "color": "#c8642a", "markerfacecolor": "none", "label": "simulator"},
     }
 )
-_OFFSETS = {Kind.MODEL: (7, -11), Kind.SIMULATOR: (7, 5)}  # of names, in points
+_PLACES: Mapping[Kind, Sequence[dict[str, Any]]] = MappingProxyType(  # of names, in turn, in points
+    {
+        Kind.MODEL: ({"xytext": (-8, -11), "ha": "right"}, {"xytext": (8, -11)}),
+        Kind.SIMULATOR: ({"xytext": (8, 5)},),
+    }
+)
+_SIDES = ((0.9, "right"), (0.005, "left"))  # of the lines' names, in turn, as a share of the width
 _FAR = 100  # a line further below all points than this factor is named in the title, not drawn
 _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
     {
@@ -49,8 +56,8 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
     lines = [p for p in shown if p.kind in _LINES and where[p.name].mean > 0]
     least = min((where[p.name].low for p in shown if p.kind in _MARKERS and where[p.name].low > 0), default=0.0)
     near = [p for p in lines if where[p.name].mean > least / _FAR]
-    for point in near:
-        _draw_line(axes, point, where[point.name], _LINES[point.kind])
+    for point, side in zip(near, cycle(_SIDES), strict=False):
+        _draw_line(axes, point, where[point.name], _LINES[point.kind], side)
     far = "; ".join(f"{p.name}: {where[p.name].mean:.1g}" for p in lines if p not in near)
     below = f"\n(below the picture: {far})" if far else ""
     for point in (p for p in shown if p.exact and p.kind is Kind.SIMULATOR):
@@ -92,22 +99,17 @@ def _draw_points(axes: Any, points: Sequence[Point], where: Mapping[str, Standin
         [p.milliseconds for p in members], [where[p.name].mean for p in members], linestyle="none", marker="o", ms=13,
         markerfacecolor="none", markeredgecolor="0.2", markeredgewidth=0.8,
     )  # fmt: skip
-    for point, time, mean in zip(ordered, times, means, strict=True):
+    for point, time, mean, place in zip(ordered, times, means, cycle(_PLACES[ordered[0].kind]), strict=False):
         axes.annotate(
-            _short(point),
-            (time, mean),
-            xytext=_OFFSETS[point.kind],
-            textcoords="offset points",
-            fontsize=7,
-            color=style["color"],
+            _short(point), (time, mean), **place, textcoords="offset points", fontsize=7, color=style["color"]
         )
 
 
-def _draw_line(axes: Any, point: Point, one: Standing, style: Mapping[str, Any]) -> None:
+def _draw_line(axes: Any, point: Point, one: Standing, style: Mapping[str, Any], side: tuple[float, str]) -> None:
     axes.axhline(one.mean, lw=1, **style)
     axes.annotate(
-        point.name, (0.995, one.mean), xycoords=("axes fraction", "data"), xytext=(0, 2), textcoords="offset points",
-        fontsize=7.5, ha="right", color=style["color"],
+        point.name, (side[0], one.mean), xycoords=("axes fraction", "data"), xytext=(0, 2),
+        textcoords="offset points", fontsize=7.5, ha=side[1], color=style["color"],
     )  # fmt: skip
 
 

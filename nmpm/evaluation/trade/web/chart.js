@@ -22,7 +22,7 @@ class Chart {
     const y = makeAxis(heights, height - MARGIN.bottom, MARGIN.top, logarithmic);
     Object.assign(this, { x, y });
     this.drawAxes(x, y, width, height, measure);
-    for (const point of near) this.drawLevel(point, value(point)[0], x, y, width);
+    near.forEach((point, index) => this.drawLevel(point, value(point)[0], y, width, index % 2 === 1));
     for (const point of placed.filter((one) => one.exact && one.kind === "simulator")) this.drawExact(point, x, height);
     const limit = Math.min(width - MARGIN.right, Math.max(MARGIN.left, x.at(Math.max(budget, x.low))));
     draw(this.svg, "line", { id: "limit", x1: limit, x2: limit, y1: MARGIN.top, y2: height - MARGIN.bottom });
@@ -44,10 +44,11 @@ class Chart {
     draw(this.svg, "text", { transform: `translate(16 ${height / 2}) rotate(-90)`, "text-anchor": "middle" }, measure.label);
   }
 
-  drawLevel(point, error, x, y, width) {
+  drawLevel(point, error, y, width, onTheLeft) {
     const group = draw(this.svg, "g", { class: `level ${point.kind}` });
     draw(group, "line", { x1: MARGIN.left, x2: width - MARGIN.right, y1: y.at(error), y2: y.at(error) });
-    draw(group, "text", { class: "label", x: width - MARGIN.right - 4, y: y.at(error) - 5, "text-anchor": "end" }, point.name);
+    const place = onTheLeft ? { x: MARGIN.left + 4, "text-anchor": "start" } : { x: width - MARGIN.right - 4, "text-anchor": "end" };
+    draw(group, "text", { class: "label", y: y.at(error) - 5, ...place }, point.name);
   }
 
   drawExact(point, x, height) {
