@@ -7,10 +7,8 @@ own where the other setups' memory would matter.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import multiprocessing
-import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -24,9 +22,9 @@ import torch
 from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import DEVICES, find_device
 from nmpm.errors import ConfigError
+from nmpm.evaluation.machine import Action, Clock, describe_device, peak_bytes, wall_clock
 
-Action = Callable[[], object]
-Clock = Callable[[], float]
+__all__ = ["peak_bytes", "wall_clock"]  # the scripts import them from here
 K = TypeVar("K")
 
 WARM_UP = 2
@@ -85,20 +83,6 @@ def make_timing_parser(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     return parser
-
-
-def synchronize() -> None:
-    """Wait until the GPU has finished; does nothing where none is in use."""
-    if torch.cuda.is_initialized():
-        torch.cuda.synchronize()
-    if torch.backends.mps.is_available():
-        torch.mps.synchronize()
-
-
-def wall_clock() -> float:
-    """Seconds, read once the GPU has finished."""
-    synchronize()
-    return time.perf_counter()
 
 
 def clock_for(device: torch.device) -> Clock:
@@ -174,37 +158,6 @@ def _alternate(timers: Mapping[K, Callable[[], float]], rounds: int, warm_up: in
     return seconds
 
 
-def peak_bytes(action: Action, device: torch.device) -> float:
-    """Most memory that an action holds at a time, beyond what was held before it.
-
-    On CUDA that of torch's tensors, on the CPU that of the process (Linux only). NaN on MPS, which has no such counter.
-    """
-    if device.type == "cuda":
-        return _peak_on_cuda(action, device)
-    if device.type == "mps":
-        action()
-        return float("nan")
-    ctypes.CDLL(None).malloc_trim(0)  # otherwise the action reuses freed memory, which would not be counted
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    before = _process_status("VmRSS")
-    action()
-    return float(_process_status("VmHWM") - before)
-
-
-def _peak_on_cuda(action: Action, device: torch.device) -> float:
-    torch.cuda.synchronize(device)
-    before = torch.cuda.memory_allocated(device)
-    torch.cuda.reset_peak_memory_stats(device)
-    action()
-    torch.cuda.synchronize(device)
-    return float(torch.cuda.max_memory_allocated(device) - before)
-
-
-def _process_status(name: str) -> int:
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
-
-
 def run_in_process(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Run a picklable action in a new process, so that no earlier memory counts, and return its result."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -228,14 +181,8 @@ def measure_limits(device: torch.device, threads: int) -> dict[str, float]:
 
 def describe_machine(device: torch.device, threads: int) -> str:
     """Processor or GPU, threads, and torch's version."""
-    if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, torch {torch.__version__}"
-    if device.type == "mps":
-        return f"Apple GPU ({platform.processor()}), torch {torch.__version__}"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.processor()}, {threads} threads, torch {torch.__version__}"
+    parts = [describe_device(device), *([f"{threads} threads"] if device.type == "cpu" else [])]
+    return ", ".join([*parts, f"torch {torch.__version__}"])
 
 
 def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """The option --device, and data for tests: recorded trajectories where there are any, tiny made-up ones everywhere."""
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,6 +12,11 @@ import torch
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 
 Sizes = Sequence[tuple[int, int]]
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+CHROMIUM_OPTIONS = (
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
+)  # fmt: skip
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -35,6 +41,27 @@ def recorded() -> Path:
     if not Path(folder).is_dir():
         pytest.skip(f"NMPM_TEST_DATA={folder} is no folder")
     return Path(folder)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium, for pages."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed")
+    with playwright.sync_playwright() as running:
+        chromium = running.chromium.launch(executable_path=CHROMIUM, args=list(CHROMIUM_OPTIONS))
+        yield chromium
+        chromium.close()
+
+
+def wait_until(page, condition):
+    """Waits for a JavaScript condition (pages' policies forbid playwright's own way, which evaluates text)."""
+    for _ in range(200):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(25)
+    pytest.fail(f"not within 5 s: {condition}")
 
 
 def made_up_trajectory(frames: int, particles: int, seed: int = 0, statics: int = 0, dim: int = 2) -> Trajectory:

@@ -1,7 +1,6 @@
 """The viewer's page in headless Chromium: what a person clicks, presses and sees."""
 
 import io
-import shutil
 
 import numpy as np
 import pytest
@@ -9,30 +8,9 @@ from PIL import Image
 
 from nmpm import view
 from nmpm.viz import LabelledTrajectories
+from tests.conftest import wait_until
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-OPTIONS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
 WATER = (38, 112, 200)
-
-
-def wait_until(page, condition):
-    """Waits for a JavaScript condition (the page's policy forbids playwright's own way, which evaluates text)."""
-    for _ in range(200):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(25)
-    pytest.fail(f"not within 5 s: {condition}")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("Chromium is not installed")
-    with playwright.sync_playwright() as running:
-        chromium = running.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.colours import hex_code, material_colours, vary_brightness
+from nmpm.viz.html import fill_page
 from nmpm.viz.output import check_output, check_suffix, replace_picture
 from nmpm.viz.spacing import particle_spacing
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
@@ -40,7 +40,7 @@ class ViewerPage:
     def __init__(self, trajectories: LabelledTrajectories, every: int = 1) -> None:
         if every < 1:
             raise ConfigError(f"every = {every} must be at least 1.")
-        self._html = _fill(_describe(trajectories, every))
+        self._html = fill_page(files(__package__), SCRIPTS, _describe(trajectories, every))
 
     @property
     def html(self) -> str:
@@ -66,20 +66,6 @@ class ViewerPage:
         return (
             f'<iframe srcdoc="{page}" sandbox="allow-scripts" style="width: 100%; height: 640px; border: 0"></iframe>'
         )
-
-
-def _fill(description: dict[str, Any]) -> str:
-    """The page with style, scripts and data in it."""
-    folder = files(__package__)
-    # `</script>` in a label would end the data.
-    data = json.dumps(description, separators=(",", ":")).replace("<", "\\u003c")
-    script = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
-    style = folder.joinpath("style.css").read_text(encoding="utf-8")
-    page = folder.joinpath("page.html").read_text(encoding="utf-8")
-    for mark, content in {"/*STYLE*/": style, "/*SCRIPT*/": script, "/*DATA*/": data}.items():
-        before, after = page.split(mark)
-        page = before + content + after
-    return page
 
 
 def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:

@@ -1,0 +1,84 @@
+"""The machine that measures: its name, clocks that wait for the GPU, and the peak of memory."""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+Action = Callable[[], object]
+Clock = Callable[[], float]
+
+CPU_TIME, WALL_TIME = "CPU time", "wall time"
+
+
+def synchronize() -> None:
+    """Wait until the GPU has finished; does nothing where none is in use."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    if torch.backends.mps.is_available():
+        torch.mps.synchronize()
+
+
+def wall_clock() -> float:
+    """Seconds, read once the GPU has finished."""
+    synchronize()
+    return time.perf_counter()
+
+
+def clock_for(device: torch.device, threads: int) -> tuple[str, Clock]:
+    """What a computation is timed by, and its name.
+
+    One thread of a CPU by its CPU time, which other programs disturb less; everything else by wall time.
+    """
+    if device.type == "cpu" and threads == 1:
+        return CPU_TIME, time.thread_time
+    return WALL_TIME, wall_clock
+
+
+def peak_bytes(action: Action, device: torch.device) -> float:
+    """Most memory that an action holds at a time, beyond what was held before it.
+
+    On CUDA that of torch's tensors, on the CPU that of the process. NaN where there is no such counter: on MPS, and on
+    systems other than Linux.
+    """
+    if device.type == "cuda":
+        return _peak_on_cuda(action, device)
+    if device.type != "cpu" or not Path("/proc/self/clear_refs").exists():
+        action()
+        return float("nan")
+    ctypes.CDLL(None).malloc_trim(0)  # otherwise the action reuses freed memory, which would not be counted
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    before = _process_status("VmRSS")
+    action()
+    return float(_process_status("VmHWM") - before)
+
+
+def _peak_on_cuda(action: Action, device: torch.device) -> float:
+    torch.cuda.synchronize(device)
+    before = torch.cuda.memory_allocated(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    action()
+    torch.cuda.synchronize(device)
+    return float(torch.cuda.max_memory_allocated(device) - before)
+
+
+def _process_status(name: str) -> int:
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def describe_device(device: torch.device) -> str:
+    """Name of the processor or GPU."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "mps":
+        return f"Apple GPU ({platform.processor()})"
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

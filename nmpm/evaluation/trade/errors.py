@@ -1,0 +1,114 @@
+"""Errors of one predicted scene, by name.
+
+| name | what |
+|---|---|
+| mse@8, …, mse | squared position error up to a frame, and over all frames; length² |
+| emd | exact earth mover's distance per material, mean over a few frames that are evenly spaced; length |
+| kinetic | mean absolute error of the kinetic energy, over its mean |
+| height | deviation of the mean height above the floor in the last frame, relative |
+| crowding | deviation of the particles per occupied cell in the last frame, relative |
+
+`gain` is the energy gained beyond the initial one, as a share of it: no error, but a mark of instability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm.evaluation.shape import measure_shape
+from nmpm.grid import Grid
+from nmpm.metrics import earth_mover
+from nmpm.particles import Particles, Window
+from nmpm.scene import Scene
+
+REVISION = 1
+"""Increased whenever the same prediction gets other errors."""
+
+GAIN = "gain"
+MOST_GAIN = 0.05
+"""A prediction that gains more energy than this share of the initial one is unstable."""
+
+_CELL = 3.0  # particle spacings: side of the cells in which crowding is counted
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is measured of a prediction.
+
+    Args:
+        horizons: Frames at which the MSE is reported, beside the full rollout.
+        emd_frames: Evenly spaced frames at which the earth mover's distance is computed, the last among them; 0 for
+            none, as each takes half a second for 2,000 particles.
+    """
+
+    horizons: tuple[int, ...] = (8, 32, 100)
+    emd_frames: int = 1
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain data."""
+        return {"horizons": list(self.horizons), "emd_frames": self.emd_frames, "revision": REVISION}
+
+
+def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Measures) -> dict[str, float]:
+    """Errors of a prediction (1, T, N, D) of the only scene of a window; all positions are finite."""
+    moving = window.mask[0]
+    ours, theirs = predicted[0, :, moving].double(), window.target[0, :, moving].double()
+    found = _squared(ours, theirs, measures.horizons)
+    if measures.emd_frames:
+        found["emd"] = _earth_mover(ours, theirs, window.material[0, moving], measures.emd_frames)
+    found |= _energies(scene, window, ours, theirs)
+    if bool((window.gravity != 0).any()):
+        found |= _shapes(scene, window.initial, predicted[:, -1], window.target[:, -1])
+    return found
+
+
+def _squared(ours: Tensor, theirs: Tensor, horizons: Sequence[int]) -> dict[str, float]:
+    curve = (ours - theirs).square().mean((1, 2))
+    at = {f"mse@{h}": float(curve[:h].mean()) for h in horizons if h <= len(curve)}
+    return at | {"mse": float(curve.mean())}
+
+
+def _earth_mover(ours: Tensor, theirs: Tensor, material: Tensor, count: int) -> float:
+    frames = np.unique(np.linspace(0, len(ours) - 1, count + 1).round().astype(int)[1:])
+    kinds = [material == kind for kind in material.unique()]
+    return float(np.mean([earth_mover(ours[frames][:, kind], theirs[frames][:, kind]) for kind in kinds]))
+
+
+def _energies(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> dict[str, float]:
+    moving = window.mask[0]
+    densities = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)
+    mass = densities[window.material[0, moving]]
+    share = mass / mass.sum()
+    start = window.frames[0, :2, moving].double()
+    kinetic, total = _energy(scene, torch.cat([start, ours]), share, window.gravity[0].double())
+    truth, _ = _energy(scene, torch.cat([start, theirs]), share, window.gravity[0].double())
+    initial = float(total[0])
+    found = {"kinetic": float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))}
+    if initial > 0:
+        found[GAIN] = float(total.max() / initial - 1)
+    return found
+
+
+def _energy(scene: Scene, path: Tensor, share: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
+    """Kinetic, and kinetic and potential energy per mass between frames, (T - 1,), of a path (T, N, D)."""
+    steps = path.diff(dim=0)
+    kinetic = (steps.square().sum(-1) * share).sum(-1) / 2
+    middle = (path[1:] + path[:-1]) / 2
+    low, high = torch.tensor(scene.bounds, dtype=torch.float64).T
+    floor = torch.where(gravity < 0, low, high)
+    return kinetic, kinetic - (((middle - floor) @ gravity) * share).sum(-1)
+
+
+def _shapes(scene: Scene, state: Particles, ours: Tensor, theirs: Tensor) -> dict[str, float]:
+    longest = max(high - low for low, high in scene.domain)
+    grid = Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
+    low, high = ours.new_tensor(scene.domain).T
+    shapes = [measure_shape(scene, grid, state, position.clamp(low, high)) for position in (ours, theirs)]
+    relative = shapes[0].relative_to(shapes[1])
+    return {name: abs(relative[name] - 1) for name in ("height", "crowding")}

@@ -1,0 +1,125 @@
+"""The recorded scenes on which all choices are measured."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from nmpm.data.format import Split, read_metadata
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import Recording, SplitRecordings
+from nmpm.data.scene_inference import infer_scene
+from nmpm.errors import ConfigError, DataError
+from nmpm.particles import Window
+from nmpm.scene import Scene
+from nmpm.sim import Preset, preset_from_dict
+
+MOVING = 0.02
+"""A scene moves as long as its root mean square speed is at least this share of the largest one."""
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Test trajectories of one family of scenes.
+
+    Args:
+        name: Of the dataset.
+        scene: What they have in common.
+        recordings: The trajectories, of at least 3 frames.
+        preset: The simulator that made them; None if they were recorded, or made by an unknown simulator.
+        seeds: Of each trajectory's initial state in the preset; empty without preset.
+    """
+
+    name: str
+    scene: Scene
+    recordings: tuple[Recording, ...]
+    preset: Preset | None = None
+    seeds: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+    def frames(self, index: int) -> int:
+        """Frames to predict: all but the two that a rollout starts from."""
+        return len(self.recordings[index].frames) - 2
+
+    def window(self, indices: Sequence[int], frames: int | None = None) -> Window:
+        """Some scenes as one batch, with so many frames to predict; with all of the shortest when left out."""
+        chosen = [self.recordings[index] for index in indices]
+        length = min(len(recording.frames) for recording in chosen) if frames is None else frames + 2
+        return collate(chosen, self.scene, length)
+
+    def moving_frames(self, index: int) -> int:
+        """Predicted frames until the scene comes to rest, see `MOVING`; at least 1."""
+        steps = self.recordings[index].frames[1:].diff(dim=0)
+        speed = steps.square().sum(-1).mean(-1).sqrt()
+        moving = (speed >= MOVING * speed.max()).nonzero()
+        return int(moving[-1]) + 1 if len(moving) else 1
+
+    @cached_property
+    def digests(self) -> tuple[str, ...]:
+        """SHA-256 of each scene's positions, materials and gravity, in short."""
+        return tuple(_digest(recording) for recording in self.recordings)
+
+
+def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = None) -> Scenes:
+    """The first `count` test trajectories of a dataset in native layout.
+
+    Args:
+        name: Of the dataset.
+        folder: Holds `test.h5` and `metadata.json`.
+        count: Fewer where the split has fewer.
+        preset: The simulator of the scenes, where the metadata do not name it; the trajectories must state their seeds.
+
+    Raises:
+        DataError: if files are missing or wrong.
+        ConfigError: if the simulator's scenes are others than the dataset's.
+    """
+    metadata = read_metadata(folder)
+    simulation = metadata.extra.get("simulation")
+    if preset is None and isinstance(simulation, dict) and "preset" in simulation:
+        preset = preset_from_dict(simulation["preset"])
+    scene = infer_scene(folder) if preset is None else preset.scene
+    split = Split(folder / "test.h5")
+    recordings = SplitRecordings(split, metadata, scene)
+    recordings.require_frames(3, "an evaluation")
+    chosen = range(min(count, len(recordings)))
+    seeds = tuple(_seed(split, index) for index in chosen) if preset else ()
+    scenes = Scenes(name, scene, tuple(recordings[index] for index in chosen), preset, seeds)
+    _check_start(scenes)
+    return scenes
+
+
+def _seed(split: Split, index: int) -> int:
+    seed = split.attributes(index).get("seed")
+    if seed is None:
+        raise DataError(
+            f"{split.where(index)}: the attribute seed is missing, so that the simulator cannot repeat the trajectory."
+        )
+    return int(seed)
+
+
+def _check_start(scenes: Scenes) -> None:
+    """Make sure that the preset draws the initial state that the first trajectory has."""
+    if scenes.preset is None:
+        return
+    drawn = torch.from_numpy(scenes.preset.draw(scenes.seeds[0]).position).float()
+    recorded = scenes.recordings[0].frames[0]
+    if drawn.shape != recorded.shape or not torch.allclose(drawn, recorded, atol=1e-5):
+        raise ConfigError(
+            f"The simulator {scenes.preset.name} does not draw the initial states of {scenes.name}: they were made by"
+            " another version or preset. Simulate the dataset again, or measure without a simulator."
+        )
+
+
+def _digest(recording: Recording) -> str:
+    digest = hashlib.sha256()
+    for values in (recording.frames, recording.material, recording.obstacle, recording.gravity):
+        digest.update(f"{values.dtype} {tuple(values.shape)};".encode())
+        digest.update(values.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,81 @@
+"""The simulator of the scenes as a choice: with fewer substeps, on a coarser grid, of larger particles."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from nmpm.evaluation.trade.choice import Choice, Kind, Rollout
+from nmpm.evaluation.trade.scenes import Scenes
+from nmpm.sim import InitialState, Preset
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorChoice(Choice):
+    """A simulator, from the initial state of each trajectory, of which frames 0 and 1 are left out.
+
+    Where its particles are others than the recorded ones (larger particles of SPH), a recorded particle moves like
+    the simulated one that was nearest to it initially.
+
+    Args:
+        name: Unique among the choices.
+        preset: Resolution and substeps; the initial states are drawn from it.
+        settings: What was chosen.
+        nudge: Standard deviation of Gaussian noise on the initial positions, as a share of the domain's longest side.
+        kind: A simulator, or a floor.
+    """
+
+    name: str
+    preset: Preset
+    settings: Mapping[str, str | int | float]
+    nudge: float = 0.0
+    kind: Kind = Kind.SIMULATOR
+    batch: int = field(default=1, init=False)
+    threads: int = field(default=1, init=False)
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        # The number of frames of the preset's own trajectories does not matter.
+        return {"preset": self.preset.with_frames(1).to_dict(), "revision": self.preset.revision, "nudge": self.nudge}
+
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        (index,) = indices
+        recorded = scenes.recordings[index].frames[:2]
+        start = self._nudged(self.preset.draw(scenes.seeds[index]), scenes.seeds[index])
+        follow = follow_nearest(recorded[0], start.position)
+
+        def run(frames: int) -> Tensor:
+            simulated = self.preset.simulate_from(start, frames + 1).position[:, : len(start.position)]
+            return follow(torch.from_numpy(simulated))[2:].unsqueeze(0)
+
+        return run
+
+    def _nudged(self, start: InitialState, seed: int) -> InitialState:
+        if not self.nudge:
+            return start
+        side = max(high - low for low, high in self.preset.domain)
+        noise = self.nudge * side * np.random.default_rng(seed).standard_normal(start.position.shape)
+        low, high = np.array(self.preset.box).T
+        low, high = np.minimum(low, start.position.min(0)), np.maximum(high, start.position.max(0))
+        return dataclasses.replace(start, position=np.clip(start.position + noise, low, high))
+
+
+def follow_nearest(first: Tensor, start: NDArray[Any]) -> Callable[[Tensor], Tensor]:
+    """From simulated paths (T, M, D) to paths (T, N, D) of the recorded particles.
+
+    Args:
+        first: (N, D) initial positions of the recorded particles.
+        start: (M, D) those of the simulated ones: the same, or else a recorded particle moves like the nearest.
+    """
+    if first.shape == start.shape:
+        return lambda simulated: simulated
+    nearest = torch.from_numpy(cKDTree(start).query(first.numpy())[1])
+    return lambda simulated: first + (simulated - simulated[0])[:, nearest]

@@ -1,0 +1,207 @@
+"""Choices over a tiny simulated dataset: what they predict, and that stored measurements are taken up."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from nmpm.errors import ConfigError
+from nmpm.evaluation.baselines import free_fall
+from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure
+from nmpm.evaluation.trade.accuracy import measure_accuracy
+from nmpm.evaluation.trade.errors import measure_errors
+from nmpm.evaluation.trade.simulators import SimulatorChoice, follow_nearest
+from nmpm.evaluation.trade.table import COLUMNS, csv_text
+from nmpm.evaluation.trade.trivial import TrivialChoice
+from tests.evaluation.trade.made_up import tiny_emulator, tiny_scenes, tiny_sweep
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    return tiny_scenes(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture(scope="module")
+def choices(scenes):
+    return make_choices(tiny_sweep(), scenes, {"carried": tiny_emulator(scenes.scene)})
+
+
+def named(choices, name):
+    return next(choice for choice in choices if choice.name == name)
+
+
+def test_every_choice_predicts_all_frames_of_every_scene(scenes, choices):
+    for choice in choices:
+        for index in range(2):
+            frames = scenes.frames(index)
+            predicted = choice.prepare(scenes, [index])(frames)
+            assert predicted.shape == scenes.window([index]).target.shape, choice.name
+
+
+def test_several_scenes_at_once_predict_what_each_does_alone(scenes, choices):
+    both = named(choices, "carried, batch 2").prepare(scenes, [0, 1])(4)
+    for index in range(2):
+        alone = named(choices, "carried").prepare(scenes, [index])(4)
+        count = alone.shape[2]
+        torch.testing.assert_close(both[index : index + 1, :, :count], alone)
+
+
+def test_the_simulator_as_shipped_repeats_the_data_to_the_bit(scenes, choices):
+    reference = choices[0]
+    assert isinstance(reference, SimulatorChoice)
+    for index in range(2):
+        predicted = reference.prepare(scenes, [index])(scenes.frames(index))
+        assert torch.equal(predicted, scenes.window([index]).target)
+
+
+def test_a_nudge_moves_the_simulation_a_little(scenes, choices):
+    nudged = next(choice for choice in choices if "nudged" in choice.name)
+    distance = nudged.prepare(scenes, [0])(4) - scenes.window([0], 4).target
+    assert 0 < float(distance.abs().max()) < 1e-3
+    assert nudged.kind is Kind.FLOOR
+
+
+def test_recorded_particles_move_like_the_nearest_of_fewer_larger_ones():
+    first = torch.tensor([[0.1, 0.1], [0.2, 0.1], [0.8, 0.1]])
+    larger = np.array([[0.15, 0.1], [0.8, 0.12]])
+    moves = torch.tensor([[0.0, 0.3], [0.05, 0.0]])  # of the two larger particles, per frame
+    simulated = torch.from_numpy(larger).float() + torch.arange(3).view(3, 1, 1) * moves
+    paths = follow_nearest(first, larger)(simulated)
+    torch.testing.assert_close(paths, first + torch.arange(3).view(3, 1, 1) * moves[[0, 0, 1]])
+
+
+def test_measuring_again_measures_nothing_and_gives_the_same_points(scenes, choices, tmp_path, monkeypatch):
+    sweep, store, steps = tiny_sweep(), Store(tmp_path), []
+    first = measure(choices, scenes, sweep, store, steps.append)
+    assert len(steps) == count_steps(choices, scenes, sweep)
+    for choice in choices:
+        monkeypatch.setattr(type(choice), "prepare", lambda *_: pytest.fail("measured again"))
+    again = measure(choices, scenes, sweep, Store(tmp_path), lambda _: None)
+    assert csv_text(again, scenes) == csv_text(first, scenes)
+
+
+def test_an_interrupted_measurement_goes_on_to_the_same_errors(scenes, choices, tmp_path):
+    sweep, choice = tiny_sweep(), named(choices, "carried")
+    whole, cut = Store(tmp_path / "whole"), Store(tmp_path / "cut")
+    list(measure_accuracy(choice, scenes, sweep.measures, whole))
+    next(measure_accuracy(choice, scenes, sweep.measures, cut))  # killed after the first scene
+    (path,) = (tmp_path / "cut" / "points").iterdir()
+    assert len(json.loads(path.read_text())["known"]) == 1
+    list(measure_accuracy(choice, scenes, sweep.measures, cut))
+    assert path.read_bytes() == next((tmp_path / "whole" / "points").iterdir()).read_bytes()
+
+
+def test_stored_predictions_give_other_errors_without_predicting(scenes, tmp_path, monkeypatch):
+    choice, store = TrivialChoice("free fall"), Store(tmp_path, keep_predictions=True)
+    measures = tiny_sweep().measures
+    list(measure_accuracy(choice, scenes, measures, store))
+    monkeypatch.setattr(TrivialChoice, "prepare", lambda *_: pytest.fail("predicted again"))
+    list(measure_accuracy(choice, scenes, dataclasses.replace(measures, horizons=(2,)), store))
+    assert len(list(tmp_path.glob("predictions/*/*.npz"))) == 2
+
+
+class Made(Choice):
+    """Predicts what a function makes of the recorded frames."""
+
+    kind, settings = Kind.MODEL, {}
+
+    def __init__(self, name, make):
+        self.name, self.make = name, make
+
+    @property
+    def identity(self):
+        return {"made": self.name}
+
+    def prepare(self, scenes, indices):
+        return lambda frames: self.make(scenes.window(indices, frames).target)
+
+
+def fail(_):
+    raise ConfigError("the simulation has blown up in frame 3")
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (fail, "the simulation has blown up in frame 3"),
+        (lambda target: target / (torch.arange(target.shape[1]) != 2).view(1, -1, 1, 1), "from predicted frame 3 on"),
+        (lambda target: target + 0.1 * torch.arange(target.shape[1]).view(1, -1, 1, 1), "of energy"),
+    ],
+    ids=["raises", "not finite", "gains energy"],
+)
+def test_what_fails_is_named_and_does_not_compete(scenes, tmp_path, make, reason):
+    (point,) = measure([Made("bad", make)], scenes, tiny_sweep(), Store(tmp_path), lambda _: None)
+    assert not point.competes
+    assert set(point.failures) == {0, 1}
+    assert all(reason in text for text in point.failures.values())
+
+
+def test_errors_of_a_shift_are_in_closed_form(scenes, tmp_path):
+    shifted = Made("shifted", lambda target: target + torch.tensor([0.01, 0.0]))
+    (point,) = measure([shifted], scenes, tiny_sweep(), Store(tmp_path), lambda _: None)
+    np.testing.assert_allclose(point.errors["mse"], 0.01**2 / 2, rtol=1e-3)  # the mean over two axes
+    np.testing.assert_allclose(point.errors["emd"], 0.01, rtol=1e-3)
+    np.testing.assert_allclose(point.errors["height"], 0, atol=1e-6)
+
+
+def test_free_fall_conserves_energy_and_repeats_free_fall(scenes):
+    window = scenes.window([0])
+    falling = free_fall(scenes.scene, window.initial, 6)
+    found = measure_errors(
+        scenes.scene, dataclasses.replace(window, frames=torch.cat([window.frames[:, :2], falling], 1)), falling,
+        tiny_sweep().measures,
+    )  # fmt: skip
+    assert found["mse"] == found["kinetic"] == found["height"] == found["crowding"] == 0
+    if not bool((falling[..., 1] <= scenes.scene.bounds[1][0]).any()):
+        assert abs(found["gain"]) < 1e-3
+
+
+def test_resting_frames_are_not_timed(scenes):
+    frames = scenes.recordings[0].frames
+    stopped = torch.cat([frames[:6], frames[5:6].expand(20, -1, -1)])
+    rest = dataclasses.replace(
+        scenes, recordings=(dataclasses.replace(scenes.recordings[0], frames=stopped), *scenes.recordings[1:])
+    )
+    assert rest.moving_frames(0) == 4  # frames 2 to 5, as predictions start at frame 2
+    assert rest.frames(0) == 24
+
+
+def test_repeated_choices_are_left_out(scenes):
+    names = [choice.name for choice in make_choices(tiny_sweep(), scenes, {"carried": tiny_emulator(scenes.scene)})]
+    assert len(names) == len(set(names))
+    assert "carried, free" not in names  # it has no constraints
+
+
+def test_a_model_of_other_scenes_is_rejected(scenes):
+    other = dataclasses.replace(scenes.scene, dt=2 * scenes.scene.dt)
+    with pytest.raises(ConfigError, match=r"model other was trained for other scenes .*: dt differ"):
+        make_choices(tiny_sweep(), scenes, {"other": tiny_emulator(other)})
+
+
+def test_settings_that_a_simulator_refuses_are_left_out(scenes):
+    least = dataclasses.replace(scenes.preset, substeps=scenes.preset.coarsened(1)._wave_substeps)
+    strict = dataclasses.replace(scenes, preset=least)
+    names = [choice.name for choice in make_choices(tiny_sweep(), strict, {})]
+    assert not any(name.startswith("twin") for name in names)
+    assert f"simulator, {least.substeps} substeps" in names
+
+
+def test_without_a_simulator_models_and_trivial_predictors_remain(scenes):
+    recorded = dataclasses.replace(scenes, preset=None, seeds=())
+    kinds = {choice.kind for choice in make_choices(tiny_sweep(), recorded, {"one": tiny_emulator(scenes.scene)})}
+    assert kinds == {Kind.MODEL, Kind.TRIVIAL}
+
+
+def test_the_table_is_tidy(scenes, choices, tmp_path):
+    points = measure(choices, scenes, tiny_sweep(), Store(tmp_path), lambda _: None)
+    header, *rows = csv_text(points, scenes).splitlines()
+    assert header.split(",") == list(COLUMNS)
+    table = list(csv.DictReader([header, *rows]))
+    assert len({(row["name"], row["error"]) for row in table}) == len(table) == 6 * len(points)
+    first = next(row for row in table if row["name"] == "carried, batch 2" and row["error"] == "mse")
+    assert (first["kind"], first["batch"], first["constraints"]) == ("model", "2", "held")
+    assert float(first["low"]) <= float(first["value"]) <= float(first["high"])
+    assert np.isclose(float(first["frames_per_second"]) * float(first["ms_per_frame"]), 1000, rtol=1e-3)
