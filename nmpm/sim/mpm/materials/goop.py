@@ -23,7 +23,7 @@ from typing import ClassVar
 
 from nmpm.errors import ConfigError
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
+from nmpm._support.jit import jit
 from nmpm.sim.mpm.materials.elastic import PlaneStrainSolid
 
 
