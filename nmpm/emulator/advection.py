@@ -20,8 +20,10 @@ from nmpm.emulator.constraints import (
     at_rest,
     check_within_bounds,
     energy,
+    mass_shares,
 )
-from nmpm.emulator.contact import Contact
+from nmpm.emulator.contact import Contact, obstacle_share
+from nmpm.emulator.departure import Departure
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
@@ -30,7 +32,7 @@ from nmpm.transfer.chunks import can_branch, chunks
 
 @dataclass(frozen=True)
 class Flight:
-    """The state at the start of a bundle and the fields predicted for it.
+    """Particles on their way through a bundle.
 
     Args:
         cells: (B, N, D) positions.
@@ -78,31 +80,39 @@ class Advection:
     bounds: Tensor
     walls: Tensor
 
-    def free_path(self, flight: Flight) -> Tensor:
+    def free_path(self, start: Departure) -> Tensor:
         """(B, m, N, D) positions by the network's velocities alone, within the bounds.
 
         Raises:
             DataError: as `constrained_path`.
         """
-        return self._check_bounds(self._free(flight))
+        return self._check_bounds(self._free(self._take_off(start)))
 
-    def constrained_path(self, flight: Flight, solid: Tensor, budget: Tensor | None) -> Tensor:
+    def constrained_path(self, start: Departure, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
 
         Args:
-            flight: What to start from.
+            start: What to start from.
             solid: (B, C_solid, *S), the share of each cell that is wall or obstacle.
             budget: (B,) energy that no frame may exceed; None for no such limit.
 
         Raises:
             DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
         """
+        flight = self._take_off(start)
         path = self._free(flight) if budget is None else self._within_energy(flight, budget)
         path = self._clear_of_obstacles(flight, path, solid)
         if self.constraints.rest_speed:
             still = at_rest(flight.cells, path, self.constraints.rest_speed, flight.gravity)
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
         return self._check_bounds(path)
+
+    def _take_off(self, start: Departure) -> Flight:
+        """The velocities that particles keep, and their shares of their scene's mass."""
+        smoothed = self.gather(start.state[:, : start.fields.shape[2]], start.cells, start.material)
+        carried = self.decoder.carried_velocity(start.velocity, smoothed)
+        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
+        return Flight(start.cells, start.velocity, carried, start.gravity, start.material, start.fields, share)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
@@ -187,9 +197,7 @@ class Advection:
         """The path (B, m, N, D), clear of obstacles."""
         if not (self.constraints.solids and self.scene.obstacles):
             return path
-        room = 1 - self.walls
-        share = torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
-        return self._confine(Contact(share, self.grid).hold(flight.cells, path))
+        return self._confine(Contact(obstacle_share(solid, self.walls), self.grid).hold(flight.cells, path))
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""

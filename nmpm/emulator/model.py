@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,9 +17,11 @@ from torch import Tensor, nn
 
 from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
-from nmpm.emulator.advection import Advection, Flight
+from nmpm.emulator.advection import Advection
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
-from nmpm.emulator.rasterise import grid_state, solid_fraction, wall_fraction
+from nmpm.emulator.departure import Departure
+from nmpm.emulator.rasterise import solid_fraction, wall_fraction
+from nmpm.emulator.steps import make_plan, steps_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -77,6 +80,7 @@ class Emulator(nn.Module):
     def __init__(self, recipe: EmulatorRecipe) -> None:
         super().__init__()
         self.recipe = recipe
+        self._plan = make_plan(recipe)
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -161,6 +165,7 @@ class Emulator(nn.Module):
         """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
         other = copy.copy(self)
         other.recipe = dataclasses.replace(self.recipe, constraints=constraints)
+        other._plan = make_plan(other.recipe)
         return other
 
     def unconstrained(self) -> Emulator:
@@ -214,30 +219,18 @@ class Emulator(nn.Module):
         """
         context = self.context(particles) if context is None else context
         device = particles.position.device.type
-        with torch.autocast(device, enabled=False):
-            cells, velocity, gravity = self.in_cells(particles)
-            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
+        steps = steps_for(self, self._plan, particles)
+        with _full_precision(device):
+            cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
-        with torch.autocast(device, enabled=False):
+        with _full_precision(device):
             fields = output.to(self.precision) * self.output_scale
-            advection = self.advection
-            smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
-            carried = self.decoder.carried_velocity(velocity, smoothed)
-            share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
-            flight = Flight(cells, velocity, carried, gravity, particles.material, fields, share)
-            if self.training:
-                path = advection.free_path(flight)
-            else:
-                path = advection.constrained_path(flight, context.solid, context.budget)
-            steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
-            precision = particles.position.dtype
-            return Bundle(
-                position=self.grid.to_length(path.to(precision)),
-                velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
-            )
+            start = Departure(cells, velocity, gravity, particles.material, particles.mask, state, fields)
+            path = steps.path(start, context)
+            return Bundle(*steps.to_length(path, cells, particles.position.dtype))
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
@@ -246,3 +239,8 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
+
+
+def _full_precision(device: str) -> AbstractContextManager[object]:
+    """A context without autocast; entering one where none is on would cost as much as a small operation."""
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()

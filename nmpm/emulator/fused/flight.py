@@ -148,3 +148,25 @@ def rest(cells, path, gravity, speed, free_fall, low, high):  # type: ignore[no-
             for frame in range(frames):
                 for d in range(dim):
                     path[frame, p, d] = cells[p, d]
+
+
+@jit
+def land(path, cells, box, velocity, low, high):  # type: ignore[no-untyped-def]
+    """Convert a path to domain length in place, and fill in the velocity at its last frame.
+
+    Args:
+        path: (m, N, D) in cells.
+        cells: (N, D), where it starts.
+        box: (2, D) the grid's lower corner and the cells' widths, in domain length.
+        velocity: (N, D) in domain length per frame.
+        low, high: Which particles.
+    """
+    last = len(path) - 1
+    for p in range(low, high):
+        for d in range(cells.shape[1]):
+            before = path[last - 1, p, d] if last > 0 else cells[p, d]
+            velocity[p, d] = (path[last, p, d] - before) * box[1, d]
+    for frame in range(last + 1):
+        for p in range(low, high):
+            for d in range(cells.shape[1]):
+                path[frame, p, d] = path[frame, p, d] * box[1, d] + box[0, d]

@@ -34,10 +34,15 @@ def gather(field, material, cells, shape, wraps, steps, out):  # type: ignore[no
 
 @jit
 def _gather_linear_2d(field, material, cells, shape, wraps, out):  # type: ignore[no-untyped-def]
+    many, walls = len(material) > 0, not (wraps[0] or wraps[1])
     for p in range(len(cells)):
-        first = 2 * material[p] if len(material) else 0
-        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        first = 2 * material[p] if many else 0
+        if walls:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], False)
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], False)
+        else:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
         a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
         for k in range(2):
             out[p, k] = bilinear(field[a, first + k], field[b, first + k], field[c, first + k], field[d, first + k], x, y)

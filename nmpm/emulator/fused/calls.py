@@ -1,0 +1,94 @@
+"""The kernels for a batch of scenes as functions of tensors: p2g, the way through a bundle, and back to domain length.
+
+Shapes as in `nmpm.particles`; tensors are float32 on the CPU and carry no gradients.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm._support.parallel import map_ranges, split
+from nmpm.emulator.fused.flight import land
+from nmpm.emulator.fused.path import SceneArrays, clear_of_obstacles, fly_scene, rest_scene
+from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.fused.rasterise import rasterise_scene
+
+_CHUNK = 2**14
+
+
+def rasterise(
+    plan: Plan, position: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, solid: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Particles in grid units, and the grid state.
+
+    Returns:
+        (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) grid state, whose
+        channels lie next to each other in memory.
+    """
+    batch, count, dim = position.shape
+    cells, moved = np.empty((2, batch, count, dim), np.float32)
+    pull = _array(gravity) / plan.box[1]
+    channels = len(plan.mass) * (dim + 1) + plan.solid + dim * plan.constants
+    state = np.empty((batch, *plan.shape, channels), np.float32)
+    own, threads = _materials(plan, material), torch.get_num_threads()
+    solids = _array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
+    inputs = (_array(position), _array(velocity), pull, own, _array(mask), solids, cells, moved)
+    rows = state.reshape(batch, solids.shape[2], channels)
+    for scene in range(batch):
+        rasterise_scene(plan, *(values[scene] for values in inputs), rows[scene], threads)
+    tensors = map(torch.from_numpy, (cells, moved, pull.reshape(batch, 1, dim), state))
+    here, own_velocity, fall, grid = tensors
+    return here, own_velocity, fall, grid.movedim(-1, 1)
+
+
+def predict_path(
+    plan: Plan, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, state: Tensor,
+    fields: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None,
+) -> Tensor:  # fmt: skip
+    """(B, m, N, D) positions in cells, as `Advection.constrained_path` gives them.
+
+    Raises:
+        IndexError: if a particle's material is none of the scene's.
+    """
+    batch, count, dim = cells.shape
+    frames, size = fields.shape[1], state[0, 0].numel()
+    path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
+    own, threads = _materials(plan, material), torch.get_num_threads()
+    if own.size and not (own.min() >= 0 and own.max() < len(plan.mass)):
+        raise IndexError(f"A particle's material is not an index from 0 to {len(plan.mass) - 1}.")
+    rows = _array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
+    flows = _array(fields.movedim(2, -1)).reshape(batch, frames, size, fields.shape[2])
+    inputs = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows, flows)
+    for scene in range(batch):
+        start = SceneArrays(*(values[scene] for values in inputs))
+        fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
+        if plan.obstacles:
+            clear_of_obstacles(start, plan, solid[scene], walls, path[scene])
+        if plan.rest_speed:
+            rest_scene(start, plan, path[scene], threads)
+    return torch.from_numpy(path)
+
+
+def to_length(plan: Plan, path: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+    """The path (B, m, N, D) in domain length, in its own memory, and the velocity (B, N, D) at its last frame."""
+    batch, _, count, _ = path.shape
+    velocity = np.empty(cells.shape, np.float32)
+    paths, starts = path.numpy(), _array(cells)
+    for scene in range(batch):
+        convert = partial(land, paths[scene], starts[scene], plan.box, velocity[scene])
+        map_ranges(convert, split(count, _CHUNK), torch.get_num_threads())
+    return path, torch.from_numpy(velocity)
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.detach().contiguous().numpy()
+
+
+def _materials(plan: Plan, material: Tensor) -> Any:
+    """(B, N) indices, (B, 0) where there is only one material."""
+    return _array(material) if len(plan.mass) > 1 else np.empty((len(material), 0), np.int64)
