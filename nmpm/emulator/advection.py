@@ -109,10 +109,11 @@ class Advection:
 
     def _take_off(self, start: Departure) -> Flight:
         """The velocities that particles keep, and their shares of their scene's mass."""
-        smoothed = self.gather(start.state[:, : start.fields.shape[2]], start.cells, start.material)
+        fields = start.fields
+        smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
         carried = self.decoder.carried_velocity(start.velocity, smoothed)
         share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
-        return Flight(start.cells, start.velocity, carried, start.gravity, start.material, start.fields, share)
+        return Flight(start.cells, start.velocity, carried, start.gravity, start.material, fields, share)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""

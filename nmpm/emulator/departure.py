@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -17,8 +18,9 @@ class Departure:
         gravity: (B, 1, D), what a frame adds to a velocity.
         material: (B, N) indices into the scene's materials.
         mask: (B, N) bool, False for padding.
-        state: (B, C_in, *S), what the network has seen; velocities first, as in `fields`.
-        fields: (B, m, materials * D, *S), what the network predicts.
+        state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
+        output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
+        scale: (m, C, 1, ...), by which it is multiplied.
     """
 
     cells: Tensor
@@ -27,4 +29,10 @@ class Departure:
     material: Tensor
     mask: Tensor
     state: Tensor
-    fields: Tensor
+    output: Tensor
+    scale: Tensor
+
+    @property
+    def fields(self) -> Tensor:
+        """(B, m, C, *S), the predicted velocities, of the scale's precision."""
+        return self.output.to(torch.promote_types(self.scale.dtype, torch.float32)) * self.scale

@@ -227,8 +227,8 @@ class Emulator(nn.Module):
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
         with _full_precision(device):
-            fields = output.to(self.precision) * self.output_scale
-            start = Departure(cells, velocity, gravity, particles.material, particles.mask, state, fields)
+            own = particles
+            start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
             path = steps.path(start, context)
             return Bundle(*steps.to_length(path, cells, particles.position.dtype))
 

@@ -98,7 +98,7 @@ class FusedSteps(Steps):
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
         return _kernels().predict_path(
             self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
-            start.fields, context.solid, self.walls, context.budget,
+            start.output, start.scale, context.solid, self.walls, context.budget,
         )  # fmt: skip
 
     def to_length(self, path: Tensor, cells: Tensor, precision: torch.dtype) -> tuple[Tensor, Tensor]:  # noqa: ARG002

@@ -5,6 +5,7 @@ Shapes as in `nmpm.particles`; tensors are float32 on the CPU and carry no gradi
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
@@ -17,6 +18,7 @@ from nmpm.emulator.fused.flight import land
 from nmpm.emulator.fused.path import SceneArrays, clear_of_obstacles, fly_scene, rest_scene
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.fused.rasterise import rasterise_scene
+from nmpm.transfer.fused.fields import unpack_bfloat16, unpack_float32
 
 _CHUNK = 2**14
 
@@ -48,7 +50,7 @@ def rasterise(
 
 def predict_path(
     plan: Plan, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, state: Tensor,
-    fields: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None,
+    output: Tensor, scale: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None,
 ) -> Tensor:  # fmt: skip
     """(B, m, N, D) positions in cells, as `Advection.constrained_path` gives them.
 
@@ -56,16 +58,18 @@ def predict_path(
         IndexError: if a particle's material is none of the scene's.
     """
     batch, count, dim = cells.shape
-    frames, size = fields.shape[1], state[0, 0].numel()
+    frames, size = output.shape[1], math.prod(plan.shape)
     path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
     own, threads = _materials(plan, material), torch.get_num_threads()
     if own.size and not (own.min() >= 0 and own.max() < len(plan.mass)):
         raise IndexError(f"A particle's material is not an index from 0 to {len(plan.mass) - 1}.")
     rows = _array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
-    flows = _array(fields.movedim(2, -1)).reshape(batch, frames, size, fields.shape[2])
-    inputs = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows, flows)
+    factors, flows = _array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
+    predicted, unpack = _rows(output)
+    inputs = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows)
     for scene in range(batch):
-        start = SceneArrays(*(values[scene] for values in inputs))
+        unpack(predicted[scene], factors, flows)
+        start = SceneArrays(*(values[scene] for values in inputs), flows)
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
         if plan.obstacles:
             clear_of_obstacles(start, plan, solid[scene], walls, path[scene])
@@ -87,6 +91,14 @@ def to_length(plan: Plan, path: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
 
 def _array(tensor: Tensor) -> Any:
     return tensor.detach().contiguous().numpy()
+
+
+def _rows(output: Tensor) -> tuple[Any, Any]:
+    """A network's output as rows (B, size, m C), one per node, and the kernel that unpacks them."""
+    rows = output.detach().movedim((1, 2), (-2, -1)).flatten(-2).flatten(1, -2)
+    if output.dtype == torch.bfloat16:
+        return rows.contiguous().view(torch.uint16).numpy(), unpack_bfloat16
+    return rows.float().contiguous().numpy(), unpack_float32
 
 
 def _materials(plan: Plan, material: Tensor) -> Any:

@@ -21,7 +21,7 @@ _LIBRARY.define(
 )
 _LIBRARY.define(
     "predict_path(str plan, Tensor cells, Tensor velocity, Tensor gravity, Tensor material, Tensor mask, Tensor state,"
-    " Tensor fields, Tensor solid, Tensor walls, Tensor? budget) -> Tensor",
+    " Tensor output, Tensor scale, Tensor solid, Tensor walls, Tensor? budget) -> Tensor",
     tags=_TAGS,
 )
 
