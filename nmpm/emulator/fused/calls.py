@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from nmpm._support.parallel import map_ranges, split
+from nmpm.emulator.fused.contact import fill_share
 from nmpm.emulator.fused.flight import land
 from nmpm.emulator.fused.path import SceneArrays, clear_of_obstacles, fly_scene, rest_scene
 from nmpm.emulator.fused.plan import Plan
@@ -66,13 +67,16 @@ def predict_path(
     rows = _array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
     factors, flows = _array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
     predicted, unpack = _rows(output)
+    share, rooms = np.empty(size if plan.obstacles else 0, np.float32), _array(walls).reshape(-1)
+    solids = _array(solid).reshape(batch, -1) if plan.obstacles else None
     inputs = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows)
     for scene in range(batch):
         unpack(predicted[scene], factors, flows)
         start = SceneArrays(*(values[scene] for values in inputs), flows)
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
         if plan.obstacles:
-            clear_of_obstacles(start, plan, solid[scene], walls, path[scene])
+            fill_share(solids[scene], rooms, share)
+            clear_of_obstacles(start, plan, share, path[scene], threads)
         if plan.rest_speed:
             rest_scene(start, plan, path[scene], threads)
     return torch.from_numpy(path)

@@ -7,18 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
-from nmpm.emulator.contact import Contact, obstacle_share
+from nmpm.emulator.fused import contact
 from nmpm.emulator.fused.flight import fly, rest, weigh
 from nmpm.emulator.fused.limit import propose, shorten
 from nmpm.emulator.fused.plan import Array, Plan
-from nmpm.grid import Grid
 
 _CHUNK = 2**14  # particles that a thread treats at once; sums do not depend on the number of threads
+_MAX_PIECES = 64
 _TINY = float(np.finfo(np.float32).tiny)
 _ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
@@ -107,10 +105,32 @@ def rest_scene(start: SceneArrays, plan: Plan, path: Array, threads: int) -> Non
     map_ranges(still, split(len(start.cells), _CHUNK), threads)
 
 
-def clear_of_obstacles(start: SceneArrays, plan: Plan, solid: Tensor, walls: Tensor, path: Array) -> None:
-    """Keep a scene's path clear of obstacles, and within the bounds."""
-    grid = Grid(plan.shape, plan.lower, plan.spacing, plan.wraps)
-    free = torch.from_numpy(path).unsqueeze(0)
-    held = Contact(obstacle_share(solid.unsqueeze(0), walls), grid).hold(torch.from_numpy(start.cells)[None], free)
-    if held is not free:
-        free.copy_(held)
+def clear_of_obstacles(start: SceneArrays, plan: Plan, share: Array, path: Array, threads: int) -> None:
+    """Keep a scene's path clear of obstacles, and within the bounds.
+
+    Args:
+        start: Where the bundle starts.
+        plan: Of the emulator.
+        share: (size,) of each cell's room that is obstacle.
+        path: (m, N, D), is changed.
+        threads: How many work.
+    """
+    ranges, grid = split(len(start.cells), _CHUNK), (plan.shape, plan.wraps)
+    pieces = _count_pieces(map_ranges(partial(contact.longest_step, start.cells, path), ranges, threads))
+    marks = np.empty(len(start.cells), np.int8)
+    find = partial(contact.mark, start.cells, path, share, grid, pieces, marks)
+    if not sum(map_ranges(find, ranges, threads)):
+        return
+    rows = np.flatnonzero(marks)
+    free = np.empty(len(rows), np.int64)
+    place, along = np.empty((2, len(rows), plan.dim), np.float32)
+    longest = contact.follow(start.cells, path, share, grid, pieces, rows, free, place, along)
+    contact.slide(path, share, grid, plan.limits, pieces, _count_pieces([longest]), rows, free, place, along)
+    stuck = np.flatnonzero(marks == contact.STUCK)
+    if len(stuck):
+        contact.push_out(start.cells, path, share, grid, plan.limits, stuck)
+
+
+def _count_pieces(lengths: list[float]) -> int:
+    """Pieces of at most half a cell in the longest of these lengths."""
+    return min(max(math.ceil(max(lengths, default=0.0) / contact.PIECE), 1), _MAX_PIECES)
