@@ -44,7 +44,7 @@ def depths(share, places, grid, out):  # type: ignore[no-untyped-def]
             k0, k1, z = linear_nodes(places[k, last], n, wraps[last])
             low = bilinear(share[a * n + k0], share[b * n + k0], share[c * n + k0], share[d * n + k0], x, y)
             high = bilinear(share[a * n + k1], share[b * n + k1], share[c * n + k1], share[d * n + k1], x, y)
-            out[k] = low + (high - low) * z
+            out[k] = (ONE - z) * low + z * high
 
 
 @jit

@@ -38,6 +38,13 @@ def predict_path(plan: Plan, *tensors: Tensor | None) -> Tensor:
     return path
 
 
+def to_length(plan: Plan, path: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+    """`calls.to_length`, as tensor operations, which compilers fuse by themselves."""
+    spacing, lower = path.new_tensor(plan.spacing), path.new_tensor(plan.lower)
+    before = path[:, -2] if path.shape[1] > 1 else cells
+    return path * spacing + lower, (path[:, -1] - before) * spacing
+
+
 def _rasterise(plan: str, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return calls.rasterise(read_plan(plan), *tensors)
 

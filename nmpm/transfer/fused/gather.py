@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.transfer.fused.nodes import ZERO, linear_nodes, stencil
+from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil
 
 
 @jit
@@ -50,9 +50,11 @@ def _gather_linear_2d(field, material, cells, shape, wraps, out):  # type: ignor
 
 @jit
 def bilinear(a, b, c, d, x, y):  # type: ignore[no-untyped-def]
-    """Values at (0, 0), (0, 1), (1, 0) and (1, 1), interpolated at (x, y)."""
-    low, high = a + (b - a) * y, c + (d - c) * y
-    return low + (high - low) * x
+    """Values at (0, 0), (0, 1), (1, 0) and (1, 1), interpolated at (x, y).
+
+    As a sum with weights, since differences would make NaN of infinite values.
+    """
+    return (ONE - x) * (ONE - y) * a + (ONE - x) * y * b + x * (ONE - y) * c + x * y * d
 
 
 @jit
@@ -67,7 +69,7 @@ def _gather_linear_3d(field, material, cells, shape, wraps, out):  # type: ignor
         for k in range(first, first + 3):
             low = bilinear(field[a + k0, k], field[b + k0, k], field[c + k0, k], field[d + k0, k], x, y)
             high = bilinear(field[a + k1, k], field[b + k1, k], field[c + k1, k], field[d + k1, k], x, y)
-            out[p, k - first] = low + (high - low) * z
+            out[p, k - first] = (ONE - z) * low + z * high
 
 
 @jit
