@@ -20,8 +20,9 @@ from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
+from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
-from nmpm.emulator.steps import make_plan, steps_for
+from nmpm.emulator.steps import steps_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -243,4 +244,5 @@ class Emulator(nn.Module):
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
     """A context without autocast; entering one where none is on would cost as much as a small operation."""
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+    on = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
+    return torch.autocast(device, enabled=False) if on else nullcontext()

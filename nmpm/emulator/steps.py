@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from nmpm.emulator.departure import Departure
-from nmpm.emulator.fused.plan import Plan, make_plan
+from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
 from nmpm.transfer.backends import is_chosen
@@ -91,21 +91,24 @@ class FusedSteps(Steps):
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         own = particles
-        return _kernels().rasterise(
+        cells, velocity, gravity, state = _kernels().rasterise(
             self.plan, own.position, own.velocity, own.gravity, own.material, own.mask, solid
         )
+        return cells, velocity, gravity, state
 
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
-        return _kernels().predict_path(
+        path: Tensor = _kernels().predict_path(
             self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
             start.output, start.scale, context.solid, self.walls, context.budget,
         )  # fmt: skip
+        return path
 
     def to_length(self, path: Tensor, cells: Tensor, precision: torch.dtype) -> tuple[Tensor, Tensor]:  # noqa: ARG002
-        return _kernels().to_length(self.plan, path, cells)
+        positions, velocity = _kernels().to_length(self.plan, path, cells)
+        return positions, velocity
 
 
-def _kernels():
+def _kernels() -> Any:
     """The functions of `calls`; in graphs that are being traced those of `operators`. Imported late, as Numba is."""
     if torch.compiler.is_compiling():
         from nmpm.emulator.fused import operators
@@ -129,6 +132,3 @@ def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles) -> St
     if torch.is_grad_enabled() and any(values.requires_grad for values in (*tensors, *emulator.parameters())):
         return TensorSteps(emulator)
     return FusedSteps(plan, emulator.walls)
-
-
-__all__ = ["FusedSteps", "Steps", "TensorSteps", "make_plan", "steps_for"]

@@ -34,7 +34,9 @@ def scene_of(dim, walls, materials, obstacles=False, gravity=True, slim=False):
     names = ("water", "sand", "goop")[:materials]
     boundary = tuple("wall" if wall else "periodic" for wall in walls[:dim])
     domain = tuple((0.08, 0.92) if wall else (0.1, 0.9) for wall in walls[:dim])
-    scene = box(dim, names, boundary=boundary, domain=domain, obstacles=obstacles, densities=(1.0, 2.0, 3.0)[:materials])
+    scene = box(
+        dim, names, boundary=boundary, domain=domain, obstacles=obstacles, densities=(1.0, 2.0, 3.0)[:materials]
+    )
     if slim:  # cells that are not square
         stretched = ((0.1, 1.3), *scene.bounds[1:])
         scene = dataclasses.replace(scene, bounds=stretched, domain=((0.05, 1.35), *scene.domain[1:]))
@@ -75,9 +77,7 @@ def test_a_bundle_is_that_of_tensor_operations(
 ):
     scene = scene_of(dim, walls, materials, slim=slim and walls[0])
     constraints = Constraints(energy=energy, rest_speed=rest, bounds=bounds)
-    emulator = emulator_of(
-        scene, scale=scale, seed=seed, transfer=transfer, decoder=decoder, constraints=constraints
-    )
+    emulator = emulator_of(scene, scale=scale, seed=seed, transfer=transfer, decoder=decoder, constraints=constraints)
     particles = cloud(scene, count, batch, speed, seed)
     if batch > 1 and count:
         particles.mask[1, count // 2 :] = False

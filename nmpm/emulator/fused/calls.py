@@ -38,15 +38,16 @@ def rasterise(
     pull = _array(gravity) / plan.box[1]
     channels = len(plan.mass) * (dim + 1) + plan.solid + dim * plan.constants
     state = np.empty((batch, *plan.shape, channels), np.float32)
-    own, threads = _materials(plan, material), torch.get_num_threads()
+    kinds, threads = _materials(plan, material), torch.get_num_threads()
     solids = _array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
-    inputs = (_array(position), _array(velocity), pull, own, _array(mask), solids, cells, moved)
+    inputs: tuple[Any, ...] = (_array(position), _array(velocity), pull, kinds, _array(mask), solids, cells, moved)
     rows = state.reshape(batch, solids.shape[2], channels)
     for scene in range(batch):
-        rasterise_scene(plan, *(values[scene] for values in inputs), rows[scene], threads)
+        first, speed, fall, kind, real, wall, here, own = (values[scene] for values in inputs)
+        rasterise_scene(plan, first, speed, fall, kind, real, wall, here, own, rows[scene], threads)
     tensors = map(torch.from_numpy, (cells, moved, pull.reshape(batch, 1, dim), state))
-    here, own_velocity, fall, grid = tensors
-    return here, own_velocity, fall, grid.movedim(-1, 1)
+    positions, velocities, falls, grid = tensors
+    return positions, velocities, falls, grid.movedim(-1, 1)
 
 
 def predict_path(
@@ -68,11 +69,12 @@ def predict_path(
     factors, flows = _array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
     predicted, unpack = _rows(output)
     share, rooms = np.empty(size if plan.obstacles else 0, np.float32), _array(walls).reshape(-1)
-    solids = _array(solid).reshape(batch, -1) if plan.obstacles else None
-    inputs = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows)
+    solids = _array(solid).reshape(batch, -1)
+    inputs: tuple[Any, ...] = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows)
     for scene in range(batch):
         unpack(predicted[scene], factors, flows)
-        start = SceneArrays(*(values[scene] for values in inputs), flows)
+        here, speed, kind, real, fall, grid = (values[scene] for values in inputs)
+        start = SceneArrays(here, speed, kind, real, fall, grid, flows)
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
         if plan.obstacles:
             fill_share(solids[scene], rooms, share)

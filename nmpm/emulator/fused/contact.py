@@ -6,6 +6,8 @@ shape and periodic axes. Particles are marked that touch an obstacle, then only 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -21,7 +23,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 @jit
-def fill_share(solid, walls, share):  # type: ignore[no-untyped-def]  # (Numba infers the types)
+def fill_share(solid: Any, walls: Any, share: Any) -> Any:
     """Fill in the share of each cell's room that is obstacle, from those that are solid and wall."""
     for node in range(len(share)):
         room = ONE - walls[node]
@@ -30,7 +32,7 @@ def fill_share(solid, walls, share):  # type: ignore[no-untyped-def]  # (Numba i
 
 
 @jit
-def depths(share, places, grid, out):  # type: ignore[no-untyped-def]
+def depths(share: Any, places: Any, grid: Any, out: Any) -> Any:
     """Fill in the share (K,) at places (K, D), interpolated linearly."""
     shape, wraps = grid
     for k in range(len(places)):
@@ -48,7 +50,7 @@ def depths(share, places, grid, out):  # type: ignore[no-untyped-def]
 
 
 @jit
-def longest_step(cells, path, low, high):  # type: ignore[no-untyped-def]
+def longest_step(cells: Any, path: Any, low: Any, high: Any) -> Any:
     """Length of the longest step of particles `low` to `high` in a frame; steps that are not finite do not count."""
     longest = ZERO
     for frame in range(len(path)):
@@ -63,7 +65,7 @@ def longest_step(cells, path, low, high):  # type: ignore[no-untyped-def]
 
 
 @jit
-def mark(cells, path, share, grid, pieces, marks, low, high):  # type: ignore[no-untyped-def]
+def mark(cells: Any, path: Any, share: Any, grid: Any, pieces: Any, marks: Any, low: Any, high: Any) -> Any:
     """Fill in which particles touch an obstacle (`TOUCHES`) or start in one (`STUCK`), and return how many do."""
     dim, found = cells.shape[1], 0
     places, values = np.empty((_BLOCK, dim), np.float32), np.empty(_BLOCK, np.float32)
@@ -90,11 +92,16 @@ def mark(cells, path, share, grid, pieces, marks, low, high):  # type: ignore[no
 
 
 @jit
-def follow(cells, path, share, grid, pieces, rows, free, place, along):  # type: ignore[no-untyped-def]
+def follow(
+    cells: Any, path: Any, share: Any, grid: Any, pieces: Any, rows: Any, free: Any, place: Any, along: Any
+) -> Any:
     """Find where particles first get too deep into an obstacle.
 
     Args:
-        cells, path, share, grid: Of the scene.
+        cells: (N, D) of the scene.
+        path: (m, N, D) of the scene.
+        share: (size,) of the scene.
+        grid: Shape and periodic axes.
         pieces: Into how many each frame is cut.
         rows: (n,) the particles.
         free: (n,), is filled: pieces before that.
@@ -131,7 +138,9 @@ def follow(cells, path, share, grid, pieces, rows, free, place, along):  # type:
 
 
 @jit
-def slide(path, share, grid, bounds, pieces, finer, rows, free, place, along):  # type: ignore[no-untyped-def]
+def slide(
+    path: Any, share: Any, grid: Any, bounds: Any, pieces: Any, finer: Any, rows: Any, free: Any, place: Any, along: Any
+) -> Any:
     """Let particles go on along the surface from where they touch; arguments as of `follow`.
 
     What is left of the way is gone straight, evenly over the frames left, until the surface bends into it: looked at in
@@ -157,7 +166,7 @@ def slide(path, share, grid, bounds, pieces, finer, rows, free, place, along):  
 
 
 @jit
-def push_out(cells, path, share, grid, bounds, rows):  # type: ignore[no-untyped-def]
+def push_out(cells: Any, path: Any, share: Any, grid: Any, bounds: Any, rows: Any) -> Any:
     """Lead particles straight out of the obstacle that they are in, or to where it is least deep."""
     frames, dim = len(path), cells.shape[1]
     points, values = np.empty((_WAYS_OUT + 1, dim), np.float32), np.empty(_WAYS_OUT + 1, np.float32)
@@ -180,7 +189,7 @@ def push_out(cells, path, share, grid, bounds, rows):  # type: ignore[no-untyped
 
 
 @jit
-def _first_deep(values, count):  # type: ignore[no-untyped-def]
+def _first_deep(values: Any, count: Any) -> Any:
     """Index of the first of `count` values beyond the surface, or that is not a number; `count` where there is none."""
     for k in range(count):
         if not values[k] <= SURFACE:
@@ -189,7 +198,7 @@ def _first_deep(values, count):  # type: ignore[no-untyped-def]
 
 
 @jit
-def _point_inward(share, place, grid, inward):  # type: ignore[no-untyped-def]
+def _point_inward(share: Any, place: Any, grid: Any, inward: Any) -> Any:
     """Fill in the unit vector (D,) along which the obstacle gets deeper; zero where it is even."""
     dim = len(place)
     ends, values = np.empty((2 * dim, dim), np.float32), np.empty(2 * dim, np.float32)

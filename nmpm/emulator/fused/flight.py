@@ -6,6 +6,8 @@ particles from `low` to `high`, so that threads share a scene.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit, jit_sum
@@ -16,13 +18,28 @@ ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
 @jit
-def fly(  # type: ignore[no-untyped-def]  # (Numba infers the types)
-    cells, velocity, material, gravity, share, grid, state, fields, decoder, bounds, ratio, carried, path, low, high
-):
+def fly(
+    cells: Any,
+    velocity: Any,
+    material: Any,
+    gravity: Any,
+    share: Any,
+    grid: Any,
+    state: Any,
+    fields: Any,
+    decoder: Any,
+    bounds: Any,
+    ratio: Any,
+    carried: Any,
+    path: Any,
+    low: Any,
+    high: Any,
+) -> Any:
     """Fill in `carried` and `path` without constraints but the bounds, and return the energies (m,) of the frames.
 
     Args:
-        cells, velocity: (N, D) at the bundle's start.
+        cells: (N, D) positions at the bundle's start.
+        velocity: (N, D) there.
         material: (N,) int64; empty where there is only one.
         gravity: (D,), what a frame adds to a velocity.
         share: (N,) of the scene's mass; empty where energies are not needed.
@@ -35,7 +52,8 @@ def fly(  # type: ignore[no-untyped-def]  # (Numba infers the types)
         ratio: (D,) widths of the cells over that of the first axis.
         carried: (N, D), is filled.
         path: (m, N, D), is filled.
-        low, high: Which particles.
+        low: The first particle.
+        high: The one after the last.
     """
     frames, dim = len(fields), cells.shape[1]
     energies = np.zeros(frames)
@@ -60,7 +78,9 @@ def fly(  # type: ignore[no-untyped-def]  # (Numba infers the types)
 
 
 @jit
-def carry(cells, velocity, material, grid, state, decoder, scratch, carried):  # type: ignore[no-untyped-def]
+def carry(
+    cells: Any, velocity: Any, material: Any, grid: Any, state: Any, decoder: Any, scratch: Any, carried: Any
+) -> Any:
     """Fill in the velocities that the decoder lets particles keep."""
     if decoder[1] != ZERO:
         gather(state, material, cells, grid[0], grid[1], grid[2], scratch)
@@ -75,7 +95,7 @@ def carry(cells, velocity, material, grid, state, decoder, scratch, carried):  #
 
 
 @jit
-def subtract(these, those, out):  # type: ignore[no-untyped-def]
+def subtract(these: Any, those: Any, out: Any) -> Any:
     """Fill in differences."""
     for p in range(len(these)):
         for d in range(these.shape[1]):
@@ -83,7 +103,7 @@ def subtract(these, those, out):  # type: ignore[no-untyped-def]
 
 
 @jit
-def move(cells, base, gathered, gravity, falls, bounds, out):  # type: ignore[no-untyped-def]
+def move(cells: Any, base: Any, gathered: Any, gravity: Any, falls: Any, bounds: Any, out: Any) -> Any:
     """Fill in positions after a frame with the velocities base + falls · gravity + gathered, within the bounds."""
     for d in range(cells.shape[1]):
         fall = gravity[d] * falls if falls > ZERO else ZERO
@@ -93,7 +113,7 @@ def move(cells, base, gathered, gravity, falls, bounds, out):  # type: ignore[no
 
 
 @jit
-def confine(x, lowest, highest, reflects):  # type: ignore[no-untyped-def]
+def confine(x: Any, lowest: Any, highest: Any, reflects: Any) -> Any:
     """A coordinate within the bounds; NaN stays."""
     if reflects:
         x = lowest + (lowest - x) if x < lowest else (highest + (highest - x) if x > highest else x)
@@ -102,7 +122,7 @@ def confine(x, lowest, highest, reflects):  # type: ignore[no-untyped-def]
 
 
 @jit_sum
-def energy(cells, before, gravity, share, ratio):  # type: ignore[no-untyped-def]
+def energy(cells: Any, before: Any, gravity: Any, share: Any, ratio: Any) -> Any:
     """Energy of particles, weighted by their shares, from their positions after and before a frame."""
     total = ZERO
     for d in range(cells.shape[1]):
@@ -114,7 +134,7 @@ def energy(cells, before, gravity, share, ratio):  # type: ignore[no-untyped-def
 
 
 @jit
-def weigh(material, mask, mass, share):  # type: ignore[no-untyped-def]
+def weigh(material: Any, mask: Any, mass: Any, share: Any) -> Any:
     """Fill in (N,) shares of the scene's mass, 0 for padding, from the mass (M,) of a particle of each material."""
     total = 0.0
     for p in range(len(mask)):
@@ -127,7 +147,7 @@ def weigh(material, mask, mass, share):  # type: ignore[no-untyped-def]
 
 
 @jit
-def rest(cells, path, gravity, speed, free_fall, low, high):  # type: ignore[no-untyped-def]
+def rest(cells: Any, path: Any, gravity: Any, speed: Any, free_fall: Any, low: Any, high: Any) -> Any:
     """Leave particles where they started that neither move nor fall, as `nmpm.emulator.constraints.at_rest` says."""
     frames, dim = path.shape[0], path.shape[1 + 1]
     half = frames // 2
@@ -151,7 +171,7 @@ def rest(cells, path, gravity, speed, free_fall, low, high):  # type: ignore[no-
 
 
 @jit
-def land(path, cells, box, velocity, low, high):  # type: ignore[no-untyped-def]
+def land(path: Any, cells: Any, box: Any, velocity: Any, low: Any, high: Any) -> Any:
     """Convert a path to domain length in place, and fill in the velocity at its last frame.
 
     Args:
@@ -159,7 +179,8 @@ def land(path, cells, box, velocity, low, high):  # type: ignore[no-untyped-def]
         cells: (N, D), where it starts.
         box: (2, D) the grid's lower corner and the cells' widths, in domain length.
         velocity: (N, D) in domain length per frame.
-        low, high: Which particles.
+        low: The first particle.
+        high: The one after the last.
     """
     last = len(path) - 1
     for p in range(low, high):

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -17,9 +19,23 @@ _ROUNDING = np.float32(4 * np.finfo(np.float32).eps)
 
 
 @jit
-def propose(  # type: ignore[no-untyped-def]  # (Numba infers the types)
-    cells, velocity, material, gravity, share, grid, fields, decoder, bounds, ratio, carried, path, frame, low, high
-):
+def propose(
+    cells: Any,
+    velocity: Any,
+    material: Any,
+    gravity: Any,
+    share: Any,
+    grid: Any,
+    fields: Any,
+    decoder: Any,
+    bounds: Any,
+    ratio: Any,
+    carried: Any,
+    path: Any,
+    frame: Any,
+    low: Any,
+    high: Any,
+) -> Any:
     """Fill in a frame of the path as if it were free.
 
     Returns:
@@ -51,7 +67,7 @@ def propose(  # type: ignore[no-untyped-def]  # (Numba infers the types)
 
 
 @jit
-def _balance(cells, velocity, gravity, ratio, path, frame, p):  # type: ignore[no-untyped-def]
+def _balance(cells: Any, velocity: Any, gravity: Any, ratio: Any, path: Any, frame: Any, p: Any) -> Any:
     """Of a step: its kinetic energy, the work of gravity, minus the potential before, and whether energy is gained."""
     kinetic, fall, height, gain = ZERO, ZERO, ZERO, ZERO
     for d in range(cells.shape[1]):
@@ -70,9 +86,19 @@ def _balance(cells, velocity, gravity, ratio, path, frame, p):  # type: ignore[n
 
 
 @jit
-def shorten(  # type: ignore[no-untyped-def]
-    cells, velocity, gravity, bounds, ratio, path, frame, factor, only_gainers, low, high
-):
+def shorten(
+    cells: Any,
+    velocity: Any,
+    gravity: Any,
+    bounds: Any,
+    ratio: Any,
+    path: Any,
+    frame: Any,
+    factor: Any,
+    only_gainers: Any,
+    low: Any,
+    high: Any,
+) -> Any:
     """Multiply the proposed steps of a frame by a factor, of the particles that gain energy or of all."""
     for p in range(low, high):
         if only_gainers and not _balance(cells, velocity, gravity, ratio, path, frame, p)[3]:

@@ -43,8 +43,8 @@ def fly_scene(start: SceneArrays, plan: Plan, budget: float | None, path: Array,
     carried = np.empty_like(start.cells)
     ranges = split(count, _CHUNK)
     free = partial(
-        fly, start.cells, start.velocity, start.material, start.gravity, share, plan.gather_grid, start.state, start.fields,
-        plan.shares, plan.limits, plan.ratio, carried, path,
+        fly, start.cells, start.velocity, start.material, start.gravity, share, plan.gather_grid, start.state,
+        start.fields, plan.shares, plan.limits, plan.ratio, carried, path,
     )  # fmt: skip
     energies = map_ranges(free, ranges, threads)
     if budget is not None and energies:
@@ -54,7 +54,13 @@ def fly_scene(start: SceneArrays, plan: Plan, budget: float | None, path: Array,
 
 
 def _limit(
-    start: SceneArrays, plan: Plan, budget: float, share: Array, carried: Array, first: int, path: Array,
+    start: SceneArrays,
+    plan: Plan,
+    budget: float,
+    share: Array,
+    carried: Array,
+    first: int,
+    path: Array,
     threads: int,
 ) -> None:
     """Redo a path's frames from the first one that exceeds the energy, each within it."""
@@ -82,9 +88,7 @@ def _affordable(sums: list[float], budget: float) -> tuple[float, bool]:
     excess = max(height - budget, -1e18)
     if not kinetic + fall + excess > 0:
         return 1.0, False
-    factor, exact = _largest_root(
-        kinetic_gained, fall_gained, excess + (kinetic + fall - kinetic_gained - fall_gained)
-    )
+    factor, exact = _largest_root(kinetic_gained, fall_gained, excess + (kinetic + fall - kinetic_gained - fall_gained))
     if exact and 0 <= factor <= 1:
         return factor, True
     factor, _ = _largest_root(kinetic, fall, excess)

@@ -1,5 +1,4 @@
-"""Everything that the kernels need to know of an emulator but its weights: plain numbers, and arrays made of them once.
-"""
+"""What the kernels need to know of an emulator but its weights: plain numbers, and arrays made of them once."""
 
 from __future__ import annotations
 
@@ -12,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from nmpm._support.plain_data import to_tuples
@@ -126,11 +126,13 @@ class Plan:
 
 
 def make_plan(recipe: EmulatorRecipe) -> Plan | None:
-    """The plan of an emulator; None if it has parts that the kernels do not know."""
+    """The plan of an emulator; None if it has parts that the kernels do not know, or lies too far off for float32."""
     scene, grid, constraints = recipe.scene, recipe.grid, recipe.constraints
     nodes = _SCATTER_NODES.get(type(recipe.transfer), 0)
     shares = _SHARES.get(type(recipe.decoder))
     if scene.dim == 1 or not nodes or shares is None or constraints.bounds not in ("stop", "reflect"):
+        return None
+    if not grid.resolves(torch.float32):
         return None
     return Plan(
         shape=grid.shape,

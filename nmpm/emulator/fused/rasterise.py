@@ -24,12 +24,14 @@ def rasterise_scene(
 
     Args:
         plan: Of the emulator.
-        position, velocity: (N, D) in domain length.
+        position: (N, D) in domain length.
+        velocity: (N, D) in domain length per frame.
         gravity: (D,) in cells.
         material: (N,) int64; empty where there is only one.
         mask: (N,) bool.
         solid: (C_solid, size).
-        cells, moved: (N, D), are filled.
+        cells: (N, D) positions, is filled.
+        moved: (N, D) velocities, is filled.
         state: (size, C_in), is filled.
         threads: How many work.
     """
@@ -51,5 +53,6 @@ def _add_range(
     sums = np.zeros((size, len(plan.mass) * (plan.dim + 1)), np.float32)
     here, own = cells[low:high], moved[low:high]
     to_cells(position[low:high], velocity[low:high], plan.box, here, own)
-    scatter(own, material[low:high], mask[low:high], here, *plan.scatter_grid, sums)
+    shape, wraps, steps = plan.scatter_grid
+    scatter(own, material[low:high], mask[low:high], here, shape, wraps, steps, sums)
     return sums

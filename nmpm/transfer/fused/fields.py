@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -10,7 +12,7 @@ _BLOCK = 64  # nodes
 
 
 @jit
-def unpack_float32(output, scale, fields):  # type: ignore[no-untyped-def]  # (Numba infers the types)
+def unpack_float32(output: Any, scale: Any, fields: Any) -> Any:
     """Fill in the fields.
 
     Args:
@@ -29,7 +31,7 @@ def unpack_float32(output, scale, fields):  # type: ignore[no-untyped-def]  # (N
 
 
 @jit
-def unpack_bfloat16(output, scale, fields):  # type: ignore[no-untyped-def]
+def unpack_bfloat16(output: Any, scale: Any, fields: Any) -> Any:
     """As `unpack_float32`, from the bits of bfloat16 numbers, uint16: the upper half of those of float32."""
     width, channels = output.shape[1], fields.shape[2]
     bits = np.empty(_BLOCK * width, np.uint32)

@@ -6,6 +6,8 @@ on each other, so that the processor computes several at once. That is three tim
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -13,14 +15,15 @@ from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil
 
 
 @jit
-def gather(field, material, cells, shape, wraps, steps, out):  # type: ignore[no-untyped-def]  # (Numba infers types)
+def gather(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
     """Interpolate each particle's own material's velocity.
 
     Args:
         field: (size, C) with the velocities of all materials first, D columns each.
         material: (N,) int64; empty where there is only one.
         cells: (N, D) positions.
-        shape, wraps: Nodes along each axis, and whether it is periodic, as tuples.
+        shape: Nodes along each axis, a tuple.
+        wraps: Whether each is periodic, a tuple.
         steps: As many integers as the kernel has nodes along an axis: 2 (linear) or 3 (quadratic).
         out: (N, D), is filled.
     """
@@ -33,7 +36,7 @@ def gather(field, material, cells, shape, wraps, steps, out):  # type: ignore[no
 
 
 @jit
-def _gather_linear_2d(field, material, cells, shape, wraps, out):  # type: ignore[no-untyped-def]
+def _gather_linear_2d(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
     many, walls = len(material) > 0, not (wraps[0] or wraps[1])
     for p in range(len(cells)):
         first = 2 * material[p] if many else 0
@@ -45,11 +48,13 @@ def _gather_linear_2d(field, material, cells, shape, wraps, out):  # type: ignor
             j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
         a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
         for k in range(2):
-            out[p, k] = bilinear(field[a, first + k], field[b, first + k], field[c, first + k], field[d, first + k], x, y)
+            out[p, k] = bilinear(
+                field[a, first + k], field[b, first + k], field[c, first + k], field[d, first + k], x, y
+            )
 
 
 @jit
-def bilinear(a, b, c, d, x, y):  # type: ignore[no-untyped-def]
+def bilinear(a: Any, b: Any, c: Any, d: Any, x: Any, y: Any) -> Any:
     """Values at (0, 0), (0, 1), (1, 0) and (1, 1), interpolated at (x, y).
 
     As a sum with weights, since differences would make NaN of infinite values.
@@ -58,7 +63,7 @@ def bilinear(a, b, c, d, x, y):  # type: ignore[no-untyped-def]
 
 
 @jit
-def _gather_linear_3d(field, material, cells, shape, wraps, out):  # type: ignore[no-untyped-def]
+def _gather_linear_3d(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
     for p in range(len(cells)):
         first = 3 * material[p] if len(material) else 0
         i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
@@ -73,7 +78,7 @@ def _gather_linear_3d(field, material, cells, shape, wraps, out):  # type: ignor
 
 
 @jit
-def _gather_stencil(field, material, cells, shape, wraps, steps, out):  # type: ignore[no-untyped-def]
+def _gather_stencil(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
     dim = len(shape)
     last, depth = dim - 1, len(steps) if dim == 3 else 1
     for p in range(len(cells)):

@@ -5,6 +5,8 @@ A non-finite position must not become an index: what each transfer does with one
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -16,7 +18,7 @@ _NO_NODE = np.int64(-(2**63))
 
 
 @jit
-def wrap(x, extent):  # type: ignore[no-untyped-def]  # (Numba infers the types)
+def wrap(x: Any, extent: Any) -> Any:
     """A position moved into a periodic axis; NaN if it is not finite."""
     if x >= ZERO and x < extent:
         return x
@@ -27,7 +29,7 @@ def wrap(x, extent):  # type: ignore[no-untyped-def]  # (Numba infers the types)
 
 
 @jit
-def interior(x, count, wraps):  # type: ignore[no-untyped-def]
+def interior(x: Any, count: Any, wraps: Any) -> Any:
     """A position in the domain: wrapped on a periodic axis, clamped to the faces of a wall axis."""
     extent = np.float32(count)
     if wraps:
@@ -38,13 +40,13 @@ def interior(x, count, wraps):  # type: ignore[no-untyped-def]
 
 
 @jit
-def node_below(x):  # type: ignore[no-untyped-def]
+def node_below(x: Any) -> Any:
     """The integer below a place in nodes."""
     return np.int64(np.floor(x)) if np.isfinite(x) else _NO_NODE
 
 
 @jit
-def fold(node, count, wraps):  # type: ignore[no-untyped-def]
+def fold(node: Any, count: Any, wraps: Any) -> Any:
     """The index of a node that may lie beyond an axis' ends."""
     if node >= 0 and node < count:
         return node
@@ -54,7 +56,7 @@ def fold(node, count, wraps):  # type: ignore[no-untyped-def]
 
 
 @jit
-def linear_nodes(x, count, wraps):  # type: ignore[no-untyped-def]
+def linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
     """The two nodes around a position, and the weight of the upper one; of NaN on a wall axis: the axis' middle.
 
     Beyond the last centre of a wall axis the position counts as there, which folds the support onto the border node.
@@ -74,7 +76,7 @@ def linear_nodes(x, count, wraps):  # type: ignore[no-untyped-def]
 
 
 @jit
-def stencil(x, count, wraps, steps):  # type: ignore[no-untyped-def]
+def stencil(x: Any, count: Any, wraps: Any, steps: Any) -> Any:
     """The nodes along an axis and their weights, three of each, unused ones with weight 0.
 
     Args:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -9,7 +11,7 @@ from nmpm.transfer.fused.nodes import ONE, linear_nodes, stencil
 
 
 @jit
-def scatter(values, material, mask, cells, shape, wraps, steps, out):  # type: ignore[no-untyped-def]  # (Numba infers)
+def scatter(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
     """Add to each node its share of the particles.
 
     Args:
@@ -17,7 +19,8 @@ def scatter(values, material, mask, cells, shape, wraps, steps, out):  # type: i
         material: (N,) int64; empty where there is only one. Particles of an unknown one count nowhere.
         mask: (N,) bool, False for padding, which is left out.
         cells: (N, D) positions.
-        shape, wraps: Nodes along each axis, and whether it is periodic, as tuples.
+        shape: Nodes along each axis, a tuple.
+        wraps: Whether each is periodic, a tuple.
         steps: As many integers as the kernel has nodes along an axis: 1 (nearest), 2 (linear) or 3 (quadratic).
         out: (size, M V + M), is added to: the values of each material, then the number of particles of each.
     """
@@ -30,7 +33,7 @@ def scatter(values, material, mask, cells, shape, wraps, steps, out):  # type: i
 
 
 @jit
-def _scatter_linear_2d(values, material, mask, cells, shape, wraps, out):  # type: ignore[no-untyped-def]
+def _scatter_linear_2d(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
     width = values.shape[1]
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
@@ -51,7 +54,7 @@ def _scatter_linear_2d(values, material, mask, cells, shape, wraps, out):  # typ
 
 
 @jit
-def _scatter_linear_3d(values, material, mask, cells, shape, wraps, out):  # type: ignore[no-untyped-def]
+def _scatter_linear_3d(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
     width = values.shape[1]
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
@@ -72,14 +75,16 @@ def _scatter_linear_3d(values, material, mask, cells, shape, wraps, out):  # typ
 
 
 @jit
-def _linear_nodes(x, count, wraps):  # type: ignore[no-untyped-def]
+def _linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
     """As `linear_nodes`, but a NaN is passed on to the grid."""
     lower, upper, share = linear_nodes(x, count, wraps)
     return lower, upper, np.float32(np.nan) if np.isnan(x) else share
 
 
 @jit
-def _scatter_stencil(values, material, mask, cells, shape, wraps, steps, out):  # type: ignore[no-untyped-def]
+def _scatter_stencil(
+    values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any
+) -> Any:
     width, last, depth = values.shape[1], len(shape) - 1, len(steps) if len(shape) == 3 else 1
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nmpm._support.jit import jit
@@ -10,7 +12,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 @jit
-def to_cells(position, velocity, box, cells, moved):  # type: ignore[no-untyped-def]  # (Numba infers the types)
+def to_cells(position: Any, velocity: Any, box: Any, cells: Any, moved: Any) -> Any:
     """Fill in positions and velocities (N, D) in cells, from those in domain length and the (2, D) `box`."""
     for p in range(len(position)):
         for d in range(position.shape[1]):
@@ -19,7 +21,7 @@ def to_cells(position, velocity, box, cells, moved):  # type: ignore[no-untyped-
 
 
 @jit
-def fill_state(sums, width, particle_volume, solid, constants, state):  # type: ignore[no-untyped-def]
+def fill_state(sums: Any, width: Any, particle_volume: Any, solid: Any, constants: Any, state: Any) -> Any:
     """Fill in the channels of a grid state.
 
     Args:
