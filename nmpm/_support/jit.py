@@ -13,9 +13,17 @@ _FASTMATH = {"contract"}
 
 def jit(function: F) -> F:
     """Compile a function by Numba: cached on disk, single-threaded, without the interpreter's lock."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FASTMATH)(function))
+    return _compile(function, _FASTMATH)
 
 
 def jit_sum(function: F) -> F:
     """`jit` for sums whose terms may be added in any order, several at once; NaN stays NaN."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FASTMATH | {"reassoc"})(function))
+    return _compile(function, _FASTMATH | {"reassoc"})
+
+
+def _compile(function: F, fastmath: set[str]) -> F:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    try:
+        return cast(F, numba.njit(cache=True, **options)(function))
+    except RuntimeError:  # neither the package's folder nor the user's cache can be written
+        return cast(F, numba.njit(**options)(function))
