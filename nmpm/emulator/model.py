@@ -231,7 +231,10 @@ class Emulator(nn.Module):
             own = particles
             start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
             path = steps.path(start, context)
-            return Bundle(*steps.to_length(path, cells, particles.position.dtype))
+            precision = particles.position.dtype
+            step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
+            velocity = self.grid.to_displacement(step.to(precision))
+            return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

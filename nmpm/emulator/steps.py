@@ -43,13 +43,12 @@ class Steps(ABC):
         """(B, m, N, D) positions in cells, held to the emulator's constraints."""
 
     @abstractmethod
-    def to_length(self, path: Tensor, cells: Tensor, precision: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The path and the velocity (B, N, D) at its last frame, in domain length and of this type.
+    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
+        """The path in domain length and of this type.
 
         Args:
             path: (B, m, N, D) in cells; its memory may be used for the result.
-            cells: (B, N, D), where it starts.
-            precision: Of the results.
+            precision: Of the result.
         """
 
 
@@ -71,10 +70,8 @@ class TensorSteps(Steps):
             return advection.free_path(start)
         return advection.constrained_path(start, context.solid, context.budget)
 
-    def to_length(self, path: Tensor, cells: Tensor, precision: torch.dtype) -> tuple[Tensor, Tensor]:
-        grid = self.emulator.grid
-        step = path[:, -1] - (path[:, -2] if path.shape[1] > 1 else cells)
-        return grid.to_length(path.to(precision)), grid.to_displacement(step.to(precision))
+    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
+        return self.emulator.grid.to_length(path.to(precision))
 
 
 @dataclass(frozen=True)
@@ -103,9 +100,9 @@ class FusedSteps(Steps):
         )  # fmt: skip
         return path
 
-    def to_length(self, path: Tensor, cells: Tensor, precision: torch.dtype) -> tuple[Tensor, Tensor]:  # noqa: ARG002
-        positions, velocity = _kernels().to_length(self.plan, path, cells)
-        return positions, velocity
+    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:  # noqa: ARG002 (float32, as the path)
+        positions: Tensor = _kernels().to_length(self.plan, path)
+        return positions
 
 
 def _kernels() -> Any:

@@ -12,6 +12,7 @@ from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, 
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import Pointwise, UNet
+from nmpm.transfer import using
 from nmpm.zoo import Zoo
 
 
@@ -143,7 +144,8 @@ def test_with_and_without_branches_the_energy_limit_is_the_same_to_the_bit(monke
     scene = box()
     emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
     emulator.output_scale.mul_(3.0)
-    by_branching = rollout(emulator, particles, 24)
+    with using("native"):
+        by_branching = rollout(emulator, particles, 24)
     limited_everywhere(monkeypatch)
     assert torch.equal(rollout(emulator, particles, 24), by_branching)
 

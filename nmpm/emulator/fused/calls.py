@@ -84,15 +84,12 @@ def predict_path(
     return torch.from_numpy(path)
 
 
-def to_length(plan: Plan, path: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-    """The path (B, m, N, D) in domain length, in its own memory, and the velocity (B, N, D) at its last frame."""
-    batch, _, count, _ = path.shape
-    velocity = np.empty(cells.shape, np.float32)
-    paths, starts = path.numpy(), _array(cells)
-    for scene in range(batch):
-        convert = partial(land, paths[scene], starts[scene], plan.box, velocity[scene])
-        map_ranges(convert, split(count, _CHUNK), torch.get_num_threads())
-    return path, torch.from_numpy(velocity)
+def to_length(plan: Plan, path: Tensor) -> Tensor:
+    """The path (B, m, N, D) in domain length, in its own memory: fresh memory would take longer than the conversion."""
+    for frames in path.numpy():
+        convert = partial(land, frames, plan.box)
+        map_ranges(convert, split(frames.shape[1], _CHUNK), torch.get_num_threads())
+    return path
 
 
 def _array(tensor: Tensor) -> Any:

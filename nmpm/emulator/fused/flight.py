@@ -171,23 +171,16 @@ def rest(cells: Any, path: Any, gravity: Any, speed: Any, free_fall: Any, low: A
 
 
 @jit
-def land(path: Any, cells: Any, box: Any, velocity: Any, low: Any, high: Any) -> Any:
-    """Convert a path to domain length in place, and fill in the velocity at its last frame.
+def land(path: Any, box: Any, low: Any, high: Any) -> Any:
+    """Convert a path (m, N, D) to domain length in place.
 
     Args:
-        path: (m, N, D) in cells.
-        cells: (N, D), where it starts.
+        path: In cells.
         box: (2, D) the grid's lower corner and the cells' widths, in domain length.
-        velocity: (N, D) in domain length per frame.
         low: The first particle.
         high: The one after the last.
     """
-    last = len(path) - 1
-    for p in range(low, high):
-        for d in range(cells.shape[1]):
-            before = path[last - 1, p, d] if last > 0 else cells[p, d]
-            velocity[p, d] = (path[last, p, d] - before) * box[1, d]
-    for frame in range(last + 1):
+    for frame in range(len(path)):
         for p in range(low, high):
-            for d in range(cells.shape[1]):
+            for d in range(path.shape[2]):
                 path[frame, p, d] = path[frame, p, d] * box[1, d] + box[0, d]

@@ -38,11 +38,9 @@ def predict_path(plan: Plan, *tensors: Tensor | None) -> Tensor:
     return path
 
 
-def to_length(plan: Plan, path: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+def to_length(plan: Plan, path: Tensor) -> Tensor:
     """`calls.to_length`, as tensor operations, which compilers fuse by themselves."""
-    spacing, lower = path.new_tensor(plan.spacing), path.new_tensor(plan.lower)
-    before = path[:, -2] if path.shape[1] > 1 else cells
-    return path * spacing + lower, (path[:, -1] - before) * spacing
+    return path * path.new_tensor(plan.spacing) + path.new_tensor(plan.lower)
 
 
 def _rasterise(plan: str, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
