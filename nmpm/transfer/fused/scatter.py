@@ -76,9 +76,11 @@ def _scatter_linear_3d(values: Any, material: Any, mask: Any, cells: Any, shape:
 
 @jit
 def _linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
-    """As `linear_nodes`, but a NaN is passed on to the grid."""
+    """As `linear_nodes`, but a NaN is passed on to the grid, on a wall axis at its first node."""
     lower, upper, share = linear_nodes(x, count, wraps)
-    return lower, upper, np.float32(np.nan) if np.isnan(x) else share
+    if not np.isnan(x):
+        return lower, upper, share
+    return (lower, upper, np.float32(np.nan)) if wraps else (np.int64(0), np.int64(0), np.float32(np.nan))
 
 
 @jit
