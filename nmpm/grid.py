@@ -85,17 +85,28 @@ class Grid:
         offset = per_axis(operator.sub, position, self.lower)
         return per_axis(operator.truediv, offset, self.spacing).to(dtype)
 
+    def resolves(self, dtype: torch.dtype) -> bool:
+        """Whether floating-point numbers at the domain's ends are at most 1/16 of a cell apart."""
+        return not any(step > _MAX_ROUNDING * h for _, step, h in self._steps(dtype))
+
     def _check_precision(self, dtype: torch.dtype) -> None:
-        """Raise DataError if floating-point numbers at the domain's ends are further apart than 1/16 of a cell."""
-        for axis, (low, n, h) in enumerate(zip(self.lower, self.shape, self.spacing, strict=True)):
-            reach = max(abs(low), abs(low + n * h))
-            step = torch.finfo(dtype).eps * 2.0 ** math.floor(math.log2(reach)) if reach > 0 else 0.0
+        """Raise DataError if this type does not resolve the cells."""
+        for axis, (reach, step, h) in enumerate(self._steps(dtype)):
             if step > _MAX_ROUNDING * h:
                 name = str(dtype).removeprefix("torch.")
                 raise DataError(
                     f"{name} numbers have a spacing of {step:g} near {reach:g}, where axis {axis} of the domain ends,"
                     f" and a cell is {h:g} wide: give positions in float64, or move the origin into the domain."
                 )
+
+    def _steps(self, dtype: torch.dtype) -> list[tuple[float, float, float]]:
+        """For each axis the end that is farthest from 0, the spacing of numbers there, and the cell's width."""
+        found = []
+        for low, n, h in zip(self.lower, self.shape, self.spacing, strict=True):
+            reach = max(abs(low), abs(low + n * h))
+            step = torch.finfo(dtype).eps * 2.0 ** math.floor(math.log2(reach)) if reach > 0 else 0.0
+            found.append((reach, step, h))
+        return found
 
     def to_cell_displacement(self, displacement: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Displacements (..., D) in domain length → cells, of type `dtype`."""

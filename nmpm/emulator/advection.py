@@ -21,9 +21,11 @@ from nmpm.emulator.constraints import (
     at_rest,
     check_within_bounds,
     energy,
+    mass_shares,
 )
-from nmpm.emulator.contact import SURFACE, Contact
+from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.crowding import Crowding
+from nmpm.emulator.departure import Departure
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
@@ -33,7 +35,7 @@ from nmpm.transfer.linear import linear_g2p
 
 @dataclass(frozen=True)
 class Flight:
-    """The state at the start of a bundle and the fields predicted for it.
+    """Particles on their way through a bundle.
 
     Args:
         cells: (B, N, D) positions.
@@ -81,25 +83,26 @@ class Advection:
     bounds: Tensor
     walls: Tensor
 
-    def free_path(self, flight: Flight) -> Tensor:
+    def free_path(self, start: Departure) -> Tensor:
         """(B, m, N, D) positions by the network's velocities alone, within the bounds.
 
         Raises:
             DataError: as `constrained_path`.
         """
-        return self._check_bounds(self._free(flight))
+        return self._check_bounds(self._free(self._take_off(start)))
 
-    def constrained_path(self, flight: Flight, solid: Tensor, budget: Tensor | None) -> Tensor:
+    def constrained_path(self, start: Departure, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
 
         Args:
-            flight: What to start from.
+            start: What to start from.
             solid: (B, C_solid, *S), the share of each cell that is wall or obstacle.
             budget: (B,) energy that no frame may exceed; None for no such limit.
 
         Raises:
             DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
         """
+        flight = self._take_off(start)
         path = self._free(flight) if budget is None else self._within_energy(flight, budget)
         path = self._clear_of_obstacles(flight, path, solid)
         if self.constraints.rest_speed:
@@ -107,11 +110,11 @@ class Advection:
             path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
         return self._check_bounds(path)
 
-    def uncrowded_path(self, flight: Flight, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
+    def uncrowded_path(self, start: Departure, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """A constrained path (B, m, N, D) whose overfull cells at the end have been spread, evenly over its frames.
 
         Args:
-            flight: What it started from.
+            start: What it started from.
             path: (B, m, N, D) from `constrained_path`.
             solid: As for `constrained_path`.
             budget: As for `constrained_path`.
@@ -119,17 +122,25 @@ class Advection:
         volume = self.scene.particle_volume / self.grid.cell_volume
         taken = solid if solid.shape[1] else self.walls.expand(1, 1, *self.grid.shape)
         crowding = Crowding(self.constraints.density_cap, volume, 1 - taken, self.grid)
-        shift = crowding.shift(path[:, -1], flight.share > 0)
+        shift = crowding.shift(path[:, -1], start.mask.unsqueeze(-1))
         if shift is None:
             return path
         frames = path.shape[1]
         ramp = torch.arange(1, frames + 1, device=path.device, dtype=path.dtype).view(-1, 1, 1) / frames
         spread = self._confine(path + ramp * shift.unsqueeze(1))
         if self.constraints.solids and self.scene.obstacles:
-            depth = linear_g2p(self._obstacle_share(solid).to(path.dtype), spread.flatten(1, 2), self.grid)
+            depth = linear_g2p(obstacle_share(solid, self.walls).to(path.dtype), spread.flatten(1, 2), self.grid)
             blocked = (depth > SURFACE).unflatten(1, path.shape[1:3]).any(1, keepdim=True)
             spread = torch.where(blocked, path, spread)
-        return spread if budget is None else self._afford_spread(flight, path, spread, budget)
+        return spread if budget is None else self._afford_spread(start, path, spread, budget)
+
+    def _take_off(self, start: Departure) -> Flight:
+        """The velocities that particles keep, and their shares of their scene's mass."""
+        fields = start.fields
+        smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
+        carried = self.decoder.carried_velocity(start.velocity, smoothed)
+        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
+        return Flight(start.cells, start.velocity, carried, start.gravity, start.material, fields, share)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
@@ -168,19 +179,20 @@ class Advection:
         if not can_branch(budget):
             return self._limit_energy(flight, budget, flight.cells.unsqueeze(1)[:, :0])
         path = self._free(flight)
-        exceeds = (self._energies(flight, path) > budget.unsqueeze(1)).any(0)
+        energies = self._energies(flight.cells, flight.gravity, flight.share, path)
+        exceeds = (energies > budget.unsqueeze(1)).any(0)
         if not bool(exceeds.any()):
             return path
         return self._limit_energy(flight, budget, path[:, : int(exceeds.int().argmax())])
 
-    def _energies(self, flight: Flight, path: Tensor) -> Tensor:
-        """(B, m) energy of each frame of a path (B, m, N, D)."""
+    def _energies(self, cells: Tensor, gravity: Tensor, share: Tensor, path: Tensor) -> Tensor:
+        """(B, m) energy of each frame of a path (B, m, N, D) from cells (B, N, D), with shares (B, N, 1) of the mass."""
         parts = []
         for chunk in chunks(path.shape[2], path.device):
-            part, own = flight.part(chunk), path[:, :, chunk]
-            steps = own.diff(dim=1, prepend=part.cells.unsqueeze(1))
-            own, steps, gravity = self.grid.isotropic_units(own, steps, flight.gravity)
-            parts.append(energy(own, steps, gravity, part.share))
+            own = path[:, :, chunk]
+            steps = own.diff(dim=1, prepend=cells[:, chunk].unsqueeze(1))
+            own, steps, pull = self.grid.isotropic_units(own, steps, gravity)
+            parts.append(energy(own, steps, pull, share[:, chunk]))
         return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
 
     def _limit_energy(self, flight: Flight, budget: Tensor, begun: Tensor) -> Tensor:
@@ -214,30 +226,26 @@ class Advection:
         """The path (B, m, N, D), clear of obstacles."""
         if not (self.constraints.solids and self.scene.obstacles):
             return path
-        return self._confine(Contact(self._obstacle_share(solid), self.grid).hold(flight.cells, path))
+        return self._confine(Contact(obstacle_share(solid, self.walls), self.grid).hold(flight.cells, path))
 
-    def _obstacle_share(self, solid: Tensor) -> Tensor:
-        """Share of each cell's room between the walls that is obstacle, (B, 1, *S)."""
-        room = 1 - self.walls
-        return torch.where(room > 0, (solid - self.walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
-
-    def _afford_spread(self, flight: Flight, path: Tensor, spread: Tensor, budget: Tensor) -> Tensor:
+    def _afford_spread(self, start: Departure, path: Tensor, spread: Tensor, budget: Tensor) -> Tensor:
         """The largest part of the way from path to spread (B, m, N, D) that no frame's energy (B,) forbids.
 
         The state after the bundle, which keeps the path's velocity, counts as a further frame.
         """
-        after = self._spread_energies(flight, path, spread)
+        after = self._spread_energies(start, path, spread)
         if can_branch(budget) and not bool((after > budget.unsqueeze(1)).any()):
             return spread
-        share = affordable_share(self._spread_energies(flight, path, path), after, budget)[:, None, None, None]
+        share = affordable_share(self._spread_energies(start, path, path), after, budget)[:, None, None, None]
         return torch.where(share < 1, path + share * (spread - path), spread)
 
-    def _spread_energies(self, flight: Flight, path: Tensor, spread: Tensor) -> Tensor:
+    def _spread_energies(self, start: Departure, path: Tensor, spread: Tensor) -> Tensor:
         """(B, m + 1) energies of the frames of a spread path, and of its end with the velocity of the path's end."""
-        before = path[:, -2] if path.shape[1] > 1 else flight.cells
-        place, step, gravity = self.grid.isotropic_units(spread[:, -1], path[:, -1] - before, flight.gravity)
-        end = energy(place, step, gravity, flight.share)
-        return torch.cat([self._energies(flight, spread), end.unsqueeze(1)], dim=1)
+        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
+        before = path[:, -2] if path.shape[1] > 1 else start.cells
+        place, step, gravity = self.grid.isotropic_units(spread[:, -1], path[:, -1] - before, start.gravity)
+        end = energy(place, step, gravity, share)
+        return torch.cat([self._energies(start.cells, start.gravity, share, spread), end.unsqueeze(1)], dim=1)
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""

@@ -36,6 +36,17 @@ Depth = Callable[[Tensor], Tensor]
 """Solid fraction (n, K) at places (n, K, D): each particle's places in its own scene."""
 
 
+def obstacle_share(solid: Tensor, walls: Tensor) -> Tensor:
+    """The share of each cell's room that is obstacle, (B, 1, *S) in [0, 1].
+
+    Args:
+        solid: (B, 1, *S), the share that is wall or obstacle.
+        walls: (*S), the share that is wall.
+    """
+    room = 1 - walls
+    return torch.where(room > 0, (solid - walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
+
+
 @dataclass(frozen=True)
 class Contact:
     """The obstacles of B scenes.

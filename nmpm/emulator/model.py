@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,9 +17,12 @@ from torch import Tensor, nn
 
 from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
-from nmpm.emulator.advection import Advection, Flight
+from nmpm.emulator.advection import Advection
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
-from nmpm.emulator.rasterise import grid_state, solid_fraction, wall_fraction
+from nmpm.emulator.departure import Departure
+from nmpm.emulator.fused.plan import make_plan
+from nmpm.emulator.rasterise import solid_fraction, wall_fraction
+from nmpm.emulator.steps import steps_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -77,6 +81,7 @@ class Emulator(nn.Module):
     def __init__(self, recipe: EmulatorRecipe) -> None:
         super().__init__()
         self.recipe = recipe
+        self._plan = make_plan(recipe)
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -161,6 +166,7 @@ class Emulator(nn.Module):
         """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
         other = copy.copy(self)
         other.recipe = dataclasses.replace(self.recipe, constraints=constraints)
+        other._plan = make_plan(other.recipe)
         return other
 
     def unconstrained(self) -> Emulator:
@@ -214,33 +220,24 @@ class Emulator(nn.Module):
         """
         context = self.context(particles) if context is None else context
         device = particles.position.device.type
-        with torch.autocast(device, enabled=False):
-            cells, velocity, gravity = self.in_cells(particles)
-            state = grid_state(self.scene, self.grid, self.transfer, particles, cells, velocity, context.solid)
+        steps = steps_for(self, self._plan, particles)
+        with _full_precision(device):
+            cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         output = self.processor(normalised.to(self.network_precision))
-        with torch.autocast(device, enabled=False):
-            fields = output.to(self.precision) * self.output_scale
-            advection = self.advection
-            smoothed = advection.gather(state[:, : fields.shape[2]], cells, particles.material)
-            carried = self.decoder.carried_velocity(velocity, smoothed)
-            share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
-            flight = Flight(cells, velocity, carried, gravity, particles.material, fields, share)
-            if self.training:
-                path = advection.free_path(flight)
-            else:
-                path = advection.constrained_path(flight, context.solid, context.budget)
-            steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
+        with _full_precision(device):
+            own = particles
+            start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
+            path = steps.path(start, context)
+            precision = particles.position.dtype
+            step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
             if self.constraints.density_cap and not self.training:
                 # Spreading is no motion of the material: the velocity is that of the path without it.
-                path = advection.uncrowded_path(flight, path, context.solid, context.budget)
-            precision = particles.position.dtype
-            return Bundle(
-                position=self.grid.to_length(path.to(precision)),
-                velocity=self.grid.to_displacement(steps[:, -1].to(precision)),
-            )
+                path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
+            velocity = self.grid.to_displacement(step.to(precision))
+            return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
@@ -249,3 +246,9 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
+
+
+def _full_precision(device: str) -> AbstractContextManager[object]:
+    """A context without autocast; entering one where none is on would cost as much as a small operation."""
+    on = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
+    return torch.autocast(device, enabled=False) if on else nullcontext()

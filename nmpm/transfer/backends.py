@@ -68,7 +68,7 @@ _chosen: ContextVar[Add | None] = ContextVar("nmpm_transfer_backend", default=No
 
 @contextmanager
 def using(name: str) -> Iterator[None]:
-    """Choose the backend within a `with` block.
+    """Choose the backend within a `with` block, in which no fused kernel runs (`nmpm.emulator.fused`).
 
     Args:
         name: "native", "sorted" or "torch-scatter".
@@ -83,6 +83,11 @@ def using(name: str) -> Iterator[None]:
         yield
     finally:
         _chosen.reset(token)
+
+
+def is_chosen() -> bool:
+    """Whether code runs within `using`, and so with tensor operations alone."""
+    return _chosen.get() is not None
 
 
 def add(source: Tensor, index: Tensor, size: int) -> Tensor:

@@ -11,9 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 from nmpm.sim.mpm.grid import MpmGrid, Walls
 from nmpm.sim.mpm.particles import MpmParticles
 from nmpm.sim.mpm.stepper import MpmStepper

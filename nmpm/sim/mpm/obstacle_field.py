@@ -23,8 +23,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.jit import jit
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 
 Distance = Callable[[Array], NDArray[Any]]
 """From points (K, 2) to their signed distances (K,) from the obstacles, negative inside."""

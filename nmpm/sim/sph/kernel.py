@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from nmpm.sim.jit import jit
+from nmpm._support.jit import jit
 
 SUPPORT = 3.0
 """Reach of the kernel, in smoothing lengths."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.jit import jit
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 
 Indices = NDArray[np.uint32]
 Pairs = tuple[Indices, Indices]

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
+from nmpm._support.jit import jit
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 from nmpm.sim.sph.kernel import NORM, slope, weight
 from nmpm.sim.sph.neighbours import Indices
 

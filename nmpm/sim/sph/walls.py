@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.jit import jit
 from nmpm.scene import Interval
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 from nmpm.sim.sph.obstacles import LAYERS, PolygonObstacle
 
 # Distance from a surface, in spacings, at which a particle is clamped. Float32 can still tell it from the surface.

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from nmpm._support.jit import jit
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 from nmpm.sim.sph import sums
 from nmpm.sim.sph.fluid import Fluid, SphParticles
 from nmpm.sim.sph.kernel import SUPPORT

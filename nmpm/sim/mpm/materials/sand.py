@@ -24,9 +24,9 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 from nmpm.sim.mpm.materials.elastic import PlaneStrainSolid
 
 

@@ -22,9 +22,9 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
 from nmpm.sim.arrays import Array
-from nmpm.sim.jit import jit
 from nmpm.sim.mpm.materials.base import Material
 
 # Of the volume at rest: smaller, Tait's pressure would overflow. Stable simulations stay far above it.

@@ -1,0 +1,109 @@
+"""The kernels for a batch of scenes as functions of tensors: p2g, the way through a bundle, and back to domain length.
+
+Shapes as in `nmpm.particles`; tensors are float32 on the CPU and carry no gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm._support.parallel import map_ranges, split
+from nmpm.emulator.fused.contact import fill_share
+from nmpm.emulator.fused.flight import land
+from nmpm.emulator.fused.path import SceneArrays, clear_of_obstacles, fly_scene, rest_scene
+from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.fused.rasterise import rasterise_scene
+from nmpm.transfer.fused.fields import unpack_bfloat16, unpack_float32
+
+_CHUNK = 2**14
+
+
+def rasterise(
+    plan: Plan, position: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, solid: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Particles in grid units, and the grid state.
+
+    Returns:
+        (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) grid state, whose
+        channels lie next to each other in memory.
+    """
+    batch, count, dim = position.shape
+    cells, moved = np.empty((2, batch, count, dim), np.float32)
+    pull = _array(gravity) / plan.box[1]
+    channels = len(plan.mass) * (dim + 1) + plan.solid + dim * plan.constants
+    state = np.empty((batch, *plan.shape, channels), np.float32)
+    kinds, threads = _materials(plan, material), torch.get_num_threads()
+    solids = _array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
+    inputs: tuple[Any, ...] = (_array(position), _array(velocity), pull, kinds, _array(mask), solids, cells, moved)
+    rows = state.reshape(batch, solids.shape[2], channels)
+    for scene in range(batch):
+        first, speed, fall, kind, real, wall, here, own = (values[scene] for values in inputs)
+        rasterise_scene(plan, first, speed, fall, kind, real, wall, here, own, rows[scene], threads)
+    tensors = map(torch.from_numpy, (cells, moved, pull.reshape(batch, 1, dim), state))
+    positions, velocities, falls, grid = tensors
+    return positions, velocities, falls, grid.movedim(-1, 1)
+
+
+def predict_path(
+    plan: Plan, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, state: Tensor,
+    output: Tensor, scale: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None,
+) -> Tensor:  # fmt: skip
+    """(B, m, N, D) positions in cells, as `Advection.constrained_path` gives them.
+
+    Raises:
+        IndexError: if a particle's material is none of the scene's.
+    """
+    batch, count, dim = cells.shape
+    frames, size = output.shape[1], math.prod(plan.shape)
+    path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
+    own, threads = _materials(plan, material), torch.get_num_threads()
+    if own.size and not (own.min() >= 0 and own.max() < len(plan.mass)):
+        raise IndexError(f"A particle's material is not an index from 0 to {len(plan.mass) - 1}.")
+    rows = _array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
+    factors, flows = _array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
+    predicted, unpack = _rows(output)
+    share, rooms = np.empty(size if plan.obstacles else 0, np.float32), _array(walls).reshape(-1)
+    solids = _array(solid).reshape(batch, -1)
+    inputs: tuple[Any, ...] = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows)
+    for scene in range(batch):
+        unpack(predicted[scene], factors, flows)
+        here, speed, kind, real, fall, grid = (values[scene] for values in inputs)
+        start = SceneArrays(here, speed, kind, real, fall, grid, flows)
+        fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
+        if plan.obstacles:
+            fill_share(solids[scene], rooms, share)
+            clear_of_obstacles(start, plan, share, path[scene], threads)
+        if plan.rest_speed:
+            rest_scene(start, plan, path[scene], threads)
+    return torch.from_numpy(path)
+
+
+def to_length(plan: Plan, path: Tensor) -> Tensor:
+    """The path (B, m, N, D) in domain length, in its own memory: fresh memory would take longer than the conversion."""
+    for frames in path.numpy():
+        convert = partial(land, frames, plan.box)
+        map_ranges(convert, split(frames.shape[1], _CHUNK), torch.get_num_threads())
+    return path
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.detach().contiguous().numpy()
+
+
+def _rows(output: Tensor) -> tuple[Any, Any]:
+    """A network's output as rows (B, size, m C), one per node, and the kernel that unpacks them."""
+    rows = output.detach().movedim((1, 2), (-2, -1)).flatten(-2).flatten(1, -2)
+    if output.dtype == torch.bfloat16:
+        return rows.contiguous().view(torch.uint16).numpy(), unpack_bfloat16
+    return rows.float().contiguous().numpy(), unpack_float32
+
+
+def _materials(plan: Plan, material: Tensor) -> Any:
+    """(B, N) indices, (B, 0) where there is only one material."""
+    return _array(material) if len(plan.mass) > 1 else np.empty((len(material), 0), np.int64)

@@ -1,0 +1,131 @@
+"""The steps of a call around the network: from particles to the grid, and back through a bundle.
+
+There are two implementations: tensor operations, for every device and with gradients, and the kernels of
+`nmpm.emulator.fused`. `steps_for` chooses.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator.departure import Departure
+from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.rasterise import grid_state
+from nmpm.particles import Particles
+from nmpm.transfer.backends import is_chosen
+
+if TYPE_CHECKING:
+    from nmpm.emulator.model import Emulator, RolloutContext
+
+
+class Steps(ABC):
+    """What a call does before and after the network."""
+
+    @abstractmethod
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Particles in grid units, and the grid state.
+
+        Args:
+            particles: In domain length.
+            solid: (B, C_solid, *S).
+
+        Returns:
+            (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) state.
+        """
+
+    @abstractmethod
+    def path(self, start: Departure, context: RolloutContext) -> Tensor:
+        """(B, m, N, D) positions in cells, held to the emulator's constraints."""
+
+    @abstractmethod
+    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
+        """The path in domain length and of this type.
+
+        Args:
+            path: (B, m, N, D) in cells; its memory may be used for the result.
+            precision: Of the result.
+        """
+
+
+@dataclass(frozen=True)
+class TensorSteps(Steps):
+    """The steps as tensor operations."""
+
+    emulator: Emulator
+
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        own = self.emulator
+        cells, velocity, gravity = own.in_cells(particles)
+        state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid)
+        return cells, velocity, gravity, state
+
+    def path(self, start: Departure, context: RolloutContext) -> Tensor:
+        advection = self.emulator.advection
+        if self.emulator.training:
+            return advection.free_path(start)
+        return advection.constrained_path(start, context.solid, context.budget)
+
+    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
+        return self.emulator.grid.to_length(path.to(precision))
+
+
+@dataclass(frozen=True)
+class FusedSteps(Steps):
+    """The steps as kernels; only for what `steps_for` gives them to.
+
+    Args:
+        plan: Of the emulator.
+        walls: (*S), the share of each cell that is wall.
+    """
+
+    plan: Plan
+    walls: Tensor
+
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        own = particles
+        cells, velocity, gravity, state = _kernels().rasterise(
+            self.plan, own.position, own.velocity, own.gravity, own.material, own.mask, solid
+        )
+        return cells, velocity, gravity, state
+
+    def path(self, start: Departure, context: RolloutContext) -> Tensor:
+        path: Tensor = _kernels().predict_path(
+            self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
+            start.output, start.scale, context.solid, self.walls, context.budget,
+        )  # fmt: skip
+        return path
+
+    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:  # noqa: ARG002 (float32, as the path)
+        positions: Tensor = _kernels().to_length(self.plan, path)
+        return positions
+
+
+def _kernels() -> Any:
+    """The functions of `calls`; in graphs that are being traced those of `operators`. Imported late, as Numba is."""
+    if torch.compiler.is_compiling():
+        from nmpm.emulator.fused import operators
+
+        return operators
+    from nmpm.emulator.fused import calls
+
+    return calls
+
+
+def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles) -> Steps:
+    """The kernels where they can do what is asked for, else tensor operations.
+
+    Kernels run on a CPU, in float32, without gradients, in evaluation mode, for the parts of this package (`make_plan`)
+    and outside of `nmpm.transfer.using`.
+    """
+    tensors = (particles.position, particles.velocity, particles.gravity)
+    plain = all(values.device.type == "cpu" and values.dtype == torch.float32 for values in tensors)
+    if plan is None or emulator.training or not plain or is_chosen() or emulator.precision != torch.float32:
+        return TensorSteps(emulator)
+    if torch.is_grad_enabled() and any(values.requires_grad for values in (*tensors, *emulator.parameters())):
+        return TensorSteps(emulator)
+    return FusedSteps(plan, emulator.walls)

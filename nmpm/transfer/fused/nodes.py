@@ -1,0 +1,101 @@
+"""The nodes that a position touches along an axis, and their weights, as in `nmpm.transfer.linear` and `quadratic`.
+
+A non-finite position must not become an index: what each transfer does with one is repeated here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from nmpm._support.jit import jit
+
+HALF, ZERO, ONE = np.float32(0.5), np.float32(0), np.float32(1)
+QUARTERS = np.float32(0.75)
+_NO_NODE = np.int64(-(2**63))
+"""What torch makes of NaN as an integer."""
+
+
+@jit
+def wrap(x: Any, extent: Any) -> Any:
+    """A position moved into a periodic axis; NaN if it is not finite."""
+    if x >= ZERO and x < extent:
+        return x
+    if not np.isfinite(x):
+        return np.float32(np.nan)
+    inside = np.float32(x % extent)
+    return inside if inside < extent else ZERO
+
+
+@jit
+def interior(x: Any, count: Any, wraps: Any) -> Any:
+    """A position in the domain: wrapped on a periodic axis, clamped to the faces of a wall axis."""
+    extent = np.float32(count)
+    if wraps:
+        return wrap(x, extent)
+    if x < ZERO:
+        return ZERO
+    return extent if x > extent else x
+
+
+@jit
+def node_below(x: Any) -> Any:
+    """The integer below a place in nodes."""
+    return np.int64(np.floor(x)) if np.isfinite(x) else _NO_NODE
+
+
+@jit
+def fold(node: Any, count: Any, wraps: Any) -> Any:
+    """The index of a node that may lie beyond an axis' ends."""
+    if node >= 0 and node < count:
+        return node
+    if wraps:
+        return np.int64(node % count)
+    return np.int64(0) if node < 0 else np.int64(count - 1)
+
+
+@jit
+def linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
+    """The two nodes around a position, and the weight of the upper one; of NaN on a wall axis: the axis' middle.
+
+    Beyond the last centre of a wall axis the position counts as there, which folds the support onto the border node.
+    """
+    if wraps:
+        offset = wrap(x, np.float32(count)) - HALF
+        base = node_below(offset)
+        return fold(base, count, True), fold(base + 1, count, True), np.float32(offset - np.floor(offset))
+    last = np.float32(count - 1)
+    offset = x - HALF
+    if not offset > ZERO:
+        offset = HALF * last if np.isnan(offset) else ZERO
+    elif offset > last:
+        offset = last
+    lower = np.int64(offset)
+    return lower, min(lower + 1, count - 1), np.float32(offset - np.float32(lower))
+
+
+@jit
+def stencil(x: Any, count: Any, wraps: Any, steps: Any) -> Any:
+    """The nodes along an axis and their weights, three of each, unused ones with weight 0.
+
+    Args:
+        x: Position.
+        count: Nodes along the axis.
+        wraps: Whether it is periodic.
+        steps: A tuple of as many integers as the kernel has nodes: 1 (nearest), 2 (linear) or 3 (quadratic).
+    """
+    inside = interior(x, count, wraps)
+    if len(steps) == 1:
+        base, weights = node_below(inside), (ONE, ZERO, ZERO)
+    elif len(steps) == 2:
+        offset = inside - HALF
+        upper = np.float32(offset - np.floor(offset))
+        base, weights = node_below(offset), (ONE - upper, upper, ZERO)
+    else:
+        nearest = np.floor(inside)
+        d = inside - HALF - nearest
+        base = node_below(nearest) - 1
+        weights = (HALF * (HALF - d) ** 2, QUARTERS - d * d, HALF * (HALF + d) ** 2)
+    nodes = (fold(base, count, wraps), fold(base + 1, count, wraps), fold(base + 2, count, wraps))
+    return nodes, weights
