@@ -186,7 +186,7 @@ class Advection:
         return self._limit_energy(flight, budget, path[:, : int(exceeds.int().argmax())])
 
     def _energies(self, cells: Tensor, gravity: Tensor, share: Tensor, path: Tensor) -> Tensor:
-        """(B, m) energy of each frame of a path (B, m, N, D) from cells (B, N, D), with shares (B, N, 1) of the mass."""
+        """(B, m) energies of the frames of a path (B, m, N, D) from cells (B, N, D), with shares (B, N, 1) of mass."""
         parts = []
         for chunk in chunks(path.shape[2], path.device):
             own = path[:, :, chunk]
