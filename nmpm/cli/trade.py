@@ -28,8 +28,8 @@ examples:
 
 It writes to the folder of --out: trade.csv (one row for each choice and error), trade.png, trade.html (an interactive
 page, self-contained), and points/, which holds every measurement: the same command goes on after an interruption, and
-measures only what is new. Times of one CPU thread are CPU time; all choices take turns, so that ratios hold on a busy
-machine, while absolute times hold for that machine and day alone.
+measures only what is new. Times of one CPU thread are CPU time, and all choices take turns; other load on the machine
+still slows networks more than the simulator, so measure on an idle one. Delete points/times-* to time everything anew.
 """
 
 
