@@ -12,11 +12,12 @@ from nmpm._support.atomic import temporary_path
 
 def file_obstacle(path: Path) -> str:
     """Why a file cannot be written, in words; empty if it can."""
-    obstacle = name_obstacle(path) or name_obstacle(temporary_path(path))
-    if obstacle:
+    if obstacle := name_obstacle(path):
         return obstacle
     if path.is_dir():
         return "it is a folder; name a file."
+    if obstacle := name_obstacle(temporary_path(path)):
+        return obstacle
     if path.parent.is_file():
         return f"{path.parent} is a file, not a folder."
     if not path.parent.is_dir():

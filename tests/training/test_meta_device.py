@@ -36,7 +36,10 @@ def no_autocast(monkeypatch):
 def build_module(config: str, scene: Scene) -> EmulatorModule:
     """The module of a configuration, with a tiny network; its optimizer is built on the device later."""
     model = yaml.safe_load(find_config(config).read_text())["model"]
-    model["processor"]["init_args"] |= {"width": 4, "depth": 1, "perceptron": [4]}
+    processor = model["processor"]
+    while "processor" in processor["init_args"]:  # of a wrapper, such as Patched
+        processor = processor["init_args"]["processor"]
+    processor["init_args"] |= {"width": 4, "depth": 1, "perceptron": [4]}
     metrics = [MSE(**chosen["init_args"]) for chosen in model.pop("metrics", ())]
     optimizer = model.pop("optimizer")
     kind = getattr(

@@ -103,7 +103,7 @@ def test_time_alone_ends_a_training_and_an_extension_starts_at_a_lower_rate():
 def test_the_shipped_queue_is_read_and_simulates_what_its_configurations_say():
     plan = Plan.read(SCRIPT.with_name("queue.yaml"))
     simulated = {dataset.name: dataset.generation() for dataset in plan.datasets}
-    assert simulated["dambreak2d"] == ("dambreak2d", {"counts": {"train": 40, "valid": 4, "test": 10}})
+    assert simulated["dambreak2d"] == ("dambreak2d", {"counts": {"train": 20, "valid": 3, "test": 8}})
     assert simulated["waterdrop-simulated"] == ("waterdrop", {})
     assert Dataset("waterdrop", "waterdrop.yaml", 1).generation() is None
 
