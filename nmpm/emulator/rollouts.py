@@ -12,10 +12,14 @@ from nmpm.emulator.monitor import Monitor
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
+from nmpm.transfer.chunks import can_branch
 
 
 def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
+
+    Once a bundle ends in exactly the state that it started from, as a scene at rest does, all further ones would be the
+    same: it is yielded again without a call. Only on a CPU, as comparing states elsewhere would halt the device.
 
     Args:
         emulator: Predicts m frames a call.
@@ -26,14 +30,25 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     if monitor is not None:
         monitor.start(emulator, particles)
     context = emulator.context(particles)
+    bundle, at_rest = None, False
     for remaining in reversed(range(bundles)):
-        bundle = emulator(particles, context)
+        if bundle is None or not at_rest:
+            bundle = emulator(particles, context)
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
             if not remaining:
                 monitor.read()
         yield bundle
-        particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        after = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        at_rest = at_rest or (not emulator.training and _is_same_motion(particles, after))
+        particles = after
+
+
+def _is_same_motion(before: Particles, after: Particles) -> bool:
+    """Whether two states have the same positions and velocities, to the bit; False where asking would cost."""
+    if not can_branch(after.position) or after.position.requires_grad:
+        return False
+    return torch.equal(before.velocity, after.velocity) and torch.equal(before.position, after.position)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:
