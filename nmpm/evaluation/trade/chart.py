@@ -76,8 +76,8 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())
-    if shown:  # room for names beside the outermost points
-        times = [point.milliseconds for point in shown]
+    times = [point.milliseconds for point in shown if point.kind in _MARKERS]
+    if times:  # room for names beside the outermost points
         axes.set_xlim(min(times) / 1.4, max(times) * 1.15)
     axes.grid(visible=True, which="major", color="0.9", lw=0.7)
     axes.set_axisbelow(True)
