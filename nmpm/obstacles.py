@@ -27,6 +27,7 @@ Number = float | Tensor
 Point = Sequence[Number] | Tensor
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+_ON_EDGE = 1e-9  # share of a triangle: lattice points on a polygon's edges are inside, whatever their rounding
 
 
 class Body(abc.ABC):
@@ -151,7 +152,7 @@ def _fan_weights(corners: Tensor, spacing: float) -> Tensor:
         first, b, c = corners[0], corners[second] - corners[0], corners[second + 1] - corners[0]
         offset, area = points - first, _cross(b, c)
         beta, gamma = _cross(offset, c.expand_as(offset)) / area, _cross(b.expand_as(offset), offset) / area
-        inside = free & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
+        inside = free & (beta >= -_ON_EDGE) & (gamma >= -_ON_EDGE) & (beta + gamma <= 1 + _ON_EDGE)
         weights[inside, 0] = 1 - beta[inside] - gamma[inside]
         weights[inside, second], weights[inside, second + 1] = beta[inside], gamma[inside]
         free &= ~inside

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
@@ -46,13 +46,15 @@ def test_a_rectangle_as_polygon_is_the_ramp_that_it_is():
 
 @settings(deadline=None)
 @given(st.integers(3, 8), st.floats(0, 6))
+@example(4, 2.220446049250313e-16)  # half of its lattice's outer points lie on its edges
 def test_polygons_are_filled_evenly_either_way_round(corners, turn):
     angles = turn + 2 * math.pi * torch.arange(corners, dtype=torch.float64) / corners
     outline = 0.5 + 0.2 * torch.stack([torch.cos(angles), torch.sin(angles)], dim=-1)
     area = corners / 2 * 0.2**2 * math.sin(2 * math.pi / corners)
     there, back = Polygon(outline).particles(0.01), Polygon(outline.flip(0)).particles(0.01)
     assert len(there) == pytest.approx(area / 0.01**2, rel=0.12)
-    torch.testing.assert_close(there.mean(0), back.mean(0), atol=2e-3, rtol=0)
+    assert len(there) == len(back)
+    torch.testing.assert_close(there.mean(0), back.mean(0))
 
 
 @pytest.mark.parametrize(
