@@ -43,6 +43,7 @@ from nmpm._support.atomic import atomic_write
 from nmpm.data.catalog import dataset_home
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Emulator, rollout
+from nmpm.evaluation.bootstrap import resampled_means
 from nmpm.evaluation.stress.settling import compare_shapes
 from nmpm.evaluation.stress.subject import Subject, simulate_window
 from nmpm.metrics import MSE, earth_mover
@@ -54,9 +55,9 @@ HORIZONS = (8, 32, 100)
 EMD_EVERY = 20
 MULTIPLES = (1.0, 5 / 3, 2.5)
 SHAPE_MEASURES = ("height", "crowding", "peak_crowding")
-RESAMPLES = 10_000
 METRICS = ("errors", "shape", "time")
 TIMED_FRAMES = 160
+RESAMPLES = 10_000
 
 
 @dataclass(frozen=True)
@@ -205,9 +206,8 @@ def time_runs(runs: Mapping[Path, Run], rounds: int) -> dict[Path, float]:
 def ratio_interval(ours: Sequence[float], theirs: Sequence[float]) -> tuple[float, float, float]:
     """Ratio of means over the same scenes, and the ends of its 95% interval by a paired bootstrap."""
     values = np.array([ours, theirs])
-    picks = np.random.default_rng(0).integers(0, values.shape[1], (RESAMPLES, values.shape[1]))
-    means = values[:, picks].mean(-1)
-    low, high = np.percentile(means[0] / means[1], [2.5, 97.5])
+    means = resampled_means(values, resamples=RESAMPLES)
+    low, high = np.percentile(means[:, 0] / means[:, 1], [2.5, 97.5])
     return float(values[0].mean() / values[1].mean()), float(low), float(high)
 
 

@@ -30,17 +30,17 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     if monitor is not None:
         monitor.start(emulator, particles)
     context = emulator.context(particles)
-    bundle, at_rest = None, False
+    repeated: Bundle | None = None
     for remaining in reversed(range(bundles)):
-        if bundle is None or not at_rest:
-            bundle = emulator(particles, context)
+        bundle = emulator(particles, context) if repeated is None else repeated
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
             if not remaining:
                 monitor.read()
         yield bundle
         after = particles.with_motion(bundle.position[:, -1], bundle.velocity)
-        at_rest = at_rest or (not emulator.training and _is_same_motion(particles, after))
+        if repeated is None and not emulator.training and _is_same_motion(particles, after):
+            repeated = bundle
         particles = after
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import torch
 
+from nmpm._support.devices import processor_name
+
 Action = Callable[[], object]
 Clock = Callable[[], float]
 
@@ -78,7 +80,4 @@ def describe_device(device: torch.device) -> str:
         return torch.cuda.get_device_name(device)
     if device.type == "mps":
         return f"Apple GPU ({platform.processor()})"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    return processor_name()

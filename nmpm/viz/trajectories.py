@@ -105,6 +105,12 @@ class LabelledTrajectories:
         """Outer side of the walls, (lower, upper) per axis."""
         return self.domain or self.bounds
 
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """The box's length along periodic axes, zero along the others."""
+        periodic = self.periodic or (False,) * self.dim
+        return tuple((high - low) * wraps for (low, high), wraps in zip(self.bounds, periodic, strict=True))
+
     def evenly_spaced_frames(self, count: int) -> list[int]:
         """Indices of at most `count` frames, evenly spaced from the first to the last."""
         indices = np.linspace(0, self.frame_count - 1, min(count, self.frame_count))
@@ -124,11 +130,10 @@ class LabelledTrajectories:
 
     def _rms_distance(self, reference: Floats, other: Floats) -> NDArray[np.float64]:
         squares = np.zeros(self.frame_count)
-        for axis, periodic in enumerate(self.periodic or (False,) * self.dim):
+        for axis, period in enumerate(self.periods):
             difference = other[..., axis].astype(np.float64) - reference[..., axis]
-            if periodic:
-                length = self.bounds[axis][1] - self.bounds[axis][0]
-                difference -= length * np.round(difference / length)
+            if period:
+                difference -= period * np.round(difference / period)
             squares += np.square(difference).mean(axis=1)
         return np.sqrt(squares)
 

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.comparison import PREDICTORS, figure_names
-from nmpm.zoo.intervals import bootstrap_interval
 from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {
@@ -85,7 +85,7 @@ def intervals(card: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """The 95% interval of each figure's mean over test scenes, for those that every scene has; empty for one scene."""
     rows = card.get("per_trajectory") or []
     names = [name for name in (rows[0] if len(rows) > 1 else ()) if all(name in row for row in rows)]
-    return {name: bootstrap_interval([row[name] for row in rows]) for name in names}
+    return {name: interval([row[name] for row in rows]) for name in names}
 
 
 def twin_ratio(card: Mapping[str, Any], name: str) -> str:

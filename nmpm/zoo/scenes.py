@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
         if "test" not in paths:
             raise ConfigError(f"{data} has no test.h5.")
         for window in EvaluationLoader(SplitRecordings(Split(paths["test"]), metadata, model.scene), 1):
-            yield window if frames is None else _first_frames(window, frames + 2)
+            yield window if frames is None else dataclasses.replace(window, frames=window.frames[:, : frames + 2])
         return
     preset, request = simulation_of(model)
     shorter = preset if frames is None else preset.with_frames(frames + 1)
@@ -39,17 +40,6 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
         run = shorter.simulate(seed)
         stored = Trajectory(run.position, run.particle_type, run.attributes)
         yield collate([reader.recording(stored, f"{preset.name}, seed {seed}")], model.scene)
-
-
-def _first_frames(window: Window, frames: int) -> Window:
-    return Window(
-        window.frames[:, :frames],
-        window.material,
-        window.mask,
-        window.obstacle,
-        window.obstacle_mask,
-        window.gravity,
-    )
 
 
 def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:

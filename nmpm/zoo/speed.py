@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import statistics
-import time
 from typing import Any
-
-import torch
 
 from nmpm._support.devices import device_name
 from nmpm.emulator import rollout
+from nmpm.evaluation.machine import peak_bytes, wall_clock
 from nmpm.particles import Particles
 from nmpm.zoo.golden import fitting_count
 from nmpm.zoo.pretrained import Pretrained
@@ -50,9 +48,9 @@ def _milliseconds(model: Pretrained, state: Particles) -> float:
     """Median milliseconds per frame, for all scenes of the batch together, over two bundles."""
     frames, found = 2 * model.emulator.frames, []
     for _ in range(REPETITIONS + 1):
-        start = time.perf_counter()
-        rollout(model.emulator, state, frames)[:, -1].sum().item()  # waits for the device
-        found.append(1e3 * (time.perf_counter() - start) / frames)
+        start = wall_clock()
+        rollout(model.emulator, state, frames)
+        found.append(1e3 * (wall_clock() - start) / frames)
     return statistics.median(found[1:])
 
 
@@ -61,7 +59,4 @@ def _peak_memory(model: Pretrained, state: Particles) -> float | None:
     device = model.emulator.device
     if device.type != "cuda":
         return None
-    torch.cuda.reset_peak_memory_stats(device)
-    before = float(torch.cuda.memory_allocated(device))
-    rollout(model.emulator, state, 2 * model.emulator.frames)
-    return round((float(torch.cuda.max_memory_allocated(device)) - before) / 2**20, 1)
+    return round(peak_bytes(lambda: rollout(model.emulator, state, 2 * model.emulator.frames), device) / 2**20, 1)

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from nmpm.errors import ConfigError
+from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.zoo.golden import TOLERANCE, golden_distance
-from nmpm.zoo.intervals import bootstrap_interval
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import iterate_test_scenes
 
@@ -93,7 +93,7 @@ def _means(rows: Sequence[Mapping[str, float]], errors: Sequence[Mapping[str, fl
     for name in (name for name in rows[0] if name != "mse@1"):
         stated = [row[name] for row in rows if name in row]
         found = [row[name] for row in errors if name in row]
-        low, high = bootstrap_interval(stated)
+        low, high = interval(stated)
         mean = math.nan if len(found) < len(stated) else float(np.mean(found))
         yield Check(f"{name} over {len(stated)} test scenes", float(np.mean(stated)), mean, low, high)
 

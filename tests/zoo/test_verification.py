@@ -11,11 +11,11 @@ import yaml
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import ConfigError
+from nmpm.evaluation.bootstrap import interval
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.index import refresh, write_index
-from nmpm.zoo.intervals import bootstrap_interval
 from nmpm.zoo.lifecycle import lifecycle
 from nmpm.zoo.twin import measure_twin, twin_of
 from nmpm.zoo.verification import Check, verify
@@ -102,9 +102,9 @@ def test_a_check_passes_at_its_limits_and_not_with_nan():
 
 def test_the_interval_of_a_mean_covers_it_as_often_as_it_says():
     rng = np.random.default_rng(1)
-    covered = [low <= 1.0 <= high for low, high in (bootstrap_interval(rng.normal(1, 1, 40)) for _ in range(200))]
+    covered = [low <= 1.0 <= high for low, high in (interval(rng.normal(1, 1, 40)) for _ in range(200))]
     assert 0.88 < np.mean(covered) < 0.99
-    assert bootstrap_interval([2.0]) == (2.0, 2.0)
+    assert interval([2.0]) == (2.0, 2.0)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from nmpm.evaluation.bootstrap import intervals
 from nmpm.evaluation.trade.choice import Kind
-from nmpm.evaluation.trade.pareto import intervals, pareto_members, pareto_probabilities
+from nmpm.evaluation.trade.pareto import pareto_members, pareto_probabilities
 from nmpm.evaluation.trade.points import Point
 
 MEASURES: Mapping[str, str] = MappingProxyType(

@@ -1,4 +1,4 @@
-"""Intervals of errors and membership in the Pareto set, both under resampling of the test scenes.
+"""Membership in the Pareto set, also under resampling of the test scenes.
 
 A point is in the Pareto set if no other is at least as fast and as accurate, and better in one of the two. Its
 probability is the share of resamples (with replacement, the same scenes for all points) in which it is; times stay.
@@ -9,23 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-
-RESAMPLES = 2000
-_LEVELS = (2.5, 97.5)
-
-
-def resampled_means(errors: Floats, seed: int = 0, resamples: int = RESAMPLES) -> Floats:
-    """Mean errors (R, P) in resamples of S scenes, from the errors (P, S) of P points; the same seed, the same bits."""
-    scenes = errors.shape[1]
-    chosen = np.random.default_rng(seed).integers(0, scenes, (resamples, scenes))
-    weights = np.stack([np.bincount(row, minlength=scenes) for row in chosen]) / scenes
-    return np.asarray(weights @ errors.T)
-
-
-def intervals(errors: Floats, seed: int = 0) -> Floats:
-    """Bootstrap intervals (P, 2) of 95% of the mean errors of P points in S scenes, (P, S)."""
-    return np.percentile(resampled_means(errors, seed), _LEVELS, axis=0).T
+from nmpm.evaluation.bootstrap import Floats, resampled_means
 
 
 def pareto_members(times: Floats, errors: Floats) -> NDArray[np.bool_]:

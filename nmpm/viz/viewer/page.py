@@ -89,7 +89,7 @@ def _describe_box(trajectories: LabelledTrajectories) -> dict[str, Any]:
         "dim": trajectories.dim,
         "bounds": [list(side) for side in trajectories.bounds],
         "domain": [list(side) for side in trajectories.outer_bounds],
-        "period": _periods(trajectories),
+        "period": list(trajectories.periods),
         "up": vertical_axis(trajectories),
     }
 
@@ -133,12 +133,6 @@ def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Fl
     }
 
 
-def _periods(trajectories: LabelledTrajectories) -> list[float]:
-    """The box's length along periodic axes, zero along the others."""
-    periodic = trajectories.periodic or (False,) * trajectories.dim
-    return [(high - low) * wraps for (low, high), wraps in zip(trajectories.bounds, periodic, strict=True)]
-
-
 def _colour_scale() -> list[tuple[int, int, int]]:
     colours = matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))
     return [(red, green, blue) for red, green, blue, _ in np.round(255 * colours).astype(int).tolist()]
@@ -158,7 +152,7 @@ def _worst(trajectories: LabelledTrajectories, positions: list[Floats]) -> float
 
 def _lengths(trajectories: LabelledTrajectories, difference: Floats) -> Floats:
     """Lengths (..., N) of differences (..., N, D), the shortest where axes are periodic."""
-    period = np.array(_periods(trajectories))
+    period = np.array(trajectories.periods)
     wrapped = difference - period * np.round(difference / np.where(period > 0, period, 1.0))
     return np.asarray(np.sqrt(np.square(wrapped).sum(axis=-1)))
 

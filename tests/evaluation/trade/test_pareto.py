@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from nmpm.evaluation.trade.pareto import intervals, pareto_members, pareto_probabilities, resampled_means
+from nmpm.evaluation.bootstrap import intervals, resampled_means
+from nmpm.evaluation.trade.pareto import pareto_members, pareto_probabilities
 
 
 def test_members_are_dominated_by_nobody():
