@@ -78,9 +78,10 @@ def predict_path(
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
         if plan.obstacles:
             fill_share(solids[scene], rooms, share)
+        if plan.obstacles and plan.solids:
             clear_of_obstacles(start, plan, share, path[scene], threads)
         if plan.rest_speed:
-            rest_scene(start, plan, path[scene], threads)
+            rest_scene(start, plan, share, path[scene], threads)
     return torch.from_numpy(path)
 
 
