@@ -127,7 +127,8 @@ def test_falling_gains_no_energy():
     scene, dt = box(obstacles=True), 0.0025
     generator = torch.Generator().manual_seed(1)
     cloud = 0.15 + 0.7 * torch.rand(80, 2, generator=generator)
-    state = state_at_rest(scene, cloud, lattice(((0.3, 0.5), (0.4, 0.5)), SPACING))
+    clear = (cloud - 0.45).abs().amax(1) > 0.15  # contact would push out what is in the obstacle
+    state = state_at_rest(scene, cloud[clear], lattice(((0.35, 0.55), (0.4, 0.5)), SPACING))
     path = rollout(emulator_of(scene), state, 80)
     steps = path.diff(dim=1, prepend=state.position.unsqueeze(1))
     energy = (steps.square().sum(-1) / 2 + 9.81 * dt**2 * heights(path)).double()
@@ -216,13 +217,12 @@ def test_support_turns_with_gravity(axis, upwards):
     down = torch.zeros(2, 1, 3)
     down[..., axis] = 1.0 if upwards else -1.0
     found = support.supported_cells(down)
-    order = [2, *(other for other in range(3) if other != axis)]  # the axis of gravity becomes the last
 
     def turn(values: Tensor) -> Tensor:
+        """The axis of gravity becomes the last one, with the floor at its lower end."""
         turned = values.movedim(axis - 3, -1)
         return turned.flip(-1) if upwards else turned
 
-    assert len(order) == 3
     sizes = tuple(float(n) for n in turn(support.filled).shape[2:])
     grid = Grid(tuple(map(int, sizes)), (0.0,) * 3, (1.0,) * 3, (False,) * 3)
     sides = tuple((0.0, size) for size in sizes)
@@ -237,7 +237,7 @@ def test_bundles_are_those_of_tensor_operations(dim, obstacles):
     scene = box(dim, ("water", "sand"), obstacles=obstacles, boundary=("periodic",) + ("wall",) * (dim - 1),
                 domain=((0.1, 0.9),) + ((0.08, 0.92),) * (dim - 1))  # fmt: skip
     generator = torch.Generator().manual_seed(dim)
-    position = 0.11 + 0.78 * torch.rand(400, dim, generator=generator)
+    position = 0.11 + 0.78 * torch.rand(60 if dim == 2 else 600, dim, generator=generator)
     beam = lattice(((0.3, 0.5),) * dim, 0.02) if obstacles else None
     emulator, state = emulator_of(scene), state_at_rest(scene, position, beam)
     with torch.no_grad():
