@@ -94,6 +94,20 @@ def test_the_simulator_itself_settles_as_its_recordings_and_its_twin_stands_besi
     assert line.figures == free.figures
 
 
+def test_what_constraints_hide_is_reported_without_them():
+    subject = goop(constraints=Constraints(energy=True, rest_speed=0.05), scale=0.5)
+    held = list(battery(subject, TINY, {"long": GROUPS["long"]}))
+    free = list(battery(subject, TINY, {"free": GROUPS["free"]}))
+    assert held[0].passed
+    assert held[0].figures["energy_gain_percent"] <= 1
+    assert free[0].name == held[0].name
+    assert free[0].figures["holds"] == 0
+    assert free[0].figures["energy_gain_percent"] > 100
+    assert {line.passed for line in free} == {None}
+    bare = subject.with_emulator(subject.emulator.unconstrained())
+    assert not list(battery(bare, TINY, {"free": GROUPS["free"]}))
+
+
 def test_scenes_one_by_one_are_those_of_a_window():
     subject = goop()
     together = simulate_window(subject, subject.preset, 2, 5)
