@@ -111,7 +111,7 @@ class Support:
                 if can_branch(pulled) and not bool(pulled.any()):
                     continue
                 here = pulled.view(-1, *(1,) * self.grid.dim)
-                result = torch.where(here, self._supported_along(axis, upwards), result)
+                result = result & (self._supported_along(axis, upwards) | ~here)  # ONNX Runtime's Where takes no bool
         return result
 
     def _supported_along(self, axis: int, upwards: bool) -> Tensor:
