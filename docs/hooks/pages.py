@@ -31,7 +31,6 @@ ROOMS = (
     "nmpm.emulator.constraints",
     "nmpm.emulator.monitor",
     "nmpm.obstacles",
-    "nmpm.training",
     "nmpm.training.losses",
     "nmpm.processors",
     "nmpm.transfer",
