@@ -27,9 +27,9 @@ from nmpm.errors import ZooError
 from nmpm.zoo.choice import Limits, choose, stated_milliseconds
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.hub import HubId, download
-from nmpm.zoo.measures.speed import measure_speed
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.runs import BEST, load_checkpoint
+from nmpm.zoo.speed import measure_speed
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]*(/[a-z0-9][a-z0-9_-]*)?")
 
