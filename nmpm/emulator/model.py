@@ -197,11 +197,16 @@ class Emulator(nn.Module):
         return self.rebuilt(self.recipe.over(scene))
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
-        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
+        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes.
+
+        Weights that need no gradients need none in the copy.
+        """
         other = recipe.build().to(self.device)
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
+        for weight, own in zip(other.parameters(), self.parameters(), strict=True):
+            weight.requires_grad_(own.requires_grad)
         other.runtime = copy.deepcopy(self.runtime)
         return other.train(self.training)
 

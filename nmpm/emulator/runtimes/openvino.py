@@ -107,9 +107,9 @@ def _compile(network: GridProcessor, grid: Tensor, precision: torch.dtype, threa
     try:
         with kept_signal_stack(), _without_telemetry(), torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch.export, about torch's own code
-            own = _ChannelsLast(copy.deepcopy(network).float().eval())
-            exported = torch.export.export(own, (grid.float().movedim(1, -1).contiguous(),))
-            model = openvino.convert_model(exported)
+            own, rows = _ChannelsLast(copy.deepcopy(network).float()), grid.float().movedim(1, -1).contiguous()
+            model = openvino.convert_model(torch.export.export(own, (rows,)))
+            model.reshape(list(rows.shape))
     except Exception as error:  # (neither documents its exceptions)
         raise ConfigError(
             f"OpenVINO cannot run {type(network).__name__}: use the runtime eager ({type(error).__name__}:"
