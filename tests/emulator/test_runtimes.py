@@ -91,7 +91,7 @@ def test_programs_used_last_are_kept():
 def graphed(monkeypatch):
     """Turns an emulator to CUDA graphs whose recorder only runs the function again, into the same memory."""
 
-    def record(function):
+    def record(function, _):
         result = function()
 
         def replay():

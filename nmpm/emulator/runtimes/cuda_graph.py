@@ -77,7 +77,7 @@ class Recorded:
 
     def __init__(self, predict: Callable[[Sequence[Tensor]], Bundle], inputs: Sequence[Tensor]) -> None:
         self._inputs = [tensor.clone(memory_format=torch.contiguous_format) for tensor in inputs]
-        self._replay, self._bundle = record(lambda: predict(self._inputs))
+        self._replay, self._bundle = record(lambda: predict(self._inputs), inputs[0].device)
 
     def __call__(self, inputs: Sequence[Tensor]) -> Bundle:
         """The bundle for inputs of these shapes, in fresh memory."""
@@ -88,19 +88,25 @@ class Recorded:
         return dataclasses.replace(made, position=made.position.clone(), velocity=made.velocity.clone())
 
 
-def record(function: Callable[[], T]) -> tuple[Callable[[], None], T]:
-    """Record the kernels that a function launches on the current GPU.
+def record(function: Callable[[], T], device: torch.device) -> tuple[Callable[[], None], T]:
+    """Record the kernels that a function launches on a GPU.
 
     Returns:
         Launches them again, on the same memory; the function's result, whose tensors each launch overwrites.
     """
-    aside = torch.cuda.Stream()
-    aside.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(aside), torch.no_grad():
-        for _ in range(_WARM_UP):
-            function()
-    torch.cuda.current_stream().wait_stream(aside)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph), torch.no_grad():
-        result = function()
-    return graph.replay, result
+    with torch.cuda.device(device), torch.no_grad():
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            for _ in range(_WARM_UP):
+                function()
+        torch.cuda.current_stream().wait_stream(aside)
+        with torch.cuda.graph(graph):
+            result = function()
+
+    def replay() -> None:
+        with torch.cuda.device(device):
+            graph.replay()
+
+    return replay, result
