@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from threading import Lock
-from typing import Generic, TypeVar
+from typing import Generic, Self, TypeVar
 
 from torch import Tensor, nn
 
@@ -17,22 +17,52 @@ _MOST = 8
 
 
 @dataclass(frozen=True)
+class _Held:
+    """A tensor of a module whose values a program holds.
+
+    Args:
+        store: Of the module, by name.
+        name, tensor: What it had then.
+        alias: Keeps the memory, so that no other tensor gets its address.
+        address, version: Of the tensor then; writing to it changes the version, replacing its memory the address.
+    """
+
+    store: Mapping[str, Tensor | None]
+    name: str
+    tensor: Tensor
+    alias: Tensor
+    address: int
+    version: int
+
+    @classmethod
+    def all_of(cls, network: nn.Module) -> list[Self]:
+        """Parameters and buffers of a module and its parts."""
+        stores = (store for module in network.modules() for store in (module._parameters, module._buffers))
+        return [
+            cls(store, name, tensor, tensor.detach(), tensor.data_ptr(), tensor._version)
+            for store in stores
+            for name, tensor in store.items()
+            if tensor is not None
+        ]
+
+
+@dataclass(frozen=True)
 class _Compiled(Generic[P]):
     """A program, with the module it was compiled from and the tensors whose values it holds."""
 
     network: nn.Module
-    modules: list[nn.Module]
-    weights: list[Tensor]
-    versions: list[int]
+    tensors: list[_Held]
     program: P
 
     def is_current(self) -> bool:
-        """Whether the module still has these tensors, unchanged."""
-        now = _tensors(self.modules)
-        same = len(now) == len(self.weights) and all(
-            one.data_ptr() == other.data_ptr() for one, other in zip(now, self.weights, strict=True)
-        )
-        return same and [tensor._version for tensor in now] == self.versions
+        """Whether the module still has these tensors, unchanged. In each call, so in few operations."""
+        for held in self.tensors:
+            tensor = held.tensor
+            if held.store.get(held.name) is not tensor or tensor._version != held.version:
+                return False
+            if tensor.data_ptr() != held.address:
+                return False
+        return True
 
 
 class Programs(Generic[P]):
@@ -54,19 +84,8 @@ class Programs(Generic[P]):
         with self._lock:
             found = self._known.get(key)
             if found is None or not found.is_current():
-                modules = list(network.modules())
-                # Aliases, so that the memory of tensors that the network gives up is not mistaken for theirs.
-                weights = [tensor.detach() for tensor in _tensors(modules)]
-                versions = [tensor._version for tensor in weights]
-                found = _Compiled(network, modules, weights, versions, compile_program())
-                self._known[key] = found
+                found = self._known[key] = _Compiled(network, _Held.all_of(network), compile_program())
             self._known.move_to_end(key)
             while len(self._known) > _MOST:
                 self._known.popitem(last=False)
             return found.program
-
-
-def _tensors(modules: list[nn.Module]) -> list[Tensor]:
-    """Parameters and buffers of modules, faster than `Module.parameters`, which walks the tree each time."""
-    both = (each for module in modules for each in (module._parameters, module._buffers))
-    return [tensor for named in both for tensor in named.values() if tensor is not None]
