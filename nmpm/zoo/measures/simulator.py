@@ -86,7 +86,7 @@ def measure_twin(model: Pretrained, data: Path | None = None) -> Twin:
     """
     preset, _ = simulation_of(model)
     other = twin_of(preset)
-    return Twin(other.substeps, preset.substeps, _compare(model, other, Preset.draw, data))
+    return Twin(other.substeps, preset.substeps, _compare(model, other, lambda own, seed: own.draw(seed), data))
 
 
 def measure_floor(model: Pretrained, data: Path | None = None) -> dict[str, float]:
