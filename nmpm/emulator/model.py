@@ -22,6 +22,7 @@ from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
+from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -82,6 +83,7 @@ class Emulator(nn.Module):
         super().__init__()
         self.recipe = recipe
         self._plan = make_plan(recipe)
+        self.runtime: Runtime = Eager()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -162,6 +164,19 @@ class Emulator(nn.Module):
         other.processor.to(precision)
         return other
 
+    def with_runtime(self, name: str) -> Emulator:
+        """This emulator with its network computed by a runtime of `RUNTIMES`; weights are shared, not copied.
+
+        Raises:
+            ConfigError: if there is no such runtime, or it cannot run here; one that lacks an operation of the network
+                says so in the first call.
+        """
+        other = copy.copy(self)
+        other.runtime = find_runtime(name)
+        if obstacle := other.runtime.obstacle(self):
+            raise ConfigError(obstacle)
+        return other
+
     def with_constraints(self, constraints: Constraints) -> Emulator:
         """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
         other = copy.copy(self)
@@ -182,11 +197,17 @@ class Emulator(nn.Module):
         return self.rebuilt(self.recipe.over(scene))
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
-        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
+        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes.
+
+        Weights that need no gradients need none in the copy.
+        """
         other = recipe.build().to(self.device)
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
+        for weight, own in zip(other.parameters(), self.parameters(), strict=True):
+            weight.requires_grad_(own.requires_grad)
+        other.runtime = copy.deepcopy(self.runtime)
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
@@ -218,7 +239,10 @@ class Emulator(nn.Module):
             particles: The state to start from.
             context: From `context` of the rollout's first state; of this state when left out.
         """
-        context = self.context(particles) if context is None else context
+        return self.runtime.bundle(self, particles, self.context(particles) if context is None else context)
+
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
+        """The bundle, operation by operation; only the network is left to the runtime."""
         device = particles.position.device.type
         steps = steps_for(self, self._plan, particles)
         with _full_precision(device):
@@ -226,7 +250,7 @@ class Emulator(nn.Module):
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
-        output = self.processor(normalised.to(self.network_precision))
+        output = self.runtime.fields(self.processor, normalised, self.network_precision)
         with _full_precision(device):
             own = particles
             start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
