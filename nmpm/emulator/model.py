@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +24,7 @@ from nmpm.emulator.departure import Departure
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.steps import steps_for
+from nmpm.emulator.windows import Coverage, UncoveredReadError, Windows, choose_windows
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -31,6 +33,8 @@ from nmpm.transfer import Transfer
 
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe
+
+T = TypeVar("T")
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
@@ -67,6 +71,9 @@ class Emulator(nn.Module):
 
     Args:
         recipe: Its form.
+
+    Attributes:
+        windows: When the network runs on windows around the particles, see `with_windows`; None for never.
     """
 
     input_mean: Tensor
@@ -82,6 +89,7 @@ class Emulator(nn.Module):
         super().__init__()
         self.recipe = recipe
         self._plan = make_plan(recipe)
+        self.windows: Windows | None = Windows()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -169,6 +177,12 @@ class Emulator(nn.Module):
         other._plan = make_plan(other.recipe)
         return other
 
+    def with_windows(self, windows: Windows | None) -> Emulator:
+        """This emulator with other limits for windows, or always on the whole grid; weights are shared, not copied."""
+        other = copy.copy(self)
+        other.windows = windows
+        return other
+
     def unconstrained(self) -> Emulator:
         """This emulator without its constraints but the scene's bounds: the network alone."""
         return self.with_constraints(Constraints(solids=False))
@@ -187,6 +201,7 @@ class Emulator(nn.Module):
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
+        other.windows = self.windows
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
@@ -226,11 +241,19 @@ class Emulator(nn.Module):
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
-        output = self.processor(normalised.to(self.network_precision))
+        inputs, own = normalised.to(self.network_precision), particles
+
+        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
+            output = self.processor(inputs) if coverage is None else coverage.predict(self.processor, inputs)
+            readable = None if coverage is None else coverage.readable
+            with _full_precision(device):
+                start = Departure(
+                    cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale, readable
+                )
+                return start, steps.path(start, context)
+
+        start, path = self._find_path(state, find_path)
         with _full_precision(device):
-            own = particles
-            start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
-            path = steps.path(start, context)
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
             if self.constraints.density_cap and not self.training:
@@ -238,6 +261,25 @@ class Emulator(nn.Module):
                 path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
             velocity = self.grid.to_displacement(step.to(precision))
             return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
+
+    def _find_path(self, state: Tensor, find: Callable[[Coverage | None], T]) -> T:
+        """What `find` gives with the network on windows that hold what particles read; else with the whole grid.
+
+        The windows are chosen by where particles are expected: a path that reads more than they hold is found again.
+        """
+        coverage = self._choose_windows(state)
+        if coverage is None:
+            return find(None)
+        try:
+            return find(coverage)
+        except UncoveredReadError:
+            return find(coverage.whole())
+
+    def _choose_windows(self, state: Tensor) -> Coverage | None:
+        if self.windows is None or self.training:
+            return None
+        materials = len(self.scene.materials)
+        return choose_windows(self.windows, self.processor, self.grid, self.transfer, state, materials, self.frames)
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
