@@ -34,12 +34,8 @@ class Axis:
 
     @property
     def block(self) -> int:
-        """Cells of a block; the last block of a wall axis may be shorter."""
-        least = _round_up(_BLOCK, self.alignment)
-        if not self.periodic:
-            return least
-        fitting = (size for size in range(least, self.cells, self.alignment) if self.cells % size == 0)
-        return next(fitting, self.cells)
+        """Cells of a block; the last block of an axis may be shorter."""
+        return _round_up(_BLOCK, self.alignment)
 
     @property
     def blocks(self) -> int:

@@ -13,13 +13,13 @@ from torch import Tensor
 from nmpm.emulator.windows.axis import Axis
 from nmpm.emulator.windows.cover import CALL_CELLS, Window, cover_scene
 from nmpm.emulator.windows.network import mark_readable, predict_windows
-from nmpm.emulator.windows.occupied import Blocks, readable_blocks
+from nmpm.emulator.windows.occupied import ALMOST_ALL, Blocks, readable_blocks
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors import GridProcessor
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
 
-_GAIN = 0.85  # of the whole grid's cells: with more in windows, planning them is not worth it
+_GAIN = 0.85  # of the whole grid's cells: with more in windows, gathering them is not worth while
 _TRANSFERS = (Nearest, Linear, Quadratic, Affine)  # exactly these interpolate from cells within `axis.READ`
 
 
@@ -108,7 +108,7 @@ def choose_windows(
     batch, most = len(state), options.most_cells or sys.maxsize
     bounded = batch * grid.size > most
     blocks = readable_blocks(state, materials, frames, axes)
-    if not blocks.any() or (blocks.mean() > _GAIN and not bounded):
+    if not blocks.any() or (blocks.mean() > ALMOST_ALL and not bounded):
         return None
     coverage = _cover(list(blocks), axes, most, state.device)
     cost = coverage.cells + CALL_CELLS * len(coverage.windows)

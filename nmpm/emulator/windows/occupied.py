@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any
 
@@ -16,8 +16,9 @@ from nmpm.emulator.windows.axis import Axis
 
 _SLACK = 3.0  # cells by which particles may leave straight paths at constant velocity,
 _FASTER = 1.25  # whose velocities are taken this much larger
-_FAST = 1e9  # stands for speeds that are not finite
-_POOLS = {1: functional.max_pool1d, 2: functional.max_pool2d, 3: functional.max_pool3d}
+
+ALMOST_ALL = 0.85
+"""Share of the blocks from which on it is not worth while to tell them from the others."""
 
 Blocks = NDArray[np.bool_]
 
@@ -34,44 +35,53 @@ def readable_blocks(state: Tensor, materials: int, frames: int, axes: Sequence[A
         axes: Of the grid.
     """
     dim = len(axes)
-    velocity, volume = state[:, : materials * dim], state[:, materials * dim : materials * (dim + 1)]
-    full = (volume != 0).any(1, keepdim=True).to(state.dtype)
-    values = torch.cat([full, velocity, -velocity], dim=1)
-    pooled = _POOLS[dim](values, [axis.block for axis in axes], ceil_mode=True)
-    numbers = pooled.nan_to_num(_FAST).clamp(-_FAST, _FAST).double().cpu().numpy()
-    fastest = numbers[:, 1:].reshape(len(state), 2, materials, dim, *numbers.shape[2:]).max(2)
-    scene, *places = np.nonzero(numbers[:, 0])
-    reach = np.moveaxis(fastest, (1, 2), (-2, -1))[(scene, *places)]  # (K, 2, D), upwards and downwards
-    extent = [3 * axis.blocks if axis.periodic else axis.blocks for axis in axes]
-    lows, highs = [], []
-    for index, axis in enumerate(axes):
-        steps = np.clip(frames * _FASTER * np.maximum(reach[..., index], 0) + _SLACK, 0, axis.cells)
-        low, high = _reached(axis, places[index], steps[:, 1], steps[:, 0])
-        lows.append(low)
-        highs.append(high)
-    boxes = _fill_boxes((len(state), *extent), scene, lows, highs)
+    velocities, volumes = slice(materials * dim), slice(materials * dim, materials * (dim + 1))
+    highest, lowest = (_extremes(state, axes, reduce) for reduce in (torch.amax, torch.amin))
+    scene, *places = np.nonzero((highest[..., volumes] != 0).any(-1))  # also where it is no number
+    if len(scene) > ALMOST_ALL * highest[..., 0].size:
+        return np.ones(highest.shape[:-1], np.bool_)
+    extremes = [highest[(scene, *places)][:, velocities], -lowest[(scene, *places)][:, velocities]]
+    found = np.stack(extremes, 1).reshape(-1, 2, materials, dim)
+    reach = np.nan_to_num(found, nan=np.inf).max(2)  # (K, 2, D), upwards and downwards
+    cells, block = np.array([axis.cells for axis in axes]), np.array([axis.block for axis in axes])
+    steps = np.ceil(frames * _FASTER * reach.clip(0, cells) + _SLACK).clip(max=cells)
+    low = np.stack(places, -1) * block
+    high = np.minimum(low + block, cells) - 1 + steps[:, 0]
+    copies = [_fit_boxes(low - steps[:, 1] + shift, high + shift, cells) for shift in _periods(axes)]
+    kept, lows, highs = (np.concatenate(values) for values in zip(*copies, strict=True))
+    count = [axis.blocks for axis in axes]
+    return _fill_boxes((len(state), *count), np.tile(scene, len(copies))[kept], lows // block, highs // block)
+
+
+def _extremes(state: Tensor, axes: Sequence[Axis], reduce: Callable[[Tensor, int], Tensor]) -> NDArray[np.float64]:
+    """(B, *blocks, C) extremes of a grid state (B, C, *S) in each block; axis by axis, the largest strides first."""
+    rows = state.movedim(1, -1)
     for index, axis in enumerate(axes, start=1):
-        if axis.periodic:  # from three periods to one
-            folded = boxes.reshape(*boxes.shape[:index], 3, axis.blocks, *boxes.shape[index + 1 :])
-            boxes = np.asarray(folded.any(index))
-    return boxes
+        missing = axis.blocks * axis.block - axis.cells
+        if missing:
+            rows = functional.pad(rows, [0, 0] * (rows.dim() - 1 - index) + [0, missing])
+        rows = reduce(rows.unflatten(index, (axis.blocks, axis.block)), index + 1)
+    return rows.double().cpu().numpy()
 
 
-def _reached(axis: Axis, block: Any, down: Any, up: Any) -> tuple[Any, Any]:
-    """First and last block, inclusive, that cells of a block reach; on periodic axes among three periods."""
-    low = np.floor((block * axis.block - down) / axis.block).astype(np.int64)
-    high = np.floor((block * axis.block + (axis.block - 1) + up) / axis.block).astype(np.int64)
-    if axis.periodic:
-        return low + axis.blocks, high + axis.blocks
-    return np.maximum(low, 0), np.minimum(high, axis.blocks - 1)
+def _periods(axes: Sequence[Axis]) -> list[Any]:
+    """Shifts (D,) by -1, 0 and 1 periods along each periodic axis, in cells."""
+    sides = [(-axis.cells, 0, axis.cells) if axis.periodic else (0,) for axis in axes]
+    return [np.array(shift) for shift in product(*sides)]
 
 
-def _fill_boxes(shape: tuple[int, ...], scene: Any, lows: list[Any], highs: list[Any]) -> Blocks:
-    """(B, *extent), True in the boxes from lows to highs, inclusive, by sums of differences at their corners."""
-    change = np.zeros((shape[0], *(cells + 1 for cells in shape[1:])), np.int32)
-    for corner in product((0, 1), repeat=len(lows)):
-        place = [high + 1 if upper else low for upper, low, high in zip(corner, lows, highs, strict=True)]
-        np.add.at(change, (scene, *place), -1 if sum(corner) % 2 else 1)
+def _fit_boxes(low: Any, high: Any, cells: Any) -> tuple[Any, Any, Any]:
+    """Which boxes of cells (K, D), the highest inclusive, are in the grid, and the parts (K', D) of them that are."""
+    kept = ((high >= 0) & (low < cells)).all(-1)
+    return kept, np.maximum(low[kept], 0).astype(np.int64), np.minimum(high[kept], cells - 1).astype(np.int64)
+
+
+def _fill_boxes(shape: tuple[int, ...], scene: Any, low: Any, high: Any) -> Blocks:
+    """(B, *blocks), True in boxes of blocks (K, D), the highest inclusive, by sums of differences at their corners."""
+    change = np.zeros((shape[0], *(count + 1 for count in shape[1:])), np.int32)
+    for corner in product((0, 1), repeat=low.shape[-1]):
+        place = np.where(corner, high + 1, low)
+        np.add.at(change, (scene, *place.T), -1 if sum(corner) % 2 else 1)
     for axis in range(1, change.ndim):
         change = change.cumsum(axis)
-    return (change > 0)[(slice(None), *(slice(0, -1),) * len(lows))]
+    return (change > 0)[(slice(None), *(slice(-1),) * low.shape[-1])]
