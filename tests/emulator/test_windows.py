@@ -15,7 +15,7 @@ from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe, rollout
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.windows import UncoveredReadError, Windows, choose_windows
-from nmpm.emulator.windows.axis import READ, Axis
+from nmpm.emulator.windows.axis import BLOCK, READ, Axis
 from nmpm.emulator.windows.cover import cover_scene
 from nmpm.emulator.windows.network import mark_readable, predict_windows
 from nmpm.emulator.windows.occupied import readable_blocks
@@ -49,8 +49,8 @@ def test_a_window_suits_the_network_and_holds_its_blocks(axis, odd, data):
     assert length == axis.cells or (length < axis.cells and (length - axis.cells) % axis.alignment == 0)
     assert axis.periodic or 0 <= start <= axis.cells - length
     low, count = axis.inner(start, length, axis.halo)
-    assert low <= first * axis.block
-    assert low + count >= min(last * axis.block, axis.cells)
+    assert low <= first * BLOCK
+    assert low + count >= min(last * BLOCK, axis.cells)
     pieces = axis.pieces(start, length)
     everywhere = np.arange(axis.cells)
     assert np.concatenate([everywhere[there] for there, _ in pieces]).tolist() == [
@@ -62,7 +62,7 @@ def test_a_window_suits_the_network_and_holds_its_blocks(axis, odd, data):
     shape=st.sampled_from([(150, 90), (77, 100), (40, 30, 20)]),
     share=st.sampled_from([0.0, 0.02, 0.2, 1.0]),
     periodic=st.booleans(),
-    most=st.sampled_from([1, 3000, 10**9]),
+    most=st.sampled_from([1, 4000, 10**9]),
     seed=st.integers(0, 100),
 )
 @settings(max_examples=12, deadline=None)
@@ -73,16 +73,16 @@ def test_windows_cover_all_marked_blocks(shape, share, periodic, most, seed):
     windows = cover_scene(blocks, axes, 0, most)
     readable = mark_readable(windows, axes, 1, torch.device("cpu"))[0]
     for place in np.argwhere(blocks):
-        cells = tuple(slice(i * axis.block, (i + 1) * axis.block) for i, axis in zip(place, axes, strict=True))
+        cells = tuple(slice(i * BLOCK, (i + 1) * BLOCK) for i, axis in zip(place, axes, strict=True))
         assert readable[cells].all()
-    least = np.prod([min(axis.cells, axis.block + 2 * axis.halo + 32) for axis in axes])
+    least = np.prod([min(axis.cells, BLOCK + 3 * axis.halo + 32) for axis in axes])
     assert all(window.cells <= max(most, least) for window in windows)
 
 
 def test_two_distant_drops_get_a_window_each():
     axes = [Axis(256, False, 9, 2)] * 2
-    blocks = np.zeros((32, 32), np.bool_)
-    blocks[2:4, 2:4] = blocks[28:30, 25:27] = True
+    blocks = np.zeros((64, 64), np.bool_)
+    blocks[4:8, 4:8] = blocks[56:60, 50:54] = True
     one, other = cover_scene(blocks, axes, 0, 10**9)
     assert one.cells == other.cells < 64**2
 
@@ -102,7 +102,7 @@ def test_windows_of_a_network_are_parts_of_its_output(processor, shape, periodic
     axes = [Axis(n, wraps, network.radius, network.alignment) for n, wraps in zip(shape, periodic, strict=True)]
     grid = torch.randn(2, 3, *shape)
     blocks = np.zeros((2, *(axis.blocks for axis in axes)), np.bool_)
-    blocks[0, 0, 0] = blocks[0, -1, -1] = blocks[1, 4, 3] = True
+    blocks[0, 0, 0] = blocks[0, -1, -1] = blocks[1, 9, 7] = True
     windows = [window for scene in range(2) for window in cover_scene(blocks[scene], axes, scene, 10**9)]
     assert sum(window.cells for window in windows) < 2 * grid[0, 0].numel()
     with torch.no_grad():
@@ -116,12 +116,12 @@ def test_windows_of_a_network_are_parts_of_its_output(processor, shape, periodic
 def test_blocks_follow_the_velocity():
     axes = [Axis(64, False, 3, 1), Axis(64, True, 3, 1)]
     state = torch.zeros(2, 3, 64, 64)
-    state[0, 2, 33, 1], state[0, 0, 33, 1], state[0, 1, 33, 1] = 0.5, 2.0, -1.0  # 20 cells up and 10 down, in 8 frames
+    state[0, :, 33, 1] = torch.tensor([2.0, -1.0, 0.5])  # 20 cells up and 10 down in 8 frames, 3 more each
     found = readable_blocks(state, 1, 8, axes)
     assert not found[1].any()
     rows, columns = np.nonzero(found[0])
-    assert set(rows) == {3, 4, 5, 6, 7}  # from 32 - 3 to 39 + 23
-    assert set(columns) == {6, 7, 0, 1}  # from 0 - 13 to 7 + 3
+    assert set(rows) == set(range(7, 15))  # cells from 32 - 3 to 35 + 23
+    assert set(columns) == {12, 13, 14, 15, 0, 1}  # from 0 - 13 to 3 + 3
 
 
 def emulator_of(scene, cells=96, processor=SMALL, scale=0.1, frames=4, **parts) -> Emulator:
@@ -168,10 +168,10 @@ SCENES = {
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_a_bundle_is_that_of_the_whole_grid(scene, path):
     constraints = Constraints(energy=True, rest_speed=0.01)
-    cells, processor = ([96, 92], SMALL) if scene.dim == 2 else (28, UNet(width=4, depth=0, perceptron=(5,)))
+    cells, processor = ([96, 92], SMALL) if scene.dim == 2 else (40, UNet(width=4, depth=0, perceptron=(5,)))
     emulator = emulator_of(scene, cells, processor, transfer=Linear(), constraints=constraints)
     chosen = 0
-    for seed, speed in enumerate((0.002, 0.02)):
+    for seed, speed in enumerate((0.0, 0.02)):
         particles = drops(scene, 100, 2, speed, seed, statics=5 * scene.obstacles)
         with using("native") if path == "tensors" else nullcontext():
             assert_same_rollout(emulator, particles, 4, 1e-3)
@@ -215,7 +215,7 @@ def test_reads_outside_are_found_by_frame_and_not_for_padding():
     check_reads(start, path.flip(1), ~mask, readable, grid)
 
 
-@pytest.mark.parametrize("cells", [64, 1])
+@pytest.mark.parametrize("cells", [64, 32])
 def test_memory_is_bounded_by_the_cells_computed_at_once(cells):
     scene = box()
     emulator, particles = emulator_of(scene, 128), cloud(scene, 3000, batch=2)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 Integers = NDArray[np.int64]
 
-_BLOCK = 8  # cells, at least: windows are planned in blocks of so many
+BLOCK = 4
+"""Cells of the blocks along each axis in which windows are planned; the last one of an axis may have fewer."""
 _STEP = 16  # cells, at least, by which the lengths of windows differ: fewer shapes make larger batches
 READ = 1
 """Cells from that of a position which transfers interpolate from, at most: linear and quadratic kernels."""
@@ -33,14 +34,9 @@ class Axis:
     alignment: int
 
     @property
-    def block(self) -> int:
-        """Cells of a block; the last block of an axis may be shorter."""
-        return _round_up(_BLOCK, self.alignment)
-
-    @property
     def blocks(self) -> int:
         """Number of blocks."""
-        return -(-self.cells // self.block)
+        return -(-self.cells // BLOCK)
 
     @property
     def halo(self) -> int:
@@ -53,8 +49,8 @@ class Axis:
         Starts are multiples of the alignment, lengths have the remainder of the whole axis, which the network pads as
         it pads that. On a periodic axis a start may be negative. Arguments are integers or arrays of them.
         """
-        low = np.asarray(first) * self.block - self.halo
-        high = np.minimum(np.asarray(last) * self.block, self.cells) + self.halo
+        low = np.asarray(first) * BLOCK - self.halo
+        high = np.minimum(np.asarray(last) * BLOCK, self.cells) + self.halo
         low = low // self.alignment * self.alignment
         rest, step = self.cells % self.alignment, _round_up(_STEP, self.alignment)
         if not self.periodic:

@@ -13,13 +13,12 @@ from torch import Tensor
 from nmpm.emulator.windows.axis import Axis
 from nmpm.emulator.windows.cover import CALL_CELLS, Window, cover_scene
 from nmpm.emulator.windows.network import mark_readable, predict_windows
-from nmpm.emulator.windows.occupied import ALMOST_ALL, Blocks, readable_blocks
+from nmpm.emulator.windows.occupied import WORTHWHILE, Blocks, readable_blocks
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors import GridProcessor
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
 
-_GAIN = 0.85  # of the whole grid's cells: with more in windows, gathering them is not worth while
 _TRANSFERS = (Nearest, Linear, Quadratic, Affine)  # exactly these interpolate from cells within `axis.READ`
 
 
@@ -29,8 +28,8 @@ class Windows:
 
     Args:
         least_cells: Grids of fewer cells are computed whole.
-        most_cells: Cells that the network computes at once at most, to bound its memory; a window of a single block and
-            its halo is the least. None for no limit.
+        most_cells: Cells that the network computes at once at most, to bound its memory, unless windows would become
+            narrower than three times its radius. None for no limit.
         device_types: Where: elsewhere reading back which cells are occupied would halt the device.
 
     Raises:
@@ -108,11 +107,11 @@ def choose_windows(
     batch, most = len(state), options.most_cells or sys.maxsize
     bounded = batch * grid.size > most
     blocks = readable_blocks(state, materials, frames, axes)
-    if not blocks.any() or (blocks.mean() > ALMOST_ALL and not bounded):
+    if not blocks.any() or (blocks.all() and not bounded):
         return None
     coverage = _cover(list(blocks), axes, most, state.device)
     cost = coverage.cells + CALL_CELLS * len(coverage.windows)
-    return coverage if bounded or cost <= _GAIN * batch * grid.size else None
+    return coverage if bounded or cost <= WORTHWHILE * batch * grid.size else None
 
 
 def _cover(blocks: Sequence[Blocks], axes: tuple[Axis, ...], most: int, device: torch.device) -> Coverage:

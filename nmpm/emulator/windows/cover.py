@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm.emulator.windows.axis import Axis
+from nmpm.emulator.windows.axis import BLOCK, Axis
 from nmpm.emulator.windows.occupied import Blocks
 
 CALL_CELLS = 2000
@@ -52,7 +52,7 @@ def cover_scene(blocks: Blocks, axes: Sequence[Axis], scene: int, most: int) -> 
         blocks: True where particles may be.
         axes: Of the grid.
         scene: Its index in the batch.
-        most: Cells of a window at most, as far as blocks and halos allow.
+        most: Cells of a window at most; but a part narrower than the halo is not cut for that, as it would cost more.
     """
     return [_window(box, axes, scene) for box in _boxes(blocks, tuple(0 for _ in axes), axes, most)]
 
@@ -68,9 +68,12 @@ def _boxes(blocks: Blocks, origin: tuple[int, ...], axes: Sequence[Axis], most: 
     cost = math.prod(int(axis.span(*ends)[1]) for axis, ends in zip(axes, box, strict=True))
     cuts = [cut for axis in range(tight.ndim) if (cut := _cheapest_cut(tight, first, axes, axis))]
     best = min(cuts, key=lambda cut: cut.cost, default=None)
-    if best is None or (best.cost + CALL_CELLS >= cost and cost <= most):
-        yield box
-        return
+    if best is None or best.cost + CALL_CELLS >= cost:
+        longest = int(np.argmax(tight.shape))
+        if cost <= most or tight.shape[longest] * BLOCK <= max(axes[longest].halo, BLOCK):
+            yield box
+            return
+        best = _Cut(cost, longest, tight.shape[longest] // 2)
     below, above = np.split(tight, [best.place], axis=best.axis)
     yield from _boxes(below, first, axes, most)
     shifted = tuple(place + best.place * (axis == best.axis) for axis, place in enumerate(first))
