@@ -178,7 +178,7 @@ class Emulator(nn.Module):
         return other
 
     def with_windows(self, windows: Windows | None) -> Emulator:
-        """This emulator with other limits for windows, or always on the whole grid; weights are shared, not copied."""
+        """This emulator with other limits for windows; None: always the whole grid. Weights are shared, not copied."""
         other = copy.copy(self)
         other.windows = windows
         return other
