@@ -86,13 +86,10 @@ def measure(emulator: Emulator, state: Particles, rounds: int) -> dict[str, Any]
         chosen[:] = [coverage]
         return network(inputs) if coverage is None else coverage.predict(network, inputs)
 
-    actions = {
-        "network_whole": lambda: network(inputs),
-        "network_windows": predict,
-        "call_whole": lambda: whole(state, context),
-        "call_windows": lambda: emulator(state, context),
-    }
-    seconds = time_alternating(actions, rounds, clock_for(torch.device("cpu")))
+    networks = {"network_whole": lambda: network(inputs), "network_windows": predict}
+    calls = {"call_whole": lambda: whole(state, context), "call_windows": lambda: emulator(state, context)}
+    clock = clock_for(torch.device("cpu"))
+    seconds = time_alternating(networks, rounds, clock) | time_alternating(calls, rounds, clock)
     cells = 1.0 if chosen[0] is None else chosen[0].cells / emulator.grid.size
     return {"cells": cells, **{name: Spread.of(values) for name, values in seconds.items()}}
 
