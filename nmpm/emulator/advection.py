@@ -27,6 +27,7 @@ from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.crowding import Crowding
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.support import Support
+from nmpm.emulator.windows.reads import check_reads
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
@@ -102,9 +103,12 @@ class Advection:
 
         Raises:
             DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
+            UncoveredReadError: if a particle reads the output where it must not.
         """
         flight = self._take_off(start)
         path = self._free(flight) if budget is None else self._within_energy(flight, budget)
+        if start.readable is not None:
+            check_reads(start.cells, path, start.mask, start.readable, self.grid)
         path = self._clear_of_obstacles(flight, path, solid)
         if self.constraints.rest_speed:
             path = self._bring_to_rest(start, path, solid)

@@ -21,6 +21,7 @@ class Departure:
         state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
         output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
         scale: (m, C, 1, ...), by which it is multiplied.
+        readable: (B, *S) bool, the cells that particles may be in when they read `output`; None for all cells.
     """
 
     cells: Tensor
@@ -31,6 +32,7 @@ class Departure:
     state: Tensor
     output: Tensor
     scale: Tensor
+    readable: Tensor | None = None
 
     @property
     def fields(self) -> Tensor:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +25,7 @@ from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
+from nmpm.emulator.windows import Coverage, UncoveredReadError, Windows, choose_windows
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -32,6 +34,8 @@ from nmpm.transfer import Transfer
 
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe
+
+T = TypeVar("T")
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
@@ -68,6 +72,9 @@ class Emulator(nn.Module):
 
     Args:
         recipe: Its form.
+
+    Attributes:
+        windows: When the network runs on windows around the particles, see `with_windows`; None for never.
     """
 
     input_mean: Tensor
@@ -84,6 +91,7 @@ class Emulator(nn.Module):
         self.recipe = recipe
         self._plan = make_plan(recipe)
         self.runtime: Runtime = Eager()
+        self.windows: Windows | None = Windows()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -184,6 +192,12 @@ class Emulator(nn.Module):
         other._plan = make_plan(other.recipe)
         return other
 
+    def with_windows(self, windows: Windows | None) -> Emulator:
+        """This emulator with other limits for windows; None: always the whole grid. Weights are shared, not copied."""
+        other = copy.copy(self)
+        other.windows = windows
+        return other
+
     def unconstrained(self) -> Emulator:
         """This emulator without its constraints but the scene's bounds: the network alone."""
         return self.with_constraints(Constraints(solids=False))
@@ -207,7 +221,7 @@ class Emulator(nn.Module):
         other.load_state_dict(self.state_dict())
         for weight, own in zip(other.parameters(), self.parameters(), strict=True):
             weight.requires_grad_(own.requires_grad)
-        other.runtime = copy.deepcopy(self.runtime)
+        other.runtime, other.windows = copy.deepcopy(self.runtime), self.windows
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
@@ -250,11 +264,19 @@ class Emulator(nn.Module):
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
-        output = self.runtime.fields(self.processor, normalised, self.network_precision)
+        own = particles
+
+        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
+            output = self._fields(normalised, coverage)
+            readable = None if coverage is None else coverage.readable
+            with _full_precision(device):
+                start = Departure(
+                    cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale, readable
+                )
+                return start, steps.path(start, context)
+
+        start, path = self._find_path(state, find_path)
         with _full_precision(device):
-            own = particles
-            start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
-            path = steps.path(start, context)
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
             if self.constraints.density_cap and not self.training:
@@ -262,6 +284,31 @@ class Emulator(nn.Module):
                 path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
             velocity = self.grid.to_displacement(step.to(precision))
             return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
+
+    def _find_path(self, state: Tensor, find: Callable[[Coverage | None], T]) -> T:
+        """What `find` gives with the network on windows that hold what particles read; else with the whole grid.
+
+        The windows are chosen by where particles are expected: a path that reads more than they hold is found again.
+        """
+        coverage = self._choose_windows(state)
+        if coverage is None:
+            return find(None)
+        try:
+            return find(coverage)
+        except UncoveredReadError:
+            return find(coverage.whole())
+
+    def _fields(self, grid: Tensor, coverage: Coverage | None) -> Tensor:
+        """The network's output (B, m, C_out, *S) for a normalised grid state, where a coverage holds it."""
+        if coverage is None:
+            return self.runtime.fields(self.processor, grid, self.network_precision)
+        return coverage.predict(self.processor, grid.to(self.network_precision))
+
+    def _choose_windows(self, state: Tensor) -> Coverage | None:
+        if self.windows is None or self.training or not self.runtime.any_shape:
+            return None
+        materials = len(self.scene.materials)
+        return choose_windows(self.windows, self.processor, self.grid, self.transfer, state, materials, self.frames)
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, differentiable_rollout, rollout
+from nmpm.emulator import Emulator, Windows, differentiable_rollout, rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -158,6 +158,10 @@ class Pretrained:
             else:
                 break
         return count
+
+    def with_windows(self, windows: Windows | None) -> Pretrained:
+        """The same model with other limits for windows around the particles; None: always the whole grid."""
+        return dataclasses.replace(self, emulator=self.emulator.with_windows(windows))
 
     def to(self, device: torch.device | str) -> Pretrained:
         """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest.
