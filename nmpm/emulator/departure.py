@@ -38,3 +38,9 @@ class Departure:
     def fields(self) -> Tensor:
         """(B, m, C, *S), the predicted velocities, of the scale's precision."""
         return self.output.to(torch.promote_types(self.scale.dtype, torch.float32)) * self.scale
+
+    @property
+    def filled(self) -> Tensor:
+        """(B, 1, *S), the volume fraction of all materials that the network has seen."""
+        materials = self.output.shape[2] // self.cells.shape[-1]
+        return self.state[:, self.output.shape[2] : self.output.shape[2] + materials].sum(1, keepdim=True)

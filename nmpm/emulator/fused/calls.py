@@ -81,9 +81,10 @@ def predict_path(
             check_scene_reads(start, plan, _array(readable[scene]).reshape(-1), path[scene], threads)
         if plan.obstacles:
             fill_share(solids[scene], rooms, share)
+        if plan.obstacles and plan.solids:
             clear_of_obstacles(start, plan, share, path[scene], threads)
         if plan.rest_speed:
-            rest_scene(start, plan, path[scene], threads)
+            rest_scene(start, plan, share, path[scene], threads)
     return torch.from_numpy(path)
 
 

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import torch
 
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
 from nmpm.emulator.fused import contact
-from nmpm.emulator.fused.flight import fly, leaves, rest, weigh
+from nmpm.emulator.fused.flight import fly, leaves, weigh
 from nmpm.emulator.fused.limit import propose, shorten
 from nmpm.emulator.fused.plan import Array, Plan
+from nmpm.emulator.fused.support import rest, support
+from nmpm.emulator.support import drops
 from nmpm.emulator.windows.reads import UncoveredReadError
 
 _CHUNK = 2**14  # particles that a thread treats at once; sums do not depend on the number of threads
@@ -118,10 +121,23 @@ def check_scene_reads(start: SceneArrays, plan: Plan, readable: Array, path: Arr
         raise UncoveredReadError
 
 
-def rest_scene(start: SceneArrays, plan: Plan, path: Array, threads: int) -> None:
-    """Leave resting particles of a scene where they started."""
+def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, threads: int) -> None:
+    """Leave resting particles of a scene where they started if something holds them up; let the others fall.
+
+    Args:
+        start: Where the bundle starts.
+        plan: Of the emulator.
+        share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
+        path: (m, N, D), is changed.
+        threads: How many work.
+    """
+    held, grid = np.empty(len(start.state), np.bool_), (plan.shape, plan.wraps)
+    support(start.state, plan.volume_channels, share, start.gravity, grid, plan.floor_rows, held)
+    fall = drops(torch.from_numpy(start.gravity).view(1, 1, -1), len(path))[0, :, 0].numpy()
     speed = np.float32(plan.rest_speed)
-    still = partial(rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE))
+    still = partial(
+        rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE), share, grid, held, fall, plan.limits
+    )  # fmt: skip
     map_ranges(still, split(len(start.cells), _CHUNK), threads)
 
 
