@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -23,8 +22,9 @@ from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
+from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
-from nmpm.emulator.windows import Coverage, UncoveredReadError, Windows, choose_windows
+from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -33,8 +33,6 @@ from nmpm.transfer import Transfer
 
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe
-
-T = TypeVar("T")
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
@@ -89,6 +87,7 @@ class Emulator(nn.Module):
         super().__init__()
         self.recipe = recipe
         self._plan = make_plan(recipe)
+        self.runtime: Runtime = Eager()
         self.windows: Windows | None = Windows()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
@@ -170,6 +169,19 @@ class Emulator(nn.Module):
         other.processor.to(precision)
         return other
 
+    def with_runtime(self, name: str) -> Emulator:
+        """This emulator with its network computed by a runtime of `RUNTIMES`; weights are shared, not copied.
+
+        Raises:
+            ConfigError: if there is no such runtime, or it cannot run here; one that lacks an operation of the network
+                says so in the first call.
+        """
+        other = copy.copy(self)
+        other.runtime = find_runtime(name)
+        if obstacle := other.runtime.obstacle(self):
+            raise ConfigError(obstacle)
+        return other
+
     def with_constraints(self, constraints: Constraints) -> Emulator:
         """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
         other = copy.copy(self)
@@ -196,11 +208,17 @@ class Emulator(nn.Module):
         return self.rebuilt(self.recipe.over(scene))
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
-        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
+        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes.
+
+        Weights that need no gradients need none in the copy.
+        """
         other = recipe.build().to(self.device)
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
+        for weight, own in zip(other.parameters(), self.parameters(), strict=True):
+            weight.requires_grad_(own.requires_grad)
+        other.runtime = copy.deepcopy(self.runtime)
         other.windows = self.windows
         return other.train(self.training)
 
@@ -233,7 +251,10 @@ class Emulator(nn.Module):
             particles: The state to start from.
             context: From `context` of the rollout's first state; of this state when left out.
         """
-        context = self.context(particles) if context is None else context
+        return self.runtime.bundle(self, particles, self.context(particles) if context is None else context)
+
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
+        """The bundle, operation by operation; only the network is left to the runtime."""
         device = particles.position.device.type
         steps = steps_for(self, self._plan, particles)
         with _full_precision(device):
@@ -241,10 +262,13 @@ class Emulator(nn.Module):
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
-        inputs, own = normalised.to(self.network_precision), particles
+        own = particles
 
         def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
-            output = self.processor(inputs) if coverage is None else coverage.predict(self.processor, inputs)
+            if coverage is None:
+                output = self.runtime.fields(self.processor, normalised, self.network_precision)
+            else:
+                output = coverage.predict(self.processor, normalised.to(self.network_precision))
             readable = None if coverage is None else coverage.readable
             with _full_precision(device):
                 start = Departure(
@@ -252,7 +276,9 @@ class Emulator(nn.Module):
                 )
                 return start, steps.path(start, context)
 
-        start, path = self._find_path(state, find_path)
+        fixed = self.training or self.runtime.fixed_shapes
+        windows = None if fixed else choose_windows(self.windows, self.processor, self.recipe, state)
+        start, path = find_in_windows(windows, find_path)
         with _full_precision(device):
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
@@ -261,25 +287,6 @@ class Emulator(nn.Module):
                 path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
             velocity = self.grid.to_displacement(step.to(precision))
             return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
-
-    def _find_path(self, state: Tensor, find: Callable[[Coverage | None], T]) -> T:
-        """What `find` gives with the network on windows that hold what particles read; else with the whole grid.
-
-        The windows are chosen by where particles are expected: a path that reads more than they hold is found again.
-        """
-        coverage = self._choose_windows(state)
-        if coverage is None:
-            return find(None)
-        try:
-            return find(coverage)
-        except UncoveredReadError:
-            return find(coverage.whole())
-
-    def _choose_windows(self, state: Tensor) -> Coverage | None:
-        if self.windows is None or self.training:
-            return None
-        materials = len(self.scene.materials)
-        return choose_windows(self.windows, self.processor, self.grid, self.transfer, state, materials, self.frames)
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
