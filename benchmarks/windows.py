@@ -80,9 +80,7 @@ def measure(emulator: Emulator, state: Particles, rounds: int) -> dict[str, Any]
     chosen = []
 
     def predict() -> object:
-        coverage = choose_windows(
-            emulator.windows, network, emulator.grid, emulator.transfer, grid_state, 1, emulator.frames
-        )
+        coverage = choose_windows(emulator.windows, network, emulator.recipe, grid_state)
         chosen[:] = [coverage]
         return network(inputs) if coverage is None else coverage.predict(network, inputs)
 

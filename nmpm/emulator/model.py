@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +24,7 @@ from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
-from nmpm.emulator.windows import Coverage, UncoveredReadError, Windows, choose_windows
+from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -34,8 +33,6 @@ from nmpm.transfer import Transfer
 
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe
-
-T = TypeVar("T")
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
@@ -221,7 +218,8 @@ class Emulator(nn.Module):
         other.load_state_dict(self.state_dict())
         for weight, own in zip(other.parameters(), self.parameters(), strict=True):
             weight.requires_grad_(own.requires_grad)
-        other.runtime, other.windows = copy.deepcopy(self.runtime), self.windows
+        other.runtime = copy.deepcopy(self.runtime)
+        other.windows = self.windows
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
@@ -267,7 +265,10 @@ class Emulator(nn.Module):
         own = particles
 
         def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
-            output = self._fields(normalised, coverage)
+            if coverage is None:
+                output = self.runtime.fields(self.processor, normalised, self.network_precision)
+            else:
+                output = coverage.predict(self.processor, normalised.to(self.network_precision))
             readable = None if coverage is None else coverage.readable
             with _full_precision(device):
                 start = Departure(
@@ -275,7 +276,9 @@ class Emulator(nn.Module):
                 )
                 return start, steps.path(start, context)
 
-        start, path = self._find_path(state, find_path)
+        fixed = self.training or self.runtime.fixed_shapes
+        windows = None if fixed else choose_windows(self.windows, self.processor, self.recipe, state)
+        start, path = find_in_windows(windows, find_path)
         with _full_precision(device):
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
@@ -284,31 +287,6 @@ class Emulator(nn.Module):
                 path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
             velocity = self.grid.to_displacement(step.to(precision))
             return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
-
-    def _find_path(self, state: Tensor, find: Callable[[Coverage | None], T]) -> T:
-        """What `find` gives with the network on windows that hold what particles read; else with the whole grid.
-
-        The windows are chosen by where particles are expected: a path that reads more than they hold is found again.
-        """
-        coverage = self._choose_windows(state)
-        if coverage is None:
-            return find(None)
-        try:
-            return find(coverage)
-        except UncoveredReadError:
-            return find(coverage.whole())
-
-    def _fields(self, grid: Tensor, coverage: Coverage | None) -> Tensor:
-        """The network's output (B, m, C_out, *S) for a normalised grid state, where a coverage holds it."""
-        if coverage is None:
-            return self.runtime.fields(self.processor, grid, self.network_precision)
-        return coverage.predict(self.processor, grid.to(self.network_precision))
-
-    def _choose_windows(self, state: Tensor) -> Coverage | None:
-        if self.windows is None or self.training or not self.runtime.any_shape:
-            return None
-        materials = len(self.scene.materials)
-        return choose_windows(self.windows, self.processor, self.grid, self.transfer, state, materials, self.frames)
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

@@ -128,6 +128,10 @@ class Pretrained:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
 
+    def with_windows(self, windows: Windows | None) -> Pretrained:
+        """The same model with other limits for windows around the particles; None: always the whole grid."""
+        return dataclasses.replace(self, emulator=self.emulator.with_windows(windows))
+
     def optimized(self, runtime: str = AUTO, precision: str | None = None) -> Pretrained:
         """The same model for inference alone, its network computed by a faster runtime than torch.
 
@@ -158,10 +162,6 @@ class Pretrained:
             else:
                 break
         return count
-
-    def with_windows(self, windows: Windows | None) -> Pretrained:
-        """The same model with other limits for windows around the particles; None: always the whole grid."""
-        return dataclasses.replace(self, emulator=self.emulator.with_windows(windows))
 
     def to(self, device: torch.device | str) -> Pretrained:
         """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest.

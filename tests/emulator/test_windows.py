@@ -14,6 +14,7 @@ from torch import nn
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe, rollout
 from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.runtimes import Eager
 from nmpm.emulator.windows import UncoveredReadError, Windows, choose_windows
 from nmpm.emulator.windows.axis import BLOCK, READ, Axis
 from nmpm.emulator.windows.cover import cover_scene
@@ -257,6 +258,12 @@ def test_the_whole_grid_is_computed_where_windows_do_not_suit():
     full = cloud(scene, 9000)
     full.position.copy_(0.1 + 0.8 * torch.rand(1, 9000, 2))
     assert coverage_of(emulator_of(scene), full) is None
+
+
+def test_runtimes_that_compile_each_shape_are_given_the_whole_grid():
+    emulator, particles = emulator_of(box()), drops(box())
+    emulator.runtime = type("Compiled", (Eager,), {"fixed_shapes": True})()
+    assert coverage_of(emulator, particles) is None
 
 
 def test_gradients_are_those_of_the_whole_grid():

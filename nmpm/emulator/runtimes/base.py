@@ -24,8 +24,8 @@ class Runtime(ABC):
     """
 
     name: ClassVar[str]
-    any_shape: ClassVar[bool] = False
-    """Whether grids of a new shape cost no more than others, as they would where each shape is compiled."""
+    fixed_shapes: ClassVar[bool] = True
+    """Whether another shape of the grid costs a compilation, so that `nmpm.emulator.windows` would not pay."""
 
     def obstacle(self, emulator: Emulator) -> str:  # noqa: ARG002 (none unless overridden)
         """Why this runtime cannot run the emulator here, with the mend; empty if nothing is known to prevent it."""

@@ -15,7 +15,7 @@ class Eager(Runtime):
     """Calls the network."""
 
     name: ClassVar[str] = "eager"
-    any_shape: ClassVar[bool] = True
+    fixed_shapes: ClassVar[bool] = False
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         out: Tensor = network(grid.to(precision))

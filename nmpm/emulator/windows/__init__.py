@@ -11,7 +11,7 @@ read, wider by the radius on each side that is not the domain's, therefore holds
     choice.py     `Windows`, the options, and the decision between windows and the whole grid
 """
 
-from nmpm.emulator.windows.choice import Coverage, Windows, choose_windows
+from nmpm.emulator.windows.choice import Coverage, Windows, choose_windows, find_in_windows
 from nmpm.emulator.windows.reads import UncoveredReadError
 
-__all__ = ["Coverage", "UncoveredReadError", "Windows", "choose_windows"]
+__all__ = ["Coverage", "UncoveredReadError", "Windows", "choose_windows", "find_in_windows"]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -14,10 +15,16 @@ from nmpm.emulator.windows.axis import Axis
 from nmpm.emulator.windows.cover import CALL_CELLS, Window, cover_scene
 from nmpm.emulator.windows.network import mark_readable, predict_windows
 from nmpm.emulator.windows.occupied import WORTHWHILE, Blocks, readable_blocks
+from nmpm.emulator.windows.reads import UncoveredReadError
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors import GridProcessor
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
+
+if TYPE_CHECKING:
+    from nmpm.emulator.recipe import EmulatorRecipe
+
+T = TypeVar("T")
 
 _TRANSFERS = (Nearest, Linear, Quadratic, Affine)  # exactly these interpolate from cells within `axis.READ`
 
@@ -81,8 +88,23 @@ class Coverage:
         return predict_windows(network, grid, self.windows, self.axes, self.most)
 
 
+def find_in_windows(coverage: Coverage | None, find: Callable[[Coverage | None], T]) -> T:
+    """What `find` gives with the network on windows; on the whole grid without them, or if more is read than they hold.
+
+    Args:
+        coverage: Chosen by where particles are expected.
+        find: Raises UncoveredReadError if they read anything else.
+    """
+    if coverage is None:
+        return find(None)
+    try:
+        return find(coverage)
+    except UncoveredReadError:
+        return find(coverage.whole())
+
+
 def choose_windows(
-    options: Windows, network: GridProcessor, grid: Grid, transfer: Transfer, state: Tensor, materials: int, frames: int
+    options: Windows | None, network: GridProcessor, recipe: EmulatorRecipe, state: Tensor
 ) -> Coverage | None:
     """The windows for a bundle; None where the whole grid is cheaper, or must be computed.
 
@@ -90,15 +112,13 @@ def choose_windows(
     without a radius, and transfers of other packages, whose kernels may be wider.
 
     Args:
-        options: The limits.
+        options: The limits; None for never.
         network: What is to run.
-        grid: The grid.
-        transfer: What reads the output.
+        recipe: Of the emulator that it is part of.
         state: (B, C_in, *S) in grid units.
-        materials: M.
-        frames: m.
     """
-    if not _is_possible(options, network, grid, transfer, state):
+    grid = recipe.grid
+    if options is None or not _is_possible(options, network, grid, recipe.transfer, state):
         return None
     radius = network.radius or 0
     axes = tuple(
@@ -106,7 +126,7 @@ def choose_windows(
     )
     batch, most = len(state), options.most_cells or sys.maxsize
     bounded = batch * grid.size > most
-    blocks = readable_blocks(state, materials, frames, axes)
+    blocks = readable_blocks(state, len(recipe.scene.materials), recipe.frames, axes)
     if not blocks.any() or (blocks.all() and not bounded):
         return None
     coverage = _cover(list(blocks), axes, most, state.device)
