@@ -220,7 +220,7 @@ class Emulator(nn.Module):
         """
         context = self.context(particles) if context is None else context
         device = particles.position.device.type
-        steps = steps_for(self, self._plan, particles)
+        steps = steps_for(self, self._plan, particles, context.solid)
         with _full_precision(device):
             cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
             normalised = self.normalise(state)
