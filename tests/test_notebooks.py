@@ -3,9 +3,12 @@
 import ast
 import base64
 import json
+import logging
 import re
+import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -16,9 +19,23 @@ from PIL import Image
 from nmpm.zoo import Zoo
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
-PUBLIC = ("nmpm", "nmpm.obstacles", "nmpm.processors", "nmpm.sim", "nmpm.testing", "nmpm.viz", "nmpm.zoo")
+PUBLIC = (
+    "nmpm",
+    "nmpm.cli",
+    "nmpm.obstacles",
+    "nmpm.optimizers",
+    "nmpm.processors",
+    "nmpm.sim",
+    "nmpm.testing",
+    "nmpm.viz",
+    "nmpm.zoo",
+)
 BUDGETS: dict[str, dict[str, object]] = {
+    "inverse_design": {"STEPS": 1, "BATCH": 1, "LAST": 8, "MOMENT": 8, "FRAMES": 16},
+    "new_processor": {"STEPS": 2, "COUNTS": {"train": 1, "valid": 1, "test": 1}, "FRAMES": 40},
     "quickstart": {"FRAMES": 16},
+    "speed_accuracy": {"TABLES": str(NOTEBOOKS.parent / "benchmarks" / "trade"), "FRAMES": 4, "ROUNDS": 1},
+    "your_own_data": {"RUNS": {"train": 2, "valid": 1, "test": 1}, "FRAMES": 24, "PARTICLES": 60, "STEPS": 2},
 }
 """Constants of the notebooks, by what they are here; only how much is computed changes."""
 if not NOTEBOOKS.is_dir():
@@ -55,20 +72,23 @@ def run(tmp_path, monkeypatch):
     """A function that runs a notebook in an empty folder, with its own cache and no network, and returns its names."""
 
     def run(name: str) -> dict[str, Any]:
-        names: dict[str, Any] = {}
+        module = ModuleType(f"notebook_{name}")  # where its classes are looked up
+        monkeypatch.setitem(sys.modules, module.__name__, module)
         code = shrink("\n".join(read_code(NOTEBOOKS / f"{name}.ipynb")), BUDGETS[name])
-        exec(compile(code, name, "exec"), names)
-        return names
+        exec(compile(code, name, "exec"), vars(module))
+        return vars(module)
 
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
-    backend = plt.get_backend()
+    logger, backend = logging.getLogger("lightning.pytorch"), plt.get_backend()
+    level = logger.level
     plt.switch_backend("Agg")
     yield run
     plt.close("all")
     plt.switch_backend(backend)
+    logger.setLevel(level)
 
 
 @every_notebook
@@ -103,6 +123,36 @@ def test_quickstart_predicts_a_scene_and_leaves_pictures(run):
     assert names["predicted"].shape == (16, len(names["start"].position), 2)
     assert 0 < names["error"][-1] < names["still"][-1]
     assert Image.open("quickstart.png").width > 300
+
+
+def test_inverse_design_turns_the_ramps_within_their_limits(run):
+    names = run("inverse_design")
+    assert all(abs(angle) <= names["LIMIT"] for angle in (*names["optima"], *names["found"]))
+    assert all(optimum != pair.angle for optimum, pair in zip(names["optima"], names["PAIRS"], strict=True))
+    assert all(0 < value < 1 for both in names["table"].values() for value in both)
+    assert Image.open("inverse_design.gif").n_frames > 1
+
+
+def test_a_new_processor_passes_the_contract_and_learns(run):
+    trained = run("new_processor")["trained"]
+    assert {name: steps for name, (_, steps, _) in trained.items()} == {"dilated": 2, "U-Net": 2}
+    assert all(0 < errors["test/mse"] < 1 for *_, errors in trained.values())
+
+
+def test_speed_and_accuracy_read_the_committed_tables(run):
+    names = run("speed_accuracy")
+    for lines in names["tables"].values():
+        assert {line["kind"] for line in lines} >= {"model", "simulator", "trivial"}
+        assert names["best"](lines, "simulator", 100.0)["mse"] == 0  # the reference itself
+        assert names["best"](lines, "model", 0.0) is None
+    assert all(len(taken) == 1 for taken in names["seconds"].values())
+
+
+def test_your_own_data_become_a_model_that_anybody_can_load(run):
+    names = run("your_own_data")
+    assert names["predicted"].shape == (22, 60, 2)
+    assert names["theirs"].card["name"] == "dust/mine"
+    assert Image.open("dust.png").width > 300
 
 
 @pytest.mark.slow
