@@ -46,7 +46,7 @@ from nmpm.emulator import Emulator, rollout
 from nmpm.evaluation.bootstrap import resampled_means
 from nmpm.evaluation.stress.settling import compare_shapes
 from nmpm.evaluation.stress.subject import Subject, simulate_window
-from nmpm.metrics import MSE, earth_mover
+from nmpm.metrics import MSE, earth_mover_of_materials
 from nmpm.particles import Window
 from nmpm.sim import load_preset
 from nmpm.training.checkpoints import load_module
@@ -158,13 +158,9 @@ def late_distance(window: Window, predicted: Tensor, row: int, chosen: Namespace
     length = predicted.shape[1]
     frames = range(EMD_EVERY - 1, length, EMD_EVERY)
     late = [frame for frame in frames if frame >= 2 * length / 3]
-    kinds = window.material[row][window.mask[row]].unique()
-    means = []
-    for kind in kinds:
-        index = (window.mask[row] & (window.material[row] == kind)).nonzero().squeeze(1)
-        index = index[torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[: chosen.emd_particles]]
-        means.append(earth_mover(predicted[row, late][:, index], window.target[row, late][:, index]))
-    return statistics.fmean(means)
+    real = window.mask[row]
+    clouds = (predicted[row, late][:, real], window.target[row, late][:, real])
+    return earth_mover_of_materials(*clouds, window.material[row, real], chosen.emd_particles)
 
 
 def simulated_window(run: Run, scenes: int) -> Window:

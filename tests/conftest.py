@@ -8,8 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
+
+# The same examples in every run, however slow the machine; `pytest --hypothesis-profile default` looks for others.
+settings.register_profile("repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("repeatable")
 
 Sizes = Sequence[tuple[int, int]]
 

@@ -23,6 +23,7 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "recipes"} | {
     "against_recordings", "calibration", "dam_break", "kills", "simulators", "stable_substeps",
+    "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels and recipes on one thread, and the simulators."""
 
@@ -274,3 +275,21 @@ def test_gpu_runs_an_interrupted_step_again(tmp_path):
     assert not gpu.has_succeeded(command, log)
     gpu.run_steps({"step": command}, tmp_path)
     assert gpu.has_succeeded(command, log)
+
+
+def test_the_map_states_break_even_for_every_width(tmp_path):
+    text = run_script("where_emulation_pays", "goop", "--times", "1", "2", "--rounds", "1", "--out", str(tmp_path))
+    found = json.loads((tmp_path / "map.json").read_text())
+    narrow, wide = found["cases"]
+    assert wide["particles"] > narrow["particles"]
+    assert min(case["frame"]["median"] for case in found["cases"]) > 0
+    assert "| goop × 2 | MLS-MPM, 2-D |" in text
+    assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_cost_is_fitted_to_all_but_the_widest():
+    import where_emulation_pays as script
+
+    cases = [script.Case("", 1, count, "", 1, None, None) for count in (100, 200, 400)]
+    fit = script.fit_cost(cases, [3.0, 5.0, 18.0])
+    assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})

@@ -32,7 +32,15 @@ def run(words: list[str]) -> int | None:
     add_device_option(verify)
     refresh = commands.add_parser("refresh", help="write READMEs, charts and the table of --root's models again")
     refresh.add_argument("name", nargs="?", help="(default: every model)")
-    refresh.add_argument("--measure", action="store_true", help="time rollouts on this machine for the cards")
+    refresh.add_argument(
+        "--measure",
+        nargs="+",
+        default=[],
+        metavar="WHAT",
+        help="for the cards: speed (on this machine), quality (earth mover's distance, energy, shape, worst scene),"
+        " twin and floor (the simulator beside itself), stress",
+    )
+    refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its test scenes")
     push = commands.add_parser("push", help="upload a model to the Hugging Face hub")
     push.add_argument("name")
     push.add_argument("repository", help="owner/repository, created if missing")
@@ -40,7 +48,6 @@ def run(words: list[str]) -> int | None:
     pull = commands.add_parser("pull", help="download a model of the Hugging Face hub")
     pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
     pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
-    refresh.add_argument("--twin", action="store_true", help="simulate test scenes beside themselves, for the cards")
     for command in (listing, card, add, verify, refresh, push, pull):
         command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
     chosen = parser.parse_args(words[1:])
@@ -118,12 +125,15 @@ def _verify(chosen: argparse.Namespace) -> int:
 
 def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
+    from nmpm.errors import ConfigError
     from nmpm.zoo.index import refresh, write_index
     from nmpm.zoo.registry import Zoo
 
+    if chosen.data is not None and chosen.name is None:
+        raise ConfigError("--data is the folder of one model's data: give the model's NAME too.")
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
-        refresh(Zoo.folder(name, root), chosen.measure, chosen.twin)
+        refresh(Zoo.folder(name, root), chosen.measure, chosen.data)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 
 

@@ -53,9 +53,9 @@ class EmulatorModule(LightningModule):
         unroll_growth: Share of the training, in [0, 1], over which the calls grow from 1 to K: early steps are cheap.
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
-        density_weight: Weight of the density error at each bundle's last frame, beside the position error in cells².
-        error_power: Power, in (0, 1], to which the position error of each window and bundle is raised before the mean.
-            At 0.5, calm windows and early bundles weigh as much as splashes.
+        density_weight: Weight of the density error at each bundle's last frame, beside the position error; 0 for none.
+        error_power: Power, in (0, 1], to which the position error, in cells², of each window and bundle is raised
+            before the mean. At 0.5, calm windows and early bundles weigh as much as splashes; at 1, mean squares.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
@@ -74,8 +74,8 @@ class EmulatorModule(LightningModule):
         unroll_growth: float = 0.0,
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
-        density_weight: float = 0.0,
-        error_power: float = 1.0,
+        density_weight: float = 4.0,
+        error_power: float = 0.5,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
         metrics: Sequence[RolloutMetric] | None = None,

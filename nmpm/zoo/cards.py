@@ -61,7 +61,10 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         *(f"| {label} | {' | '.join(_errors(test, kind))} |" for kind, label in PREDICTORS.items()),
         *_interval_row(card, names),
         "",
+        *_goal_lines(card),
         *_twin_lines(card),
+        *_floor_lines(card),
+        *_quality_lines(card),
         *_speed_lines(card),
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
         f"{training['precision']}; {training['parameters']:,} parameters; one run.",
@@ -76,7 +79,11 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         "positions = model.rollout(model.example(), frames=400)  # (1, 400, N, D)",
         "```",
     ]
-    pictures = {"chart.png": "errors over frames and over training", "rollout.png": "rollout"}
+    pictures = {
+        "chart.png": "errors over frames and over training",
+        "rollout.png": "rollout",
+        "worst.png": "the test scene with the largest error",
+    }
     lines += [line for name, text in pictures.items() if name in files for line in ("", f"![{text}]({name})")]
     return "\n".join(lines) + "\n"
 
@@ -105,6 +112,52 @@ def _twin_lines(card: Mapping[str, Any]) -> list[str]:
         f"The simulator with {twin['substeps']} substeps a frame beside itself with {twin['own_substeps']}: {figures}.",
         "",
     ]
+
+
+def _goal_lines(card: Mapping[str, Any]) -> list[str]:
+    """What the full-rollout error was meant to be."""
+    goal = card.get("goal")
+    if goal is None:
+        return []
+    reached = "reached" if card["test"]["mse"] <= goal else f"missed by a factor of {card['test']['mse'] / goal:.2g}"
+    return [f"Goal for `mse`: {1e3 * goal:.3g} ×10⁻³, {reached}.", ""]
+
+
+def _floor_lines(card: Mapping[str, Any]) -> list[str]:
+    floor = card.get("floor")
+    if not floor:
+        return []
+    figures = ", ".join(f"`{name}` {1e3 * floor[name]:.2g} ×10⁻³" for name in ("mse@100", "mse") if name in floor)
+    return [
+        f"Predictability: the simulator beside itself, started from positions that differ by {floor['nudge']:g} of the"
+        f" domain's side: {figures}.",
+        "",
+    ]
+
+
+def _quality_lines(card: Mapping[str, Any]) -> list[str]:
+    quality = card.get("quality")
+    if not quality:
+        return []
+    forms = {
+        "emd": ("earth mover's distance", 1e3, " ×10⁻³"),
+        "kinetic": ("kinetic energy off by", 100, "%"),
+        "height": ("height of the last frame's material off by", 100, "%"),
+        "crowding": ("particles per occupied cell off by", 100, "%"),
+    }
+    known = [(quality[name], *form) for name, form in forms.items() if name in quality]
+    texts = [f"{text} {_range(figure, factor)}{unit}" for figure, text, factor, unit in known]
+    worst = quality["worst"]
+    return [
+        f"On the test scenes, mean and its 95% interval: {'; '.join(texts)}. The largest error is that of scene"
+        f" {worst['scene']}, {1e3 * worst['mse']:.3g} ×10⁻³.",
+        "",
+    ]
+
+
+def _range(figure: Mapping[str, Any], factor: float) -> str:
+    mean, between = f"{factor * figure['mean']:.3g}", figure.get("interval")
+    return f"{mean} ({factor * between[0]:.3g} – {factor * between[1]:.3g})" if between else mean
 
 
 def _speed_lines(card: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,8 @@ from nmpm.zoo.charts import write_chart
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.golden import golden_rollout
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
+from nmpm.zoo.measures import MEASURES
 from nmpm.zoo.registry import Zoo
-from nmpm.zoo.speed import measure_speed
-from nmpm.zoo.twin import measure_twin
 
 HEAD = """\
 # The zoo
@@ -48,34 +47,37 @@ def write_index(root: Path) -> Path:
     return path
 
 
-def refresh(folder: Path, measure: bool = False, twin: bool = False, data: Path | None = None) -> None:
+def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None) -> None:
     """Write again what is derived from an entry's card and weights: lifecycle, README and chart.
 
-    A golden rollout is added where the card has none; one that there is stays, as it would hide a change.
+    A golden rollout is added where the card has none; one that there is stays, as it would hide a change. The card is
+    written after each measure.
 
     Args:
         folder: Of the entry.
-        measure: Whether to time rollouts on this machine for the card.
-        twin: Whether to measure what the simulator of the data is uncertain about, which takes as long as half a
-            simulation of the test scenes, and that simulation too without `data`.
-        data: Folder of the dataset.
+        measures: What to measure for the card, of `nmpm.zoo.measures.MEASURES`.
+        data: Folder of the dataset, which spares the simulation of the test scenes; needed for recorded data.
 
     Raises:
-        ZooError: if a file is missing or damaged.
-        ConfigError: if a twin is asked for and the data are recorded.
+        ZooError: if a file is missing or damaged, or a measure is unknown.
+        ConfigError: if what is to be measured needs a simulator or data that are not there.
     """
+    unknown = sorted(set(measures) - set(MEASURES))
+    if unknown:
+        raise ZooError(f"--measure {' '.join(unknown)}: what can be measured is {', '.join(MEASURES)}.")
     model = load_entry(folder)
     card = {"format": CARD_FORMAT} | read_card(folder)
     card |= {"lifecycle": lifecycle(card)}
     card.setdefault("golden", golden_rollout(model.emulator))
-    if measure:
-        found = measure_speed(model)
-        others = [entry for entry in card.get("speed", []) if entry["hardware"] != found["hardware"]]
-        card["speed"] = [*others, found]
-    if twin:
-        card["twin"] = measure_twin(model, data).to_dict()
+    _write(folder, card)
+    for name in measures:
+        card |= MEASURES[name](model, folder, data)
+        _write(folder, card)
+
+
+def _write(folder: Path, card: Mapping[str, Any]) -> None:
     with atomic_write(folder / CARD) as part:
-        part.write_text(yaml.safe_dump(card, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
+        part.write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
     write_chart(folder)
     with atomic_write(folder / "README.md") as part:
         part.write_text(readme(card, [path.name for path in folder.iterdir()]), encoding="utf-8")

@@ -79,7 +79,7 @@ def test_a_training_goes_on_with_the_arguments_that_it_is_given(begun, tmp_path,
     assert f"model.optimizer.lr = 1e-05 (was {rate})" in line
     for found in (
         "betas = (0.5, 0.9) (was (0.9, 0.999))",
-        "density_weight = 0.5 (was 0.0)",
+        "density_weight = 0.5 (was 4.0)",
         "schedule.warmup = 1 (was",
     ):
         assert found in line

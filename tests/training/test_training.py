@@ -71,7 +71,8 @@ class Losses(lightning.Callback):
 def test_training_lowers_the_loss_and_reports_rollouts_beside_the_trivial_predictors(make_dataset, tmp_path):
     data = data_of(make_dataset())
     fast = functools.partial(torch.optim.Adam, lr=1e-2)
-    model = module_of(data, schedule=Schedule(warmup=2), position_noise=0.0, grid_noise=0.0, optimizer=fast)
+    squares = {"error_power": 1.0, "density_weight": 0.0}
+    model = module_of(data, schedule=Schedule(warmup=2), position_noise=0.0, grid_noise=0.0, optimizer=fast, **squares)
     trainer, losses = trainer_of(tmp_path, 80, val_check_interval=80), Losses()
     trainer.callbacks.append(losses)
     trainer.fit(model, data)

@@ -17,7 +17,7 @@ from nmpm.zoo import Zoo
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.lifecycle import lifecycle
-from nmpm.zoo.twin import measure_twin, twin_of
+from nmpm.zoo.measures.simulator import measure_twin, twin_of
 from nmpm.zoo.verification import Check, verify
 
 SHIPPED = shipped_folder("zoo")
@@ -133,7 +133,7 @@ def test_a_zoo_is_refreshed_and_its_table_names_every_model(root, capsys):
     }
     path.write_text(yaml.safe_dump(card))
     (root / "small" / "errors.csv").write_text("frame,model,still,free_fall\n1,0.1,0.2,0.3\n2,0.2,0.3,0.4\n")
-    assert main(["zoo", "refresh", "--measure", "--root", str(root)]) == 0
+    assert main(["zoo", "refresh", "--measure", "speed", "--root", str(root)]) == 0
     again = yaml.safe_load(path.read_text())
     assert (again["lifecycle"], again["format"]) == ("active", 1)
     assert golden_distance(Zoo.load("small", root), again["golden"]) == 0

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from nmpm.evaluation.shape import measure_shape
 from nmpm.grid import Grid
-from nmpm.metrics import earth_mover
+from nmpm.metrics import earth_mover_of_materials
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 
@@ -76,8 +76,7 @@ def _squared(ours: Tensor, theirs: Tensor, horizons: Sequence[int]) -> dict[str,
 
 def _earth_mover(ours: Tensor, theirs: Tensor, material: Tensor, count: int) -> float:
     frames = np.unique(np.linspace(0, len(ours) - 1, count + 1).round().astype(int)[1:])
-    kinds = [material == kind for kind in material.unique()]
-    return float(np.mean([earth_mover(ours[frames][:, kind], theirs[frames][:, kind]) for kind in kinds]))
+    return earth_mover_of_materials(ours[frames], theirs[frames], material)
 
 
 def _energies(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> dict[str, float]:

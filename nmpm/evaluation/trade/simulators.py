@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -15,7 +13,8 @@ from torch import Tensor
 
 from nmpm.evaluation.trade.choice import Choice, Kind, Rollout
 from nmpm.evaluation.trade.scenes import Scenes
-from nmpm.sim import InitialState, Preset
+from nmpm.sim import Preset
+from nmpm.sim.nudge import nudge
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,9 @@ class SimulatorChoice(Choice):
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         (index,) = indices
         recorded = scenes.recordings[index].frames[:2]
-        start = self._nudged(self.preset.draw(scenes.seeds[index]), scenes.seeds[index])
+        start = self.preset.draw(scenes.seeds[index])
+        if self.nudge:
+            start = nudge(self.preset, start, self.nudge, scenes.seeds[index])
         follow = follow_nearest(recorded[0], start.position)
 
         def run(frames: int) -> Tensor:
@@ -57,15 +58,6 @@ class SimulatorChoice(Choice):
             return follow(torch.from_numpy(simulated))[2:].unsqueeze(0)
 
         return run
-
-    def _nudged(self, start: InitialState, seed: int) -> InitialState:
-        if not self.nudge:
-            return start
-        side = max(high - low for low, high in self.preset.domain)
-        noise = self.nudge * side * np.random.default_rng(seed).standard_normal(start.position.shape)
-        low, high = np.array(self.preset.box).T
-        low, high = np.minimum(low, start.position.min(0)), np.maximum(high, start.position.max(0))
-        return dataclasses.replace(start, position=np.clip(start.position + noise, low, high))
 
 
 def follow_nearest(first: Tensor, start: NDArray[Any]) -> Callable[[Tensor], Tensor]:

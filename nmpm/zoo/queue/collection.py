@@ -5,7 +5,7 @@ from __future__ import annotations
 import filecmp
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,12 @@ from nmpm.data.generate import SimulationRequest
 from nmpm.errors import ZooError
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import refresh, write_index
+from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.publish import replace
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.trainings import History, Training
 from nmpm.zoo.registry import Zoo
 from nmpm.zoo.runs import BEST
-from nmpm.zoo.twin import measure_twin
 
 MERGED = "merged.json"
 """The report of the test with what all trainings took."""
@@ -61,9 +61,8 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         if (reason := _reason_to_keep(name, zoo, best.error(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
         replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
-        refresh(zoo / name, measure=True)
-        if history.dataset.generation() is not None:
-            _add_twin(zoo / name, history)
+        refresh(zoo / name, ["speed"])
+        _extend_card(zoo / name, _references(zoo / name, history))
         write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
 
@@ -83,17 +82,25 @@ def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
     return _read(folder / "report.json")
 
 
-def _add_twin(entry: Path, history: History) -> None:
-    """Put the simulator's own uncertainty on an entry's card; measured once, as it does not depend on the model."""
+def _references(entry: Path, history: History) -> dict[str, Any]:
+    """What a card states beside the errors of the model: the goal, and how uncertain the simulator itself is."""
+    found: dict[str, Any] = {} if history.dataset.goal is None else {"goal": history.dataset.goal}
+    if history.dataset.generation() is None:
+        return found
     kept = history.folder / "twin.json"
-    if not kept.is_file():
+    if not kept.is_file():  # measured once, as it does not depend on the model
         data = catalog.dataset_folder(*_request(history.dataset))
-        found = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None)
+        twin = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None)
         with atomic_write(kept) as part:
-            part.write_text(json.dumps(found.to_dict(), indent=1), encoding="utf-8")
-    card = read_card(entry) | {"twin": _read(kept)}
+            part.write_text(json.dumps(twin.to_dict(), indent=1), encoding="utf-8")
+    return found | {"twin": _read(kept)}
+
+
+def _extend_card(entry: Path, keys: Mapping[str, Any]) -> None:
     with atomic_write(entry / CARD) as part:
-        part.write_text(yaml.safe_dump(card, sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
+        part.write_text(
+            yaml.safe_dump(read_card(entry) | dict(keys), sort_keys=False, allow_unicode=True, width=120), "utf-8"
+        )
     refresh(entry)
 
 

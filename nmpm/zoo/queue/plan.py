@@ -49,6 +49,7 @@ class Dataset:
         publish: Whether its model goes into the zoo.
         options: Further values of the configuration, by dotted keys.
         about: What the card says of the data, beside their name.
+        goal: What the full-rollout MSE on the test split is meant to be, in domain length squared; for the card.
         start: Another dataset of the queue, whose best weights the first training starts from, at the extension's rate.
     """
 
@@ -58,12 +59,15 @@ class Dataset:
     publish: bool = True
     options: Mapping[str, Any] = field(default_factory=dict)
     about: str = ""
+    goal: float | None = None
     start: str = ""
 
     def __post_init__(self) -> None:
         check_name(self.name)
         if self.hours <= 0:
             raise ConfigError(f"{self.name}: hours = {self.hours} must be positive.")
+        if self.goal is not None and self.goal <= 0:
+            raise ConfigError(f"{self.name}: goal = {self.goal} must be positive.")
 
     def generation(self) -> tuple[str, dict[str, Any]] | None:
         """Name and options of the simulated data, as `nmpm.data.catalog.ensure` takes them; None for recorded data."""

@@ -1,9 +1,13 @@
-"""What the simulator of a model's data is itself uncertain about: its test scenes, simulated with other time steps."""
+"""What the simulator of a model's data is itself uncertain about: its test scenes, simulated again.
+
+The *twin* has other time steps; the *floor*, which no prediction gets below, starts from positions that differ by 10⁻⁶
+of the domain.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +22,15 @@ from nmpm.data.loading.recording import RecordingReader
 from nmpm.errors import ConfigError
 from nmpm.metrics import MSE
 from nmpm.particles import Window
-from nmpm.sim import Preset
+from nmpm.sim import InitialState, Preset
+from nmpm.sim.nudge import nudge
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import iterate_test_scenes, simulation_of
+
+NUDGE = 1e-6
+"""Of the floor: standard deviation of the initial positions, as a share of the domain's longest side."""
+Start = Callable[[Preset, int], InitialState]
+"""The initial state of a preset for a seed."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +64,16 @@ def twin_of(preset: Preset) -> Preset:
     return dataclasses.replace(preset, substeps=2 * preset.substeps)
 
 
+def twin_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
+    """The key `twin` of a card, see `measure_twin`."""
+    return {"twin": measure_twin(model, data).to_dict()}
+
+
+def floor_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
+    """The key `floor` of a card, see `measure_floor`."""
+    return {"floor": {"nudge": NUDGE, **measure_floor(model, data)}}
+
+
 def measure_twin(model: Pretrained, data: Path | None = None) -> Twin:
     """Simulate a model's test scenes with other substeps and compare.
 
@@ -64,22 +84,37 @@ def measure_twin(model: Pretrained, data: Path | None = None) -> Twin:
     Raises:
         ConfigError: if the data are not simulated, or by another revision of the simulator.
     """
-    preset, request = simulation_of(model)
+    preset, _ = simulation_of(model)
     other = twin_of(preset)
-    rows = list(_rows(model, preset, other, request.trajectory_seed, data))
-    names = [name for name in rows[0] if all(name in row for row in rows)]
-    return Twin(other.substeps, preset.substeps, {name: float(np.mean([row[name] for row in rows])) for name in names})
+    return Twin(other.substeps, preset.substeps, _compare(model, other, lambda own, seed: own.draw(seed), data))
 
 
-def _rows(
-    model: Pretrained, preset: Preset, other: Preset, seed_of: Callable[[str, int], int], data: Path | None
-) -> Iterator[dict[str, float]]:
+def measure_floor(model: Pretrained, data: Path | None = None) -> dict[str, float]:
+    """Simulate a model's test scenes from nudged positions and compare: means over the scenes, "mse@100", …, "mse".
+
+    Args:
+        model: Of simulated data.
+        data: Folder of the dataset, as for `measure_twin`.
+
+    Raises:
+        ConfigError: if the data are not simulated, or by another revision of the simulator.
+    """
+    preset, _ = simulation_of(model)
+    return _compare(model, preset, lambda own, seed: nudge(own, own.draw(seed), NUDGE, seed), data)
+
+
+def _compare(model: Pretrained, other: Preset, start: Start, data: Path | None) -> dict[str, float]:
+    """Mean errors of another simulation of the test scenes."""
+    preset, request = simulation_of(model)
     reader = RecordingReader(preset_metadata(preset), model.scene)
+    rows = []
     for index, window in enumerate(iterate_test_scenes(model, None, data)):
-        seed = seed_of("test", index)
-        run = other.simulate_from(preset.draw(seed), preset.frames)
+        seed = request.trajectory_seed("test", index)
+        run = other.simulate_from(start(preset, seed), preset.frames)
         stored = Trajectory(run.position, run.particle_type, run.attributes)
-        yield _errors(window, reader.recording(stored, f"{preset.name}, seed {seed}").frames)
+        rows.append(_errors(window, reader.recording(stored, f"{preset.name}, seed {seed}").frames))
+    names = [name for name in rows[0] if all(name in row for row in rows)]
+    return {name: float(np.mean([row[name] for row in rows])) for name in names}
 
 
 def _errors(window: Window, frames: torch.Tensor) -> dict[str, float]:

@@ -1,0 +1,238 @@
+"""Where emulation pays: what a frame of the simulators costs beside one of the emulators, against the particles.
+
+python benchmarks/where_emulation_pays.py                          table, and map.json and map.png in benchmarks/trade
+python benchmarks/where_emulation_pays.py goop dambreak2d --times 1 4 16
+
+Each preset is simulated in domains 1, 4, 16, … times as wide, with as many times as many particles, on one thread; the
+emulator is the zoo's model of it, or an untrained one of its configuration. The cost of both is close to linear in the
+particles, so their ratio is a number of substeps:
+
+    break-even = (ms per frame of the emulator) / (ms per substep of the simulator)
+
+Emulation pays where the cheapest stable simulation of the same error needs more substeps than that. The cost model of
+the map, ms = a + b × particles, is fitted to all widths but the widest and checked on that. Points: settings of the
+trade's tables (`benchmarks/trade/NAME/trade.csv`), the cheapest simulation that is no less accurate than the model.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from timing import Spread, clock_for, make_parser, time_alternating, write_json
+
+from nmpm._support.atomic import atomic_write
+from nmpm._support.shipped import find_config
+from nmpm.data.format import Trajectory
+from nmpm.data.generate import preset_metadata
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
+from nmpm.emulator import Emulator, EmulatorRecipe
+from nmpm.emulator.calibration import calibrate
+from nmpm.errors import ZooError
+from nmpm.particles import Window
+from nmpm.sim import InitialState, Preset, load_preset
+from nmpm.zoo import Zoo
+
+TRADE = Path(__file__).parent / "trade"
+NAMES = ("goop", "waterramps", "waterdrop3d", "dambreak2d", "wbcsph")
+TIMES = (1, 4, 16)
+FRAMES, SUBSTEPS = 16, 4
+"""Frames of an emulator and substeps of a simulator in a timed run."""
+RECIPE = ("cells", "frames", "transfer", "processor", "decoder", "constraints")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What one width costs.
+
+    Args:
+        name: Of the preset.
+        times: As wide as the preset's own domain.
+        particles: That move.
+        solver: Of the simulator, with its number of dimensions.
+        substeps: Of the preset.
+        substep: Of the simulator, seconds.
+        frame: Of the emulator, seconds.
+    """
+
+    name: str
+    times: int
+    particles: int
+    solver: str
+    substeps: int
+    substep: Spread
+    frame: Spread
+
+    @property
+    def break_even(self) -> float:
+        """Substeps of the simulator that take as long as a frame of the emulator."""
+        return self.frame.median / self.substep.median
+
+
+def emulator_of(preset: Preset, window: Window) -> Emulator:
+    """The zoo's model in the preset's domain; where there is none, an untrained one of the configuration."""
+    try:
+        return Zoo.load(preset.name).with_network("bfloat16").emulator.over(preset.scene)
+    except ZooError:
+        model = yaml.safe_load(find_config(f"{preset.name}.yaml").read_text(encoding="utf-8"))["model"]
+    torch.manual_seed(0)
+    own = {key: model[key] for key in RECIPE if key in model}
+    emulator = EmulatorRecipe(load_preset(preset.name).scene, **own).build().over(preset.scene)
+    calibrate(emulator, [window])
+    return emulator.with_network(torch.bfloat16).eval().requires_grad_(False)
+
+
+def simulate(preset: Preset, start: InitialState, frames: int) -> Window:
+    """A window of so many simulated frames after the first two."""
+    run = preset.simulate_from(start, frames + 1)
+    stored = Trajectory(run.position, run.particle_type, run.attributes)
+    return collate(
+        [RecordingReader(preset_metadata(preset), preset.scene).recording(stored, preset.name)], preset.scene
+    )
+
+
+def measure(name: str, times: int, rounds: int) -> Case:
+    """Time a preset's simulator and emulator in a domain so many times as wide, taking turns.
+
+    A substep is timed by the difference of two simulations of a frame, so that what precedes the first one is left out.
+    """
+    preset = load_preset(name) if times == 1 else load_preset(name).widened(times)
+    start = preset.draw(0)
+    window = simulate(preset, start, FRAMES)
+    emulator, state = emulator_of(preset, window), window.initial
+    context = emulator.context(state)
+
+    def emulate() -> None:
+        particles = state
+        with torch.inference_mode():
+            for _ in range(FRAMES // emulator.frames):
+                bundle = emulator(particles, context)
+                particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+
+    actions = {
+        "one": lambda: preset.simulate_from(start, 1),
+        "more": lambda: preset.simulate_from(start, 1 + SUBSTEPS),
+        "emulator": emulate,
+    }
+    seconds = time_alternating(actions, rounds, clock_for(torch.device("cpu")))
+    pairs = zip(seconds["more"], seconds["one"], strict=True)
+    substep = [(more - one) / SUBSTEPS / preset.substeps for more, one in pairs]
+    frame = [value / FRAMES for value in seconds["emulator"]]
+    solver = f"{preset.generator}, {len(preset.box)}-D"
+    return Case(name, times, len(start.position), solver, preset.substeps, Spread.of(substep), Spread.of(frame))
+
+
+def fit_cost(cases: Sequence[Case], seconds: Sequence[float]) -> dict[str, float]:
+    """The line a + b × particles through all but the widest case, and the latter's cost over that of the line."""
+    counts = np.array([case.particles for case in cases], dtype=float)
+    values = np.array(seconds)
+    weights = 1 / values[:-1]  # relative errors count
+    matrix = np.stack([np.ones(len(counts) - 1), counts[:-1]], axis=1)
+    offset, slope = np.linalg.lstsq(matrix * weights[:, None], values[:-1] * weights, rcond=None)[0]
+    return {"offset": offset, "slope": slope, "check": float(values[-1] / (offset + slope * counts[-1]))}
+
+
+def equal_error(name: str) -> dict[str, Any] | None:
+    """From a trade's table: the fastest model, and the cheapest stable simulation that is no less accurate."""
+    path = TRADE / name / "trade.csv"
+    if not path.is_file():
+        return None
+    with path.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["error"] == "mse" and row["batch"] == "1"]
+    models = [row for row in rows if row["kind"] == "model" and row["constraints"] == "held" and row["value"]]
+    simulators = [row for row in rows if row["kind"] == "simulator" and row["stable"] == "True" and row["value"]]
+    if not models:
+        return None
+    model = min(models, key=lambda row: float(row["value"]))
+    good = [row for row in simulators if float(row["value"]) <= float(model["value"])]
+    other = min(good, key=lambda row: float(row["ms_per_frame"]))
+    return {
+        "name": name,
+        "particles": int(model["particles"]),
+        "model": model["name"],
+        "simulator": other["name"],
+        "speed_up": float(other["ms_per_frame"]) / float(model["ms_per_frame"]),
+    }
+
+
+def draw(axes: Axes, name: str, cases: Sequence[Case]) -> None:
+    """Milliseconds per frame against particles: emulator, simulator as shipped, and per substep."""
+    counts = [case.particles for case in cases]
+    axes.plot(counts, [1e3 * case.frame.median for case in cases], "o-", label="emulator")
+    for substeps in (1, 10, 100):
+        times = [1e3 * substeps * case.substep.median for case in cases]
+        axes.plot(counts, times, "--", color="0.6", linewidth=1)
+        axes.annotate(f"{substeps} substep{'s' * (substeps > 1)}", (counts[-1], times[-1]), fontsize=7, ha="right")
+    shipped = [1e3 * case.substeps * case.substep.median for case in cases]
+    axes.plot(counts, shipped, "s-", label=f"simulator, {cases[0].substeps} substeps")
+    axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ms per frame", title=f"{name}: {cases[0].solver}")
+    axes.legend(frameon=False, fontsize="small")
+
+
+def write_map(cases: Mapping[str, Sequence[Case]], path: Path) -> None:
+    """The picture: a panel per preset."""
+    figure = Figure(figsize=(3.6 * len(cases), 3.2), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, rows) in zip(figure.subplots(1, len(cases), squeeze=False)[0], cases.items(), strict=True):
+        draw(axes, name, rows)
+    with atomic_write(path) as part:
+        figure.savefig(part, format="png")
+
+
+def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
+    """Print the table, and return all figures."""
+    out = sys.stdout.write
+    out("| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps |\n")
+    out("|---|---|---:|---:|---:|---:|\n")
+    for rows in cases.values():
+        for case in rows:
+            out(
+                f"| {case.name} × {case.times} | {case.solver} | {case.particles:,} | {case.substep.format()} |"
+                f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} |\n"
+            )
+    costs = {
+        name: {
+            "emulator": fit_cost(rows, [case.frame.median for case in rows]),
+            "substep": fit_cost(rows, [case.substep.median for case in rows]),
+        }
+        for name, rows in cases.items()
+        if len(rows) > 2
+    }
+    for name, cost in costs.items():
+        checks = ", ".join(f"{part} {fit['check']:.2f}" for part, fit in cost.items())
+        out(f"{name}: the widest case over the fitted line: {checks}\n")
+    points = [point for name in cases if (point := equal_error(name)) is not None]
+    for point in points:
+        out(f"{point['name']}: {point['model']} is {point['speed_up']:.2g} times as fast as {point['simulator']}\n")
+    return {"cases": [asdict(case) for rows in cases.values() for case in rows], "costs": costs, "points": points}
+
+
+def main() -> None:
+    """Measure, print, and write JSON and a picture."""
+    parser = make_parser(__doc__)
+    parser.add_argument("names", nargs="*", default=NAMES, help="presets")
+    parser.add_argument("--times", type=int, nargs="+", default=TIMES, help="widths of the domain")
+    parser.add_argument("--rounds", type=int, default=7, help="timed runs of each")
+    parser.add_argument("--out", type=Path, default=TRADE, help="folder of map.json and map.png")
+    chosen: Namespace = parser.parse_args()
+    torch.set_num_threads(1)
+    cases = {name: [measure(name, times, chosen.rounds) for times in chosen.times] for name in chosen.names}
+    found = report(cases)
+    write_json(chosen.out / "map.json", found)
+    write_map(cases, chosen.out / "map.png")
+
+
+if __name__ == "__main__":
+    main()

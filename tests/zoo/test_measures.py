@@ -1,0 +1,83 @@
+"""What `nmpm zoo refresh --measure` puts on cards."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from nmpm.cli import main
+from nmpm.errors import ZooError
+from nmpm.evaluation.stress import QUICK, Line
+from nmpm.sim import load_preset
+from nmpm.zoo import Zoo
+from nmpm.zoo.cards import readme
+from nmpm.zoo.index import refresh
+from nmpm.zoo.measures.simulator import NUDGE, measure_floor
+
+SHIPPED = Path(__file__).parents[2] / "zoo"
+
+
+@pytest.fixture
+def goop(tmp_path) -> Path:
+    """The shipped model with two short test scenes."""
+    folder = tmp_path / "zoo" / "goop"
+    shutil.copytree(SHIPPED / "goop", folder)
+    preset = load_preset("goop").with_frames(24)
+    simulation = {"preset": preset.to_dict(), "counts": {"train": 0, "valid": 0, "test": 2}, "seed": 0}
+    card = yaml.safe_load((folder / "card.yaml").read_text()) | {
+        "simulation": simulation | {"revision": preset.revision}
+    }
+    (folder / "card.yaml").write_text(yaml.safe_dump(card))
+    return folder
+
+
+def test_quality_floor_and_the_worst_scene_are_on_the_card(goop, capsys):
+    words = ["zoo", "refresh", "goop", "--measure", "quality", "floor", "--root", str(goop.parent)]
+    assert main(words) == 0
+    card = yaml.safe_load((goop / "card.yaml").read_text())
+    quality, floor = card["quality"], card["floor"]
+    for name in ("emd", "kinetic", "height", "crowding"):
+        low, high = quality[name]["interval"]
+        assert 0 <= low <= quality[name]["mean"] <= high
+    assert 0 < quality["emd"]["mean"] < 0.01  # of a domain of length 1, in the first frames
+    assert quality["worst"]["scene"] in (0, 1)
+    assert 0 < floor["mse"] < 1e-2 * quality["worst"]["mse"]
+    assert floor["nudge"] == NUDGE
+    assert (goop / "worst.png").read_bytes()[:4] == b"\x89PNG"
+    text = (goop / "README.md").read_text()
+    assert "![the test scene with the largest error](worst.png)" in text
+    assert "Predictability: the simulator beside itself" in text
+    assert f"that of scene {quality['worst']['scene']}" in text
+
+
+def test_the_floor_repeats(goop):
+    model = Zoo.load("goop", goop.parent)
+    assert measure_floor(model) == measure_floor(model)
+
+
+def test_stress_tests_held_and_free_are_counted(goop, monkeypatch):
+    def two_lines(subject, size):
+        assert size is QUICK
+        held = subject.emulator.constraints.energy
+        yield Line("long", "energy", held, {}, "")
+        yield Line("long", "speed", None, {}, "")
+
+    monkeypatch.setattr("nmpm.zoo.measures.stress.battery", two_lines)
+    refresh(goop, ["stress"])
+    card = yaml.safe_load((goop / "card.yaml").read_text())
+    assert card["stress"] == {"size": "quick", "passed": 1, "failed": []}
+    assert card["stress_free"] == {"size": "quick", "passed": 0, "failed": ["long: energy"]}
+
+
+def test_what_cannot_be_measured_is_named(goop, capsys):
+    with pytest.raises(ZooError, match=r"--measure sped: .* speed, quality, twin, floor, stress"):
+        refresh(goop, ["sped"])
+    assert main(["zoo", "refresh", "--measure", "quality", "--data", ".", "--root", str(goop.parent)]) == 1
+    assert "give the model's NAME too" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("goal", "said"), [(0.6, "600 ×10⁻³, reached"), (0.25, "250 ×10⁻³, missed by a factor of 2")])
+def test_a_card_says_whether_its_goal_is_reached(goop, goal, said):
+    card = yaml.safe_load((goop / "card.yaml").read_text())
+    assert f"Goal for `mse`: {said}" in readme(card | {"goal": goal, "test": card["test"] | {"mse": 0.5}})
