@@ -29,7 +29,7 @@ PUBLIC = (
     "nmpm.zoo",
 )
 BUDGETS: dict[str, dict[str, object]] = {
-    "fine_tuning": {"SECONDS": 0, "SIZES": (1, 2), "TEST": 1, "FRAMES": 40},
+    "fine_tuning": {"STEPS": 2, "SIZES": (1,), "TEST": 1, "FRAMES": 40},
     "inverse_design": {"STEPS": 1, "BATCH": 1, "LAST": 8, "MOMENT": 8, "FRAMES": 16},
     "new_processor": {"STEPS": 2, "COUNTS": {"train": 1, "valid": 1, "test": 1}, "FRAMES": 40},
     "quickstart": {"FRAMES": 16},
