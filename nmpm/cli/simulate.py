@@ -12,6 +12,7 @@ from nmpm.cli.options import check_at_least, check_folder, check_picture
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from nmpm.data.shard import Shard
     from nmpm.sim import Preset
 
 _INTERRUPTED = 130  # as shells report SIGINT
@@ -21,6 +22,7 @@ examples:
   nmpm simulate --list                                   the shipped scenes
   nmpm simulate waterramps --preview ramps.png           draw one trajectory, write no data
   nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
+  nmpm simulate waterramps --shard 2/8 --out ramps       a task of a job array; the last of 8 completes the folder
   nmpm simulate my-scene.yaml --out mine                 your own scene: start from a copy of a shipped one
   nmpm simulate goop --show > my-scene.yaml              such a copy, with comments
 
@@ -50,6 +52,9 @@ def run(words: list[str]) -> None:
     parser.add_argument("--frames", type=int, help="frames after the initial one (default: the scene's)")
     parser.add_argument("--seed", type=int, default=0, help="of the whole dataset (default: 0)")
     parser.add_argument("--workers", type=int, help="processes (default: one per processor core)")
+    parser.add_argument(
+        "--shard", metavar="I/N", help="simulate the I-th of N parts, from 1 on; N processes share the folder --out"
+    )
     parser.add_argument("--out", type=Path, help="folder to write (default: the scene's name)")
     chosen = parser.parse_args(words[1:])
     if chosen.list:
@@ -75,9 +80,10 @@ def _simulate(chosen: argparse.Namespace) -> None:
         check_picture("--preview", chosen.preview)
     elif chosen.out is not None:
         check_folder("--out", chosen.out)
-    from nmpm.data.generate import generate
+    from nmpm.data.shard import Shard
     from nmpm.sim import load_preset
 
+    shard = None if chosen.shard is None else Shard.parse(chosen.shard)
     preset = load_preset(chosen.name)
     preset = preset if chosen.frames is None else preset.with_frames(chosen.frames)
     if chosen.preview is not None:
@@ -87,9 +93,24 @@ def _simulate(chosen: argparse.Namespace) -> None:
     counts |= {name: getattr(chosen, name) for name in counts if getattr(chosen, name) is not None}
     out = chosen.out or Path(preset.name)
     check_folder("--out", out)
-    generate(preset, out, counts, chosen.seed, chosen.workers)
-    sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
-    sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
+    if _generate(preset, out, counts, shard, chosen):
+        sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
+        sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
+
+
+def _generate(
+    preset: Preset, out: Path, counts: Mapping[str, int], shard: Shard | None, chosen: argparse.Namespace
+) -> bool:
+    """Simulate all, or a shard; returns whether the dataset is complete."""
+    from nmpm.data.generate import generate, generate_shard
+
+    if shard is None:
+        generate(preset, out, counts, chosen.seed, chosen.workers)
+        return True
+    missing = generate_shard(preset, out, counts, shard, chosen.seed, chosen.workers)
+    if missing:
+        sys.stdout.write(f"shard {shard} is in {out}; trajectories of other shards that are not there yet: {missing}\n")
+    return missing == 0
 
 
 def _paper_counts(name: str) -> Mapping[str, int]:

@@ -3,6 +3,9 @@
 An unfinished folder contains `.parts`, with the request and a file for each finished trajectory. When all parts of a
 split are there they are assembled into its HDF5 file; `metadata.json` is written last and marks the dataset as
 complete. Files are written atomically, so that a repeated call continues where the last one stopped.
+
+Shards are processes that write different parts to the same folder at the same time, under a shared lock; whoever
+assembles the parts holds an exclusive lock.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import logging
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,25 +26,24 @@ import numpy as np
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.version import __version__
-from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,
     Metadata,
     Split,
-    Trajectory,
     read_metadata,
     write_metadata,
     write_split,
 )
+from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, write_part
 from nmpm.data.progress import progress_bar
+from nmpm.data.shard import Shard
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
 
-_PARTS = ".parts"
 _REQUEST = "request.json"
 _KEY = "simulation"
 
@@ -121,14 +123,40 @@ def generate(
     request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
         return
-    try:
-        with lock_folder(folder):
-            _complete(request, folder, workers or os.cpu_count() or 1)
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written ({error}). Finished trajectories are kept; free space or correct the"
-            " permissions, and repeat the call to continue."
-        ) from error
+    with explain_write_errors(folder), lock_folder(folder):
+        _complete(request, folder, workers or os.cpu_count() or 1)
+
+
+def generate_shard(
+    preset: Preset,
+    folder: Path,
+    counts: Mapping[str, int],
+    shard: Shard,
+    seed: int = 0,
+    workers: int | None = None,
+) -> int:
+    """Simulates a shard of a dataset; the shard that finishes last completes the dataset.
+
+    Shards may run at the same time in the same folder. The folder then has the bytes that `generate` writes. Arguments
+    and errors are those of `generate`.
+
+    Returns:
+        Number of trajectories that other shards have yet to simulate; 0 if the dataset is complete.
+    """
+    request, folder = SimulationRequest(preset, counts, seed), Path(folder)
+    if _is_complete(request, folder):
+        return 0
+    with explain_write_errors(folder), lock_folder(folder, shared=True):
+        if _is_complete(request, folder):
+            return 0
+        with lock_folder(folder / PARTS):
+            _prepare_parts(request, folder)
+        _simulate_parts(request, folder, shard.select(_trajectories(request)), workers or os.cpu_count() or 1)
+        # While the lock is held nobody assembles: the last shard to come here finds all parts.
+        missing = len(_missing(folder, _trajectories(request)))
+    if missing == 0:
+        generate(preset, folder, counts, seed, workers)
+    return missing
 
 
 def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
@@ -136,7 +164,7 @@ def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
         return
     _prepare_parts(request, folder)
     _remove_stale_files(folder)
-    _simulate_parts(request, folder, workers)
+    _simulate_parts(request, folder, _trajectories(request), workers)
     for split in request.splits:
         _assemble(request, folder, split)
     metadata = preset_metadata(request.preset)
@@ -145,7 +173,7 @@ def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
         statistics.add(first.read(index))
     extra = metadata.extra | statistics.result() | {_KEY: request.to_dict()}
     write_metadata(folder, dataclasses.replace(metadata, extra=extra))
-    shutil.rmtree(folder / _PARTS, ignore_errors=True)
+    shutil.rmtree(folder / PARTS, ignore_errors=True)
 
 
 def _is_complete(request: SimulationRequest, folder: Path) -> bool:
@@ -157,7 +185,7 @@ def _is_complete(request: SimulationRequest, folder: Path) -> bool:
 
 def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
     """Writes the request beside the parts, or checks that existing parts belong to the same request."""
-    path = folder / _PARTS / _REQUEST
+    path = folder / PARTS / _REQUEST
     if path.is_file():
         _check_same(request, json.loads(path.read_text(encoding="utf-8")), folder)
         return
@@ -186,16 +214,24 @@ def _difference(key: str, found: Any, asked: Any) -> str:
 
 def _remove_stale_files(folder: Path) -> None:
     """Removes files that killed processes left incomplete; the lock guarantees that no other process is writing."""
-    for stale in [*folder.glob(".*.part*"), *(folder / _PARTS).glob(".*.part*")]:
+    for stale in [*folder.glob(".*.part*"), *(folder / PARTS).glob(".*.part*")]:
         stale.unlink(missing_ok=True)
 
 
-def _simulate_parts(request: SimulationRequest, folder: Path, workers: int) -> None:
-    wanted = [(s, i) for s in request.splits if not (folder / f"{s}.h5").is_file() for i in range(request.counts[s])]
-    missing = [(s, i) for s, i in wanted if not _part(folder, s, i).is_file()]
+def _trajectories(request: SimulationRequest) -> list[tuple[str, int]]:
+    """Split and index of every trajectory."""
+    return [(split, index) for split in request.splits for index in range(request.counts[split])]
+
+
+def _missing(folder: Path, wanted: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Those of the trajectories that are neither in their split's file nor in a part."""
+    return [(s, i) for s, i in wanted if not (folder / f"{s}.h5").is_file() and not part_path(folder, s, i).is_file()]
+
+
+def _simulate_parts(request: SimulationRequest, folder: Path, wanted: Sequence[tuple[str, int]], workers: int) -> None:
+    missing, total = _missing(folder, wanted), len(wanted)
     if not missing:
         return
-    total = sum(request.counts.values())
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
     # Threads suffice, as the simulators' compiled loops release the GIL.
     pool, interrupted = ThreadPoolExecutor(min(workers, len(missing))), threading.Event()
@@ -221,35 +257,17 @@ def _simulate_part(
             raise CancelledError
 
     run = request.preset.simulate(request.trajectory_seed(split, index), stop_if_interrupted)
-    with atomic_write(_part(folder, split, index)) as temporary, temporary.open("wb") as file:
-        np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)
-
-
-def _part(folder: Path, split: str, index: int) -> Path:
-    return folder / _PARTS / f"{split}-{index:05d}.npz"
+    write_part(part_path(folder, split, index), run)
 
 
 def _assemble(request: SimulationRequest, folder: Path, split: str) -> None:
     path = folder / f"{split}.h5"
-    parts = [_part(folder, split, index) for index in range(request.counts[split])]
+    parts = [part_path(folder, split, index) for index in range(request.counts[split])]
     if not path.is_file():
         with progress_bar(f"Writing {path.name}", len(parts)) as advance:
-            write_split(path, _read_parts(parts, advance))
+            write_split(path, read_parts(parts, advance))
     for part in parts:
         part.unlink(missing_ok=True)
-
-
-def _read_parts(parts: list[Path], advance: Callable[[], None]) -> Iterator[Trajectory]:
-    for part in parts:
-        try:
-            with np.load(part, allow_pickle=False) as arrays:
-                attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
-                yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
-        except NPZ_ERRORS as error:
-            raise DataError(
-                f"{part}: damaged ({error}); delete it and repeat the call, which simulates it again."
-            ) from error
-        advance()
 
 
 def preset_metadata(preset: Preset) -> Metadata:

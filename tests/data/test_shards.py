@@ -1,0 +1,108 @@
+"""A dataset in shards, as the tasks of a job array simulate it."""
+
+import dataclasses
+import hashlib
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from nmpm.cli import main
+from nmpm.data.format import Split
+from nmpm.data.generate import generate, generate_shard
+from nmpm.data.shard import Shard
+from nmpm.errors import ConfigError, DataError
+from nmpm.sim import load_preset
+
+GOOP = load_preset("goop")
+TINY = dataclasses.replace(GOOP, frames=10, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
+COUNTS = {"train": 4, "valid": 1, "test": 2}
+
+
+def fingerprints(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
+
+
+def run_shard(folder: Path, index: int, count: int, seed: int = 5) -> int:
+    return generate_shard(TINY, folder, COUNTS, Shard(index, count), seed, workers=1)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    generate(TINY, folder, COUNTS, seed=5, workers=1)
+    return folder
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 9])
+def test_every_item_is_in_one_shard(count):
+    shards = [Shard(index, count).select(range(7)) for index in range(1, count + 1)]
+    assert sorted(item for shard in shards for item in shard) == list(range(7))
+    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+def test_the_last_shard_completes_the_bytes_of_one_process(whole, tmp_path):
+    assert run_shard(tmp_path, 2, 2) == 4
+    assert not list(tmp_path.glob("*.h5"))
+    assert run_shard(tmp_path, 1, 2) == 0
+    assert fingerprints(tmp_path) == fingerprints(whole)
+    assert not (tmp_path / ".parts").exists()
+
+
+def test_shards_at_the_same_time_give_the_same_bytes(whole, tmp_path):
+    with ThreadPoolExecutor(3) as pool:
+        missing = list(pool.map(lambda index: run_shard(tmp_path, index, 3), (1, 2, 3)))
+    assert 0 in missing
+    assert fingerprints(tmp_path) == fingerprints(whole)
+
+
+def test_parts_of_machines_without_a_common_folder_are_merged(whole, tmp_path):
+    """As `rsync a/.parts/ b/.parts/` does; the command without a shard then simulates nothing new."""
+    for index, name in ((1, "a"), (2, "b")):
+        run_shard(tmp_path / name, index, 2)
+    shutil.copytree(tmp_path / "a" / ".parts", tmp_path / "b" / ".parts", dirs_exist_ok=True)
+    generate(TINY, tmp_path / "b", COUNTS, seed=5, workers=1)
+    assert fingerprints(tmp_path / "b") == fingerprints(whole)
+
+
+def test_without_a_shard_the_missing_ones_are_simulated(whole, tmp_path):
+    run_shard(tmp_path, 1, 3)
+    generate(TINY, tmp_path, COUNTS, seed=5, workers=1)
+    assert fingerprints(tmp_path) == fingerprints(whole)
+
+
+def test_a_shard_of_a_complete_dataset_does_nothing(whole):
+    before = {path: path.stat().st_mtime_ns for path in whole.iterdir()}
+    assert run_shard(whole, 2, 3) == 0
+    assert {path: path.stat().st_mtime_ns for path in whole.iterdir()} == before
+
+
+def test_a_shard_without_trajectories_leaves_the_rest_to_the_others(tmp_path):
+    assert run_shard(tmp_path, 9, 9) == 7
+
+
+def test_shards_of_different_datasets_do_not_mix(tmp_path):
+    run_shard(tmp_path, 1, 2, seed=1)
+    with pytest.raises(DataError, match="seed is 1, requested 2"):
+        run_shard(tmp_path, 2, 2, seed=2)
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "1/0", "1", "a/b", "-1/4", "1/4/2", "", "1 /4", "²/4"])
+def test_wrong_shards_are_refused(text):
+    with pytest.raises(ConfigError, match="as in 1/8, 2/8"):
+        Shard.parse(text)
+
+
+def test_the_command_says_what_is_missing(tmp_path, capsys):
+    words = ["simulate", "goop", "--train", "2", "--valid", "1", "--test", "0", "--frames", "2", "--workers", "1"]
+    words += ["--out", str(tmp_path / "goop")]
+    assert main([*words, "--shard", "1/2"]) == 0
+    said = capsys.readouterr().out
+    assert "shard 1/2 is in" in said
+    assert "other shards that are not there yet: 1" in said
+    assert main([*words, "--shard", "2/2"]) == 0
+    assert "wrote 2 train, 1 valid trajectories" in capsys.readouterr().out
+    assert len(Split(tmp_path / "goop" / "train.h5")) == 2
+    assert main([*words, "--shard", "3/2"]) == 1
+    assert "shards are counted from 1" in capsys.readouterr().err

@@ -1,0 +1,105 @@
+"""The documentation: it builds without a warning and without the network, and its links hold."""
+
+import html
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [
+    path
+    for pattern in ("README.md", "CHANGELOG.md", "docs/**/*.md", "zoo/**/*.md", "benchmarks/**/*.md")
+    for path in sorted(ROOT.glob(pattern))
+]
+FENCED = re.compile(r"^ *```.*?^ *```$", flags=re.DOTALL | re.MULTILINE)
+CODE = re.compile(r"`[^`\n]*`")
+FETCHED = re.compile(r"<(?:script|img|iframe)\b[^>]*\bsrc=\"?(?:https?:)?//|<link\b[^>]*\bhref=\"?(?:https?:)?//")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+if not (ROOT / "mkdocs.yml").is_file() or not (ROOT / "notebooks").is_dir():
+    pytest.skip("the documentation is not complete in this distribution", allow_module_level=True)
+
+
+def anchors(path: Path) -> set[str]:
+    """Anchors of the headings of a Markdown file."""
+    headings = re.findall(r"^#+ (.+)$", FENCED.sub("", path.read_text("utf-8")), flags=re.MULTILINE)
+    kept = [re.sub(r"[^\w\s-]", "", heading.lower()).strip() for heading in headings]
+    return {re.sub(r"\s", "-", heading) for heading in kept}
+
+
+def load_hook(name: str):
+    """A hook of the site, as MkDocs loads it."""
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed: pip install nmpm[docs]")
+    spec = importlib.util.spec_from_file_location(f"docs_hook_{name}", ROOT / "docs" / "hooks" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_within_the_repository_hold(page):
+    """As on a page that shows the repository's files; whether they hold in the site, MkDocs checks."""
+    text = CODE.sub("", FENCED.sub("", page.read_text("utf-8")))
+    for target in LINK.findall(text):
+        if re.match(r"\w+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        found = page.parent / name if name else page
+        assert found.exists(), target
+        assert not anchor or anchor in anchors(found), target
+
+
+def build(folder: Path) -> None:
+    """Builds the site; warnings are errors."""
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "40"}
+    run = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=270,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout[-4000:]
+
+
+def test_the_site_builds_and_fetches_nothing(tmp_path):
+    for package in ("mkdocs", "material", "mkdocstrings"):
+        pytest.importorskip(package, reason=f"{package} is not installed: pip install nmpm[docs]")
+    build(tmp_path)
+    pages = {path.relative_to(tmp_path).as_posix(): path.read_text("utf-8") for path in tmp_path.glob("**/*.html")}
+    sources = {path.relative_to(ROOT / "docs") for path in (ROOT / "docs").glob("**/*.md")}
+    assert pages.keys() >= {path.with_suffix(".html").as_posix() for path in sources}
+    assert pages.keys() >= {"index.html", "zoo/goop/index.html", "benchmarks/index.html"}
+    for name, page in pages.items():
+        assert FETCHED.search(page) is None, name
+    assert all(f'id="nmpm.processors.{name}"' in pages["reference/nmpm.processors.html"] for name in ("UNet", "FNO"))
+    commands = html.unescape(pages["reference/commands.html"])
+    assert all(option in commands for option in ("--shard I/N", "--full", "--private"))
+    concepts = pages["concepts.html"]
+    assert concepts.count("<svg") > 10
+    assert "```math" not in concepts
+
+
+def test_help_does_not_depend_on_the_terminal(monkeypatch):
+    pages = load_hook("pages")
+    written = []
+    for width in ("20", "200"):
+        monkeypatch.setenv("COLUMNS", width)
+        written.append(pages.commands_page())
+    assert written[0] == written[1]
+    assert os.environ["COLUMNS"] == "200"
+
+
+def test_links_are_rewritten_to_their_place_in_the_site(tmp_path):
+    links = load_hook("links")
+    assert links.site_path(ROOT / "docs" / "howto" / "stress.md", ROOT / "docs") == "howto/stress.md"
+    assert links.site_path(ROOT / "zoo" / "README.md", ROOT / "docs") == "zoo/README.md"
