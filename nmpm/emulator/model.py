@@ -256,7 +256,7 @@ class Emulator(nn.Module):
     def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
         """The bundle, operation by operation; only the network is left to the runtime."""
         device = particles.position.device.type
-        steps = steps_for(self, self._plan, particles)
+        steps = steps_for(self, self._plan, particles, context.solid)
         with _full_precision(device):
             cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
             normalised = self.normalise(state)

@@ -121,7 +121,7 @@ def _kernels() -> Any:
     return calls
 
 
-def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles) -> Steps:
+def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
     Kernels run on a CPU, in float32, without gradients, in evaluation mode, for the parts of this package (`make_plan`)
@@ -131,6 +131,6 @@ def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles) -> St
     plain = all(values.device.type == "cpu" and values.dtype == torch.float32 for values in tensors)
     if plan is None or emulator.training or not plain or is_chosen() or emulator.precision != torch.float32:
         return TensorSteps(emulator)
-    if torch.is_grad_enabled() and any(values.requires_grad for values in (*tensors, *emulator.parameters())):
+    if torch.is_grad_enabled() and any(values.requires_grad for values in (*tensors, solid, *emulator.parameters())):
         return TensorSteps(emulator)
     return FusedSteps(plan, emulator.walls)

@@ -46,10 +46,10 @@ def scene_of(dim, walls, materials, obstacles=False, gravity=True, slim=False):
 def predict_both(emulator, particles):
     """A bundle's positions in cells, by kernels and by tensor operations."""
     with torch.no_grad():
-        assert isinstance(steps_for(emulator, emulator._plan, particles), FusedSteps)
+        assert isinstance(steps_for(emulator, emulator._plan, particles, emulator.solid(particles)), FusedSteps)
         fused = emulator(particles)
         with using("native"):
-            assert isinstance(steps_for(emulator, emulator._plan, particles), TensorSteps)
+            assert isinstance(steps_for(emulator, emulator._plan, particles, emulator.solid(particles)), TensorSteps)
             tensors = emulator(particles)
     spacing = torch.tensor(emulator.grid.spacing)
     return [torch.stack([b.position[:, -1], b.velocity]) / spacing for b in (fused, tensors)]
@@ -187,7 +187,7 @@ def test_gradients_and_everything_else_take_tensor_operations():
     emulator, particles = emulator_of(scene), cloud(scene, 10)
 
     def fused(model=emulator, state=particles):
-        return isinstance(steps_for(model, model._plan, state), FusedSteps)
+        return isinstance(steps_for(model, model._plan, state, model.solid(state)), FusedSteps)
 
     assert not fused()  # the weights want gradients
     with torch.no_grad():

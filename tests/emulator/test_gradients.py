@@ -12,6 +12,7 @@ from nmpm.processors import UNet
 from tests.scenes import box, cloud
 
 FRAMES = 5  # of which the last bundle is cut
+FLOATS = ("position", "velocity", "gravity", "obstacle")
 
 
 def emulator(**constraints) -> Emulator:
@@ -54,6 +55,23 @@ def test_gradients_of_a_ramps_angle_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(lambda given: loss(model, state(given)), angle, eps=1e-7, atol=1e-6)
     loss(model, state(angle)).backward()
     assert angle.grad.abs() > 1e-9
+
+
+@pytest.mark.parametrize("constraints", [{}, {"density_cap": 0.5, "energy": True, "rest_speed": 0.01}])
+def test_gradients_of_an_obstacle_alone_are_not_lost_to_the_kernels(constraints):
+    """In float32, where rollouts without gradients take fused kernels."""
+
+    def derivative(also_of_the_position: bool) -> torch.Tensor:
+        model = emulator(**constraints).float()
+        angle = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+        plain = dataclasses.replace(state(angle), **{name: getattr(state(angle), name).float() for name in FLOATS})
+        position = plain.position.detach().requires_grad_(also_of_the_position)
+        loss(model, dataclasses.replace(plain, position=position)).backward()
+        return angle.grad
+
+    alone = derivative(False)
+    assert alone.abs() > 1e-9
+    torch.testing.assert_close(alone, derivative(True), rtol=1e-4, atol=1e-9)
 
 
 def test_gradients_of_a_discs_place_are_finite_and_not_zero_with_contact():
