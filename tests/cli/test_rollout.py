@@ -2,6 +2,7 @@ import errno
 import os
 import re
 import tempfile
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -33,7 +34,8 @@ def test_names_and_paths_give_the_same_rollout(folder):
 
 
 def test_another_runtime_gives_the_same_rollout_to_rounding(folder):
-    pytest.importorskip("openvino")
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
     few = ["rollout", "goop", "--frames", "8", "--particles", "50"]
     for name in ("eager", "openvino"):
         assert main([*few, "--runtime", name, "--out", f"{name}.h5"]) == 0

@@ -1,4 +1,5 @@
 import json
+from importlib.util import find_spec
 
 import pytest
 
@@ -21,7 +22,8 @@ def test_a_table_for_people(capsys):
 
 
 def test_by_another_runtime(capsys):
-    pytest.importorskip("openvino")
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
     assert main(["stress", "goop", "--runtime", "openvino", "--groups", "poison"]) == 0
     assert "5 passed, 0 failed." in capsys.readouterr().out
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -15,7 +16,8 @@ from nmpm.emulator.runtimes import OpenVINO
 from nmpm.errors import ConfigError
 from nmpm.processors import Axial, ConvNeXt, GridProcessor, Identity, Pointwise, UNet
 
-pytest.importorskip("openvino")
+if find_spec("openvino") is None:  # importing it would report to its makers
+    pytest.skip("openvino is not installed", allow_module_level=True)
 
 SMALL = UNet(width=4, depth=1, perceptron=(4,))
 CHANNEL = {"boundary": ("periodic", "wall"), "domain": ((0.1, 0.9), (0.08, 0.92))}

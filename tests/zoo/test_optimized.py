@@ -3,6 +3,7 @@
 import logging
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -29,7 +30,8 @@ class Wrong(Runtime):
 
 
 def test_the_fastest_that_runs_here_is_taken_and_checked(model, caplog):
-    pytest.importorskip("openvino")
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
     caplog.set_level(logging.INFO, "nmpm")
     quick = model.optimized()
     assert isinstance(quick.emulator.runtime, OpenVINO)
@@ -47,7 +49,8 @@ def needs_gradients(values):
 
 @pytest.mark.filterwarnings("ignore:This processor has no bfloat16")
 def test_the_precision_is_that_asked_for(model):
-    pytest.importorskip("openvino")
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
     quick = model.optimized("openvino", "bfloat16")
     assert quick.emulator.network_precision == torch.bfloat16
     with pytest.raises(ConfigError, match="float32 or bfloat16, not in 'float61'"):
@@ -73,6 +76,7 @@ def test_a_runtime_that_computes_something_else_is_refused(model, monkeypatch):
 
 
 def test_a_model_on_another_device_says_that_openvino_is_of_the_cpu(model):
-    pytest.importorskip("openvino")
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
     with pytest.raises(ConfigError, match="runs on CPUs; the model is on meta"):
         model.to("meta").optimized("openvino")

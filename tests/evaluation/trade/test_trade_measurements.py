@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -176,7 +177,8 @@ def test_repeated_choices_are_left_out(scenes):
 
 
 def test_runtimes_are_choices_of_their_own(scenes):
-    pytest.importorskip("openvino")
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
     settings = dataclasses.replace(tiny_sweep().models, runtime=("eager", "openvino"), batch=(1,))
     sweep, models = dataclasses.replace(tiny_sweep(), models=settings), {"carried": tiny_emulator(scenes.scene)}
     plain, quick = (choice for choice in make_choices(sweep, scenes, models) if choice.kind is Kind.MODEL)
