@@ -98,6 +98,39 @@ class ProcessorContract:
                 last = network(grid.contiguous(memory_format=torch.channels_last))
                 torch.testing.assert_close(last, plain, rtol=1e-4, atol=1e-5)
 
+    def test_output_depends_on_the_input_within_the_radius_only(self) -> None:
+        network, length = self._strip_network()
+        if network.radius is None:
+            return
+        grid = torch.randn(1, 4, length, 2 * network.alignment, dtype=torch.float64)
+        before = network(grid)
+        for place in range(network.radius + 1, network.radius + 1 + network.alignment):
+            changed = grid.clone()
+            changed[:, :, place] += 10.0
+            difference = (network(changed) - before).abs().amax((0, 1, 2, 4))
+            assert difference[: place - network.radius].max() < 1e-9
+            assert difference[place + network.radius + 1 :].max() < 1e-9
+
+    def test_a_window_gives_what_the_whole_grid_gives_beyond_the_radius(self) -> None:
+        network, length = self._strip_network()
+        if network.radius is None:
+            return
+        shift, radius = network.alignment, network.radius
+        length += shift + shift // 2  # which is no multiple
+        grid = torch.randn(1, 4, length, 2 * shift, dtype=torch.float64)
+        whole, upper, lower = network(grid), network(grid[:, :, shift:]), network(grid[:, :, : length - shift])
+        inner = length - shift - radius
+        torch.testing.assert_close(upper[..., radius:, :], whole[..., shift + radius :, :], rtol=0, atol=1e-5)
+        torch.testing.assert_close(lower[..., :inner, :], whole[..., :inner, :], rtol=0, atol=1e-5)
+
+    def _strip_network(self) -> tuple[GridProcessor, int]:
+        """A network in float64 on the CPU for a narrow strip, and a length of that beyond what it sees."""
+        network = self.network((16, 16)).eval()
+        if network.radius is None:
+            return network, 0
+        least = 2 * network.radius + 3 + network.alignment
+        return network.cpu().double(), -(-least // network.alignment) * network.alignment
+
     def test_weights_survive_saving(self) -> None:
         shape = self.shapes[0]
         first, grid = self.network(shape).eval(), self.grid(1, 4, *shape)

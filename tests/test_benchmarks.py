@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent / "benchmarks"
 if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
-WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "recipes"} | {
+WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "recipes", "runtimes", "windows"} | {
     "against_recordings", "calibration", "dam_break", "kills", "simulators", "stable_substeps",
     "where_emulation_pays",
 }  # fmt: skip
@@ -50,7 +50,7 @@ def run_script(name, *words):
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help_of_every_script(name):
-    if name == "exported":
+    if name in ("exported", "runtimes"):
         pytest.importorskip("onnxruntime")
     text = run_script(name, "--help")
     assert text.startswith(f"usage: {name}.py")

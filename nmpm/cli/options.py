@@ -31,6 +31,16 @@ def add_device_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda or mps; cuda:1 for the second GPU")
 
 
+def add_runtime_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--runtime`."""
+    parser.add_argument(
+        "--runtime",
+        default="eager",
+        help="what computes the network: eager (torch, default), openvino (CPU, nmpm[openvino]), cuda-graph (GPU), or"
+        " auto for the fastest that runs here",
+    )
+
+
 def check_device(name: str) -> None:
     """Check a `--device` that a rollout can run on.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from nmpm.cli.options import (
     add_device_option,
     add_model_options,
+    add_runtime_option,
     check_at_least,
     check_device,
     check_input,
@@ -35,7 +36,7 @@ def run(words: list[str]) -> None:
     _check(chosen)
     from nmpm.zoo.registry import load_model
 
-    model = load_model(chosen.model, chosen.device, chosen.root).with_network(chosen.precision)
+    model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime, chosen.precision)
     given = chosen.data is not None
     state = _recorded_state(model, chosen.data, chosen.trajectory) if given else _thrown_state(model, chosen)
     _write(model, state, chosen)
@@ -64,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
         default="float32",
         help="of the network: float32 (default), or bfloat16, less accurate, faster if the processor supports it",
     )
+    add_runtime_option(parser)
     parser.add_argument(
         "--watch",
         choices=["warn", "stop", "record"],

@@ -8,7 +8,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import add_device_option, add_model_options, check_device, check_folder
+from nmpm.cli.options import (
+    add_device_option,
+    add_model_options,
+    add_runtime_option,
+    check_device,
+    check_folder,
+)
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -43,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="nmpm stress", description=DESCRIPTION)
     add_model_options(parser)
     add_device_option(parser)
+    add_runtime_option(parser)
     parser.add_argument("--full", action="store_true", help="longer and larger, as zoo cards quote (default: minutes)")
     parser.add_argument("--preset", help="simulator of its scenes (default: of the training data; none if recorded)")
     parser.add_argument("--free", action="store_true", help="without the model's constraints: the network alone")
@@ -63,7 +70,7 @@ def _subject(chosen: argparse.Namespace) -> Subject:
     from nmpm.sim import load_preset, preset_names
     from nmpm.zoo import load_model
 
-    model = load_model(chosen.model, chosen.device, chosen.root)
+    model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime)
     known = model.preset if model.preset in preset_names() else None
     preset = chosen.preset or known
     emulator = model.emulator.unconstrained() if chosen.free else model.emulator

@@ -4,12 +4,14 @@ from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.model import Bundle, Emulator, RolloutContext
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.rollouts import rollout, stream, unroll
+from nmpm.emulator.windows import Windows
 
 __all__ = [
     "Bundle",
     "Emulator",
     "EmulatorRecipe",
     "RolloutContext",
+    "Windows",
     "differentiable_rollout",
     "rollout",
     "stream",

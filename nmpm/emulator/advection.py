@@ -26,6 +26,8 @@ from nmpm.emulator.constraints import (
 from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.crowding import Crowding
 from nmpm.emulator.departure import Departure
+from nmpm.emulator.support import Support
+from nmpm.emulator.windows.reads import check_reads
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
@@ -101,13 +103,15 @@ class Advection:
 
         Raises:
             DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
+            UncoveredReadError: if a particle reads the output where it must not.
         """
         flight = self._take_off(start)
         path = self._free(flight) if budget is None else self._within_energy(flight, budget)
+        if start.readable is not None:
+            check_reads(start.cells, path, start.mask, start.readable, self.grid)
         path = self._clear_of_obstacles(flight, path, solid)
         if self.constraints.rest_speed:
-            still = at_rest(flight.cells, path, self.constraints.rest_speed, flight.gravity)
-            path = torch.where(still[:, None, :, None], flight.cells.unsqueeze(1), path)
+            path = self._bring_to_rest(start, path, solid)
         return self._check_bounds(path)
 
     def uncrowded_path(self, start: Departure, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
@@ -227,6 +231,17 @@ class Advection:
         if not (self.constraints.solids and self.scene.obstacles):
             return path
         return self._confine(Contact(obstacle_share(solid, self.walls), self.grid).hold(flight.cells, path))
+
+    def _bring_to_rest(self, start: Departure, path: Tensor, solid: Tensor) -> Tensor:
+        """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
+        still = at_rest(start.cells, path, self.constraints.rest_speed, start.gravity)
+        if can_branch(still) and not bool(still.any()):
+            return path
+        obstacle = obstacle_share(solid, self.walls) if self.scene.obstacles else None
+        support = Support(start.filled, obstacle, self.scene, self.grid)
+        held = support.holds(start.cells, start.gravity)[:, None, :, None]
+        fallen = self._confine(support.fall(start.cells, start.gravity, path.shape[1]))
+        return torch.where(still[:, None, :, None], torch.where(held, start.cells.unsqueeze(1), fallen), path)
 
     def _afford_spread(self, start: Departure, path: Tensor, spread: Tensor, budget: Tensor) -> Tensor:
         """The largest part of the way from path to spread (B, m, N, D) that no frame's energy (B,) forbids.

@@ -21,6 +21,7 @@ class Departure:
         state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
         output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
         scale: (m, C, 1, ...), by which it is multiplied.
+        readable: (B, *S) bool, the cells that particles may be in when they read `output`; None for all cells.
     """
 
     cells: Tensor
@@ -31,8 +32,15 @@ class Departure:
     state: Tensor
     output: Tensor
     scale: Tensor
+    readable: Tensor | None = None
 
     @property
     def fields(self) -> Tensor:
         """(B, m, C, *S), the predicted velocities, of the scale's precision."""
         return self.output.to(torch.promote_types(self.scale.dtype, torch.float32)) * self.scale
+
+    @property
+    def filled(self) -> Tensor:
+        """(B, 1, *S), the volume fraction of all materials that the network has seen."""
+        materials = self.output.shape[2] // self.cells.shape[-1]
+        return self.state[:, self.output.shape[2] : self.output.shape[2] + materials].sum(1, keepdim=True)

@@ -22,7 +22,9 @@ from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
+from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
+from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -67,6 +69,9 @@ class Emulator(nn.Module):
 
     Args:
         recipe: Its form.
+
+    Attributes:
+        windows: When the network runs on windows around the particles, see `with_windows`; None for never.
     """
 
     input_mean: Tensor
@@ -82,6 +87,8 @@ class Emulator(nn.Module):
         super().__init__()
         self.recipe = recipe
         self._plan = make_plan(recipe)
+        self.runtime: Runtime = Eager()
+        self.windows: Windows | None = Windows()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -162,11 +169,30 @@ class Emulator(nn.Module):
         other.processor.to(precision)
         return other
 
+    def with_runtime(self, name: str) -> Emulator:
+        """This emulator with its network computed by a runtime of `RUNTIMES`; weights are shared, not copied.
+
+        Raises:
+            ConfigError: if there is no such runtime, or it cannot run here; one that lacks an operation of the network
+                says so in the first call.
+        """
+        other = copy.copy(self)
+        other.runtime = find_runtime(name)
+        if obstacle := other.runtime.obstacle(self):
+            raise ConfigError(obstacle)
+        return other
+
     def with_constraints(self, constraints: Constraints) -> Emulator:
         """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
         other = copy.copy(self)
         other.recipe = dataclasses.replace(self.recipe, constraints=constraints)
         other._plan = make_plan(other.recipe)
+        return other
+
+    def with_windows(self, windows: Windows | None) -> Emulator:
+        """This emulator with other limits for windows; None: always the whole grid. Weights are shared, not copied."""
+        other = copy.copy(self)
+        other.windows = windows
         return other
 
     def unconstrained(self) -> Emulator:
@@ -182,11 +208,18 @@ class Emulator(nn.Module):
         return self.rebuilt(self.recipe.over(scene))
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
-        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
+        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes.
+
+        Weights that need no gradients need none in the copy.
+        """
         other = recipe.build().to(self.device)
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
+        for weight, own in zip(other.parameters(), self.parameters(), strict=True):
+            weight.requires_grad_(own.requires_grad)
+        other.runtime = copy.deepcopy(self.runtime)
+        other.windows = self.windows
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
@@ -218,7 +251,10 @@ class Emulator(nn.Module):
             particles: The state to start from.
             context: From `context` of the rollout's first state; of this state when left out.
         """
-        context = self.context(particles) if context is None else context
+        return self.runtime.bundle(self, particles, self.context(particles) if context is None else context)
+
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
+        """The bundle, operation by operation; only the network is left to the runtime."""
         device = particles.position.device.type
         steps = steps_for(self, self._plan, particles, context.solid)
         with _full_precision(device):
@@ -226,11 +262,24 @@ class Emulator(nn.Module):
             normalised = self.normalise(state)
             if self.training and self.recipe.grid_noise > 0:
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
-        output = self.processor(normalised.to(self.network_precision))
+        own = particles
+
+        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
+            if coverage is None:
+                output = self.runtime.fields(self.processor, normalised, self.network_precision)
+            else:
+                output = coverage.predict(self.processor, normalised.to(self.network_precision))
+            readable = None if coverage is None else coverage.readable
+            with _full_precision(device):
+                start = Departure(
+                    cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale, readable
+                )
+                return start, steps.path(start, context)
+
+        fixed = self.training or self.runtime.fixed_shapes
+        windows = None if fixed else choose_windows(self.windows, self.processor, self.recipe, state)
+        start, path = find_in_windows(windows, find_path)
         with _full_precision(device):
-            own = particles
-            start = Departure(cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale)
-            path = steps.path(start, context)
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
             if self.constraints.density_cap and not self.training:

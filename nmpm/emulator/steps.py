@@ -40,7 +40,11 @@ class Steps(ABC):
 
     @abstractmethod
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
-        """(B, m, N, D) positions in cells, held to the emulator's constraints."""
+        """(B, m, N, D) positions in cells, held to the emulator's constraints.
+
+        Raises:
+            UncoveredReadError: if a particle reads the network's output where it must not.
+        """
 
     @abstractmethod
     def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
@@ -94,9 +98,10 @@ class FusedSteps(Steps):
         return cells, velocity, gravity, state
 
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
+        windows = () if start.readable is None else (start.readable,)  # never in traced graphs
         path: Tensor = _kernels().predict_path(
             self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
-            start.output, start.scale, context.solid, self.walls, context.budget,
+            start.output, start.scale, context.solid, self.walls, context.budget, *windows,
         )  # fmt: skip
         return path
 

@@ -5,7 +5,10 @@ Position errors barely notice a liquid that slowly loses its volume; these measu
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -35,9 +38,15 @@ class Shape:
     crowding: Tensor
     peak_crowding: Tensor
 
+    @classmethod
+    def concatenate(cls, shapes: Sequence[Shape]) -> Self:
+        """The scenes of several ones."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: torch.cat([getattr(shape, name) for shape in shapes]) for name in names})
+
     def relative_to(self, other: Shape) -> dict[str, float]:
         """Each measure, summed over scenes, over that of another shape, by name."""
-        names = ("height", "occupied", "crowding", "peak_crowding")
+        names = [field.name for field in dataclasses.fields(self)]
         return {name: float(getattr(self, name).sum() / getattr(other, name).sum()) for name in names}
 
 

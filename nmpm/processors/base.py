@@ -40,7 +40,17 @@ class GridLayout:
 
 
 class GridProcessor(nn.Module, ABC):
-    """A network from a grid state to the next m grid velocity fields."""
+    """A network from a grid state to the next m grid velocity fields.
+
+    Attributes:
+        radius: Cells along each axis from which an output cell depends on the input; None, as here, if it may depend on
+            the whole grid. With a radius, windows of a grid can be computed instead of all of it.
+        alignment: Cells by whose multiples the input may be shifted so that the output is shifted alike, e.g. 2 for a
+            network that works on a grid half as fine.
+    """
+
+    radius: int | None = None
+    alignment: int = 1
 
     @abstractmethod
     def forward(self, grid: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
-from nmpm.processors.ushape import UShape, upsample_nearest
+from nmpm.processors.ushape import UShape, upsample_nearest, ushape_radius
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,8 @@ class ConvNeXtNetwork(GridProcessor):
         super().__init__()
         width, periodic, depth = recipe.width, layout.periodic, recipe.depth
         self.multiple, self.frames = 2**depth, layout.frames
+        reach = recipe.blocks * (recipe.kernel // 2)
+        self.alignment, self.radius = self.multiple, 1 + ushape_radius(depth, level=reach, bottom=reach, between=2)
 
         def level() -> nn.Sequential:
             return nn.Sequential(*(Block(recipe, periodic) for _ in range(recipe.blocks)))

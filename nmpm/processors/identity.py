@@ -23,6 +23,8 @@ class Identity(Processor):
 class IdentityNetwork(GridProcessor):
     """Repeats channels; where there are fewer than are asked for, from the first on again."""
 
+    radius = 0
+
     def __init__(self, layout: GridLayout) -> None:
         super().__init__()
         self.frames = layout.frames

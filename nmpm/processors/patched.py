@@ -62,6 +62,9 @@ class PatchedNetwork(GridProcessor):
     def __init__(self, patch: int, network: GridProcessor) -> None:
         super().__init__()
         self.patch, self.network = patch, network
+        self.alignment = patch * network.alignment
+        if network.radius is not None:
+            self.radius = patch * network.radius + patch - 1
 
     def forward(self, grid: Tensor) -> Tensor:
         coarse = cells_to_channels(pad_to_multiple(grid, self.patch), self.patch)

@@ -27,6 +27,8 @@ class Pointwise(Processor):
 class PointwiseNetwork(GridProcessor):
     """1x1 convolutions."""
 
+    radius = 0
+
     def __init__(self, recipe: Pointwise, layout: GridLayout) -> None:
         super().__init__()
         self.frames = layout.frames

@@ -19,6 +19,7 @@ from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import Convolution, Upsampling, pointwise
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.ushape import ushape_radius
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,9 @@ class UNetNetwork(GridProcessor):
     def __init__(self, recipe: UNet, layout: GridLayout) -> None:
         super().__init__()
         width, periodic = recipe.width, layout.periodic
-        self.multiple = 2**recipe.depth
+        self.multiple = self.alignment = 2**recipe.depth
+        reach = recipe.kernel // 2
+        self.radius = ushape_radius(recipe.depth, level=reach, bottom=2 * reach, between=3)
         hidden = recipe.perceptron
         self.encoder = pointwise([layout.in_channels, *hidden, width], layout.dim)
         self.down = nn.ModuleList(Convolution(width, width, recipe.kernel, periodic) for _ in range(recipe.depth + 1))

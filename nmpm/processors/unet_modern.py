@@ -18,7 +18,7 @@ from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
-from nmpm.processors.ushape import UShape, upsample_nearest
+from nmpm.processors.ushape import UShape, upsample_nearest, ushape_radius
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,10 @@ class UNetModernNetwork(GridProcessor):
         periodic, kernel = layout.periodic, recipe.kernel
         widths = [recipe.width * factor for factor in recipe.growth]
         self.multiple, self.frames = 2**recipe.depth, layout.frames
+        self.alignment, reach = self.multiple, kernel // 2
+        if not recipe.groups:  # normalisation over groups takes the mean over all cells
+            wide = 2 * recipe.blocks * reach
+            self.radius = reach + ushape_radius(recipe.depth, level=wide, bottom=wide, between=2 + reach)
 
         def level(width: int) -> nn.Sequential:
             return nn.Sequential(*(ResidualBlock(width, kernel, periodic, recipe.groups) for _ in range(recipe.blocks)))

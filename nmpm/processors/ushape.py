@@ -43,3 +43,16 @@ class UShape(nn.Module):
 def upsample_nearest() -> nn.Module:
     """Upsampling that repeats each cell twice along each axis."""
     return nn.Upsample(scale_factor=2.0, mode="nearest")
+
+
+def ushape_radius(depth: int, level: int, bottom: int, between: int) -> int:
+    """Radius in cells of levels of convolutions in a U shape, see `GridProcessor.radius`.
+
+    Args:
+        depth: Number of down-samplings by 2.
+        level: Cells that the convolutions of a level but the coarsest reach, on the way down and on the way up each.
+        bottom: Cells that those of the coarsest level reach.
+        between: Cells that a step to the coarser level and back reaches; of these, the strided convolution has 1.5.
+    """
+    coarsest = 1 << depth
+    return (coarsest - 1) * (2 * level + between) + coarsest * bottom

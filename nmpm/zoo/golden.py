@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator import Emulator, rollout
-from nmpm.errors import ConfigError
 from nmpm.zoo.pretrained import Pretrained
 
 FRAMES = 32
@@ -22,20 +21,8 @@ TOLERANCE = 1e-3
 
 def golden_rollout(emulator: Emulator) -> dict[str, Any]:
     """The last positions of some particles in a rollout of thrown blocks, with what determines it."""
-    count = fitting_count(Pretrained(emulator, {}), COUNT)
+    count = Pretrained(emulator, {}).fitting_count(COUNT)
     return {"seed": 0, "count": count, "frames": FRAMES, "position": _positions(emulator, 0, count, FRAMES).tolist()}
-
-
-def fitting_count(model: Pretrained, count: int) -> int:
-    """The number of particles, halved until a block of them fits into the box."""
-    while count > 1:
-        try:
-            model.example(count=count)
-        except ConfigError:
-            count //= 2
-        else:
-            break
-    return count
 
 
 def golden_distance(model: Pretrained, golden: Mapping[str, Any]) -> float:

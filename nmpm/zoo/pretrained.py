@@ -15,14 +15,17 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, differentiable_rollout, rollout
+from nmpm.emulator import Emulator, Windows, differentiable_rollout, rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
+from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.states import StateBuilder
 
 NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 """Precisions of a pretrained network, by name."""
+_EXAMPLE = 300
+"""Particles of the example by which runtimes are compared."""
 SIMULATED = ", simulated by nmpm"
 """What follows a preset's name in the description of its dataset."""
 
@@ -124,6 +127,41 @@ class Pretrained:
         if precision not in NETWORK_PRECISIONS:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
+
+    def with_windows(self, windows: Windows | None) -> Pretrained:
+        """The same model with other limits for windows around the particles; None: always the whole grid."""
+        return dataclasses.replace(self, emulator=self.emulator.with_windows(windows))
+
+    def optimized(self, runtime: str = AUTO, precision: str | None = None) -> Pretrained:
+        """The same model for inference alone, its network computed by a faster runtime than torch.
+
+        One bundle of an example is compared with torch's. Programs are compiled in the first call for each batch and
+        grid, in a second or two, for as many threads as torch then has. This model is left as it is.
+
+        Args:
+            runtime: A name of `nmpm.emulator.runtimes.RUNTIMES`: "openvino" (CPU, needs `nmpm[openvino]`), "cuda-graph"
+                (GPU) or "eager", torch itself; "auto" for the fastest that can run the model here.
+            precision: As for `with_network`; the network's own if left out.
+
+        Raises:
+            ConfigError: if the runtime is not installed, cannot run the model here, or computes something else.
+        """
+        model = self if precision is None else self.with_network(precision)
+        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, model._small_example))
+
+    def _small_example(self) -> Particles:
+        return self.example(count=self.fitting_count(_EXAMPLE)).to(self.emulator.device)
+
+    def fitting_count(self, count: int) -> int:
+        """The number of particles, halved until a block of them fits into the box."""
+        while count > 1:
+            try:
+                self.example(count=count)
+            except ConfigError:
+                count //= 2
+            else:
+                break
+        return count
 
     def to(self, device: torch.device | str) -> Pretrained:
         """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest.

@@ -10,7 +10,6 @@ from nmpm._support.devices import device_name
 from nmpm.emulator import rollout
 from nmpm.evaluation.machine import peak_bytes, wall_clock
 from nmpm.particles import Particles
-from nmpm.zoo.golden import fitting_count
 from nmpm.zoo.pretrained import Pretrained
 
 BATCHES = (1, 4, 16)
@@ -32,7 +31,7 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
         `hardware`, `particles`, `ms_per_frame` of one scene, the `best_batch` of `BATCHES` with its
         `best_ms_per_frame` and scene, and `memory_mb`, the peak on a GPU beside the weights, None elsewhere.
     """
-    count = fitting_count(model, int(model.card.get("particles", PARTICLES)))
+    count = model.fitting_count(int(model.card.get("particles", PARTICLES)))
     state = model.example(count=count).to(model.emulator.device)
     times = {batch: _milliseconds(model, _repeated(state, batch)) / batch for batch in BATCHES}
     best = min(times, key=lambda batch: times[batch])

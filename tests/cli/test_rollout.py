@@ -32,6 +32,15 @@ def test_names_and_paths_give_the_same_rollout(folder):
     np.testing.assert_array_equal(a, c)
 
 
+def test_another_runtime_gives_the_same_rollout_to_rounding(folder):
+    pytest.importorskip("openvino")
+    few = ["rollout", "goop", "--frames", "8", "--particles", "50"]
+    for name in ("eager", "openvino"):
+        assert main([*few, "--runtime", name, "--out", f"{name}.h5"]) == 0
+    one, other = (Split(folder / f"{name}.h5").read(0).position for name in ("eager", "openvino"))
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -49,6 +58,8 @@ def test_names_and_paths_give_the_same_rollout(folder):
         (["goop", "--device", "cuda:77"], "has no device 'cuda:77'"),
         (["goop", "--device", "gpu"], "--device gpu: it is not one of auto, cpu, cuda, mps"),
         (["goop", "--device", "meta"], "--device meta: it is not one of"),
+        (["goop", "--runtime", "fast"], "No runtime is called 'fast'; there are cuda-graph, openvino, eager."),
+        (["goop", "--runtime", "cuda-graph"], "The runtime cuda-graph needs a CUDA GPU; the model is on cpu."),
         (["gop"], "Did you mean goop?"),
         (["nothing.ckpt"], "nothing.ckpt: there is no such checkpoint"),
         (["."], "holds no model"),

@@ -20,6 +20,12 @@ def test_a_table_for_people(capsys):
     assert "5 passed, 0 failed." in out
 
 
+def test_by_another_runtime(capsys):
+    pytest.importorskip("openvino")
+    assert main(["stress", "goop", "--runtime", "openvino", "--groups", "poison"]) == 0
+    assert "5 passed, 0 failed." in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -12,11 +12,13 @@ from nmpm.processors import UNet
 from tests.scenes import box, cloud
 
 BUNDLES = 6
+WEIGHTLESS = box(gravity=(0.0, 0.0))
 
 
 def emulator(rest_speed: float) -> Emulator:
     torch.manual_seed(0)
-    recipe = EmulatorRecipe(box(), 16, 4, processor=UNet(4, 1), constraints=Constraints(rest_speed=rest_speed))
+    constraints = Constraints(rest_speed=rest_speed)
+    recipe = EmulatorRecipe(WEIGHTLESS, 16, 4, processor=UNet(4, 1), constraints=constraints)
     return recipe.build().eval().requires_grad_(False)
 
 
@@ -38,7 +40,7 @@ def called_each_time(model: Emulator, particles: Particles) -> list[torch.Tensor
 
 @pytest.mark.parametrize("batch", [1, 3])
 def test_a_scene_at_rest_is_not_computed_again(batch):
-    model, particles = emulator(rest_speed=1e3), cloud(box(), batch=batch)
+    model, particles = emulator(rest_speed=1e3), cloud(WEIGHTLESS, batch=batch)
     expected, calls = called_each_time(model, particles), count_calls(model)
     found = [bundle.position for bundle in unroll(model, particles, BUNDLES)]
     assert 1 < calls[0] < BUNDLES
@@ -46,7 +48,7 @@ def test_a_scene_at_rest_is_not_computed_again(batch):
 
 
 def test_what_moves_is_computed():
-    model, particles = emulator(rest_speed=0.0), cloud(box(), speed=0.01)
+    model, particles = emulator(rest_speed=0.0), cloud(WEIGHTLESS, speed=0.01)
     expected, calls = called_each_time(model, particles), count_calls(model)
     found = [bundle.position for bundle in unroll(model, particles, BUNDLES)]
     assert calls == [BUNDLES]
@@ -55,7 +57,7 @@ def test_what_moves_is_computed():
 
 def test_one_moving_scene_keeps_its_batch_awake():
     model = emulator(rest_speed=0.05)
-    resting, moving = cloud(box(), speed=0.0), cloud(box(), speed=0.02, seed=1)
+    resting, moving = cloud(WEIGHTLESS, speed=0.0), cloud(WEIGHTLESS, speed=0.02, seed=1)
     both = dataclasses.replace(
         resting,
         **{
@@ -72,5 +74,5 @@ def test_one_moving_scene_keeps_its_batch_awake():
 def test_training_computes_every_bundle():
     model = emulator(rest_speed=1e3).train()
     calls = count_calls(model)
-    list(unroll(model, cloud(box(), speed=0.0), BUNDLES))
+    list(unroll(model, cloud(WEIGHTLESS, speed=0.0), BUNDLES))
     assert calls == [BUNDLES]

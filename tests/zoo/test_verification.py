@@ -13,11 +13,12 @@ from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.sim import load_preset
+from nmpm.sim.twin import twin_of
 from nmpm.zoo import Zoo
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.lifecycle import lifecycle
-from nmpm.zoo.measures.simulator import measure_twin, twin_of
+from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.verification import Check, verify
 
 SHIPPED = shipped_folder("zoo")

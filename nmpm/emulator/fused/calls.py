@@ -16,7 +16,7 @@ from torch import Tensor
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.fused.contact import fill_share
 from nmpm.emulator.fused.flight import land
-from nmpm.emulator.fused.path import SceneArrays, clear_of_obstacles, fly_scene, rest_scene
+from nmpm.emulator.fused.path import SceneArrays, check_scene_reads, clear_of_obstacles, fly_scene, rest_scene
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.fused.rasterise import rasterise_scene
 from nmpm.transfer.fused.fields import unpack_bfloat16, unpack_float32
@@ -52,11 +52,12 @@ def rasterise(
 
 def predict_path(
     plan: Plan, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, state: Tensor,
-    output: Tensor, scale: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None,
+    output: Tensor, scale: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None, readable: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """(B, m, N, D) positions in cells, as `Advection.constrained_path` gives them.
 
     Raises:
+        UncoveredReadError: if a particle reads the output where it must not, see `Departure`.
         IndexError: if a particle's material is none of the scene's.
     """
     batch, count, dim = cells.shape
@@ -76,11 +77,14 @@ def predict_path(
         here, speed, kind, real, fall, grid = (values[scene] for values in inputs)
         start = SceneArrays(here, speed, kind, real, fall, grid, flows)
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
+        if readable is not None:
+            check_scene_reads(start, plan, _array(readable[scene]).reshape(-1), path[scene], threads)
         if plan.obstacles:
             fill_share(solids[scene], rooms, share)
+        if plan.obstacles and plan.solids:
             clear_of_obstacles(start, plan, share, path[scene], threads)
         if plan.rest_speed:
-            rest_scene(start, plan, path[scene], threads)
+            rest_scene(start, plan, share, path[scene], threads)
     return torch.from_numpy(path)
 
 

@@ -1,4 +1,4 @@
-"""Kernels that move particles: frame by frame through a bundle, and to rest, as `nmpm.emulator.advection` does.
+"""Kernels that move particles: frame by frame through a bundle, as `nmpm.emulator.advection` does.
 
 Arrays are those of one scene: positions and velocities (N, D), paths (m, N, D), all in cells. Each kernel treats the
 particles from `low` to `high`, so that threads share a scene.
@@ -14,6 +14,7 @@ from nmpm._support.jit import jit, jit_sum
 from nmpm.transfer.fused.gather import gather
 
 _BLOCK = 512  # particles: their places and velocities stay in the fastest cache
+_FAR = np.float32(1e9)  # cells; positions beyond, and those that are not finite, count as 0
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
@@ -75,6 +76,22 @@ def fly(
                 energies[frame] += energy(path[frame, begin:end], here, gravity, share[begin:end], ratio)
             before = here
     return energies
+
+
+@jit
+def leaves(cells: Any, path: Any, mask: Any, readable: Any, shape: Any, wraps: Any, low: Any, high: Any) -> Any:
+    """Whether a particle was in a cell that is not readable (size,) when a frame was interpolated there."""
+    for frame in range(len(path)):
+        for p in range(low, high):
+            node = 0
+            for d in range(cells.shape[1]):
+                x = path[frame - 1, p, d] if frame > 0 else cells[p, d]
+                cell = np.int64(np.floor(x)) if abs(x) < _FAR else 0
+                inside = cell % shape[d] if wraps[d] else min(max(cell, 0), shape[d] - 1)
+                node = node * shape[d] + inside
+            if mask[p] and not readable[node]:
+                return True
+    return False
 
 
 @jit
@@ -144,30 +161,6 @@ def weigh(material: Any, mask: Any, mass: Any, share: Any) -> Any:
     scale = np.float32(1 / total) if total > 0 else ZERO
     for p in range(len(mask)):
         share[p] *= scale
-
-
-@jit
-def rest(cells: Any, path: Any, gravity: Any, speed: Any, free_fall: Any, low: Any, high: Any) -> Any:
-    """Leave particles where they started that neither move nor fall, as `nmpm.emulator.constraints.at_rest` says."""
-    frames, dim = path.shape[0], path.shape[1 + 1]
-    half = frames // 2
-    gravity_square = ZERO
-    for d in range(dim):
-        gravity_square += gravity[d] * gravity[d]
-    for p in range(low, high):
-        moved, gained = ZERO, ZERO
-        for d in range(dim):
-            way = path[frames - 1, p, d] - cells[p, d]
-            moved += way * way
-            if frames > 1:
-                middle = path[half - 1, p, d]
-                late = (path[frames - 1, p, d] - middle) / np.float32(frames - half)
-                gained += (late - (middle - cells[p, d]) / np.float32(half)) * gravity[d]
-        falls = frames > 1 and gained > free_fall * np.float32(frames) * HALF * gravity_square
-        if np.sqrt(moved) < speed * np.float32(frames) and not falls:
-            for frame in range(frames):
-                for d in range(dim):
-                    path[frame, p, d] = cells[p, d]
 
 
 @jit

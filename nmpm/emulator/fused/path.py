@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import torch
 
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
 from nmpm.emulator.fused import contact
-from nmpm.emulator.fused.flight import fly, rest, weigh
+from nmpm.emulator.fused.flight import fly, leaves, weigh
 from nmpm.emulator.fused.limit import propose, shorten
 from nmpm.emulator.fused.plan import Array, Plan
+from nmpm.emulator.fused.support import rest, support
+from nmpm.emulator.support import drops
+from nmpm.emulator.windows.reads import UncoveredReadError
 
 _CHUNK = 2**14  # particles that a thread treats at once; sums do not depend on the number of threads
 _MAX_PIECES = 64
@@ -102,10 +106,38 @@ def _largest_root(square: float, slope: float, constant: float) -> tuple[float, 
     return (math.sqrt(max(inner, _TINY)) - slope) / (2 * square if moves else 1.0), moves and inner >= 0
 
 
-def rest_scene(start: SceneArrays, plan: Plan, path: Array, threads: int) -> None:
-    """Leave resting particles of a scene where they started."""
+def check_scene_reads(start: SceneArrays, plan: Plan, readable: Array, path: Array, threads: int) -> None:
+    """Raise UncoveredReadError if a scene's path was interpolated from cells that must not be read.
+
+    Args:
+        start: Where the bundle starts.
+        plan: Of the emulator.
+        readable: (size,) bool.
+        path: (m, N, D) before contact and rest have changed it.
+        threads: How many work.
+    """
+    stray = partial(leaves, start.cells, path, start.mask, readable, plan.shape, plan.wraps)
+    if any(map_ranges(stray, split(len(start.cells), _CHUNK), threads)):
+        raise UncoveredReadError
+
+
+def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, threads: int) -> None:
+    """Leave resting particles of a scene where they started if something holds them up; let the others fall.
+
+    Args:
+        start: Where the bundle starts.
+        plan: Of the emulator.
+        share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
+        path: (m, N, D), is changed.
+        threads: How many work.
+    """
+    held, grid = np.empty(len(start.state), np.bool_), (plan.shape, plan.wraps)
+    support(start.state, plan.volume_channels, share, start.gravity, grid, plan.floor_rows, held)
+    fall = drops(torch.from_numpy(start.gravity).view(1, 1, -1), len(path))[0, :, 0].numpy()
     speed = np.float32(plan.rest_speed)
-    still = partial(rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE))
+    still = partial(
+        rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE), share, grid, held, fall, plan.limits
+    )  # fmt: skip
     map_ranges(still, split(len(start.cells), _CHUNK), threads)
 
 

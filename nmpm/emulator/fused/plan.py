@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nmpm._support.plain_data import to_tuples
 from nmpm.decoders import Absolute, Acceleration, Blend, Decoder, Flip, Residual
+from nmpm.emulator.support import floor_rows
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
 
 if TYPE_CHECKING:
@@ -57,7 +58,9 @@ class Plan:
         bounds: Lowest and highest positions in domain length, per axis.
         reflects: Whether particles are mirrored at the bounds instead of stopped.
         rest_speed: Cells per frame; 0 for none.
-        obstacles: Whether particles must keep clear of obstacles.
+        obstacles: Whether there can be obstacles.
+        solids: Whether particles must keep clear of them.
+        floors: As `nmpm.emulator.support.floor_rows`.
     """
 
     shape: tuple[int, ...]
@@ -75,6 +78,8 @@ class Plan:
     reflects: bool
     rest_speed: float
     obstacles: bool
+    solids: bool
+    floors: tuple[tuple[int, int], ...]
 
     def to_text(self) -> str:
         """The plan as JSON."""
@@ -115,6 +120,16 @@ class Plan:
         return np.where(np.all(np.abs(ratio - 1) < 1e-6), 1.0, ratio).astype(np.float32)
 
     @cached_property
+    def floor_rows(self) -> Array:
+        """(D, 2) int64."""
+        return np.array(self.floors, np.int64)
+
+    @property
+    def volume_channels(self) -> tuple[int, int]:
+        """The grid state's first channel that is a volume fraction, and the one after the last."""
+        return len(self.mass) * self.dim, len(self.mass) * (self.dim + 1)
+
+    @cached_property
     def masses(self) -> Array:
         """(M,) float32."""
         return np.array(self.mass, np.float32)
@@ -149,7 +164,9 @@ def make_plan(recipe: EmulatorRecipe) -> Plan | None:
         bounds=scene.bounds,
         reflects=constraints.bounds == "reflect",
         rest_speed=constraints.rest_speed,
-        obstacles=constraints.solids and scene.obstacles,
+        obstacles=scene.obstacles,
+        solids=constraints.solids,
+        floors=floor_rows(scene, grid),
     )
 
 

@@ -9,6 +9,7 @@ import torch
 
 from nmpm.evaluation.stress.counts import counts
 from nmpm.evaluation.stress.duration import duration
+from nmpm.evaluation.stress.free import free
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.obstacles import obstacles
 from nmpm.evaluation.stress.poison import poison
@@ -31,6 +32,7 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
         "sensitivity": sensitivity,
         "obstacles": obstacles,
         "poison": poison,
+        "free": free,
     }
 )
 

@@ -26,6 +26,13 @@ _PROBE = 200
 
 def duration(subject: Subject, size: Size) -> Iterator[Line]:
     """Long rollouts of the scenes that the model knows."""
+    yield from energy_and_rest(subject, size)
+    far = trace_rollout(subject.emulator, subject.starts(1), size.far)
+    yield Line(_GROUP, f"{size.far:,} frames", far.valid, far.figures(), INVARIANTS)
+
+
+def energy_and_rest(subject: Subject, size: Size) -> Iterator[Line]:
+    """Energy over many training horizons, then rest and volume of what has settled."""
     state = subject.starts(size.scenes)
     frames = size.horizons * subject.horizon
     long = trace_rollout(subject.emulator, state, frames)
@@ -34,8 +41,6 @@ def duration(subject: Subject, size: Size) -> Iterator[Line]:
         _GROUP, f"{size.horizons} training horizons ({frames} frames)", long.valid, long.figures(), INVARIANTS, curves
     )  # fmt: skip
     yield failure(long)
-    far = trace_rollout(subject.emulator, state.scenes(slice(1)), size.far)
-    yield Line(_GROUP, f"{size.far:,} frames", far.valid, far.figures(), INVARIANTS)
     yield from settled_lines(subject, long, state, size)
 
 

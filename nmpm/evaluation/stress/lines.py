@@ -40,7 +40,8 @@ class Size:
         compared: Frames that are compared with the simulator.
         particles: Largest number of particles in one scene.
         bundles: Largest number of bundles that gradients go through.
-        settling_multiples: Lengths of the settling rollouts, in trajectories of the preset.
+        settling_scenes: Scenes of the settling rollouts: single ones scatter by a fifth.
+        settling_multiples: Where their shapes are compared, in trajectories of the preset.
     """
 
     scenes: int
@@ -51,7 +52,8 @@ class Size:
     compared: int
     particles: int
     bundles: int
-    settling_multiples: tuple[float, ...] = (1.0, 1.7, 2.5)
+    settling_scenes: int = 8
+    settling_multiples: tuple[float, ...] = (1.0, 5 / 3, 5 / 2)
 
 
 QUICK = Size(scenes=2, horizons=25, far=4_000, settling=3, settled=1_600, compared=160, particles=100_000, bundles=16)
@@ -64,5 +66,5 @@ FULL = Size(
     compared=400,
     particles=10_000_000,
     bundles=64,
-    settling_multiples=(1.0, 1.7, 2.5, 20.0),
+    settling_multiples=(1.0, 5 / 3, 5 / 2, 20.0),
 )

@@ -28,7 +28,7 @@ _GROUP = "precision and sensitivity"
 def precision(subject: Subject, size: Size) -> Iterator[Line]:
     """Rollouts in other precisions, beside the model's own sensitivity."""
     state, frames = subject.starts(size.scenes), 4 * subject.horizon
-    emulator = subject.emulator
+    emulator = subject.emulator.with_runtime("eager")  # which has every precision, and gradients
     plain = rollout(emulator, state, frames)
     nudged = rollout(emulator, nudge(subject, state), frames)
     double = rollout(copy.deepcopy(emulator).double(), state.double(), frames)
@@ -50,7 +50,7 @@ def precision(subject: Subject, size: Size) -> Iterator[Line]:
 def sensitivity(subject: Subject, size: Size) -> Iterator[Line]:
     """How fast a nudge grows, in the emulator and in the simulator; gradients through more and more bundles."""
     state, frames = subject.starts(size.scenes), 4 * subject.horizon
-    emulator = subject.emulator
+    emulator = subject.emulator.with_runtime("eager")
     pair = rollout(emulator, state, frames), rollout(emulator, nudge(subject, state), frames)
     figures = {"growth_per_100_frames": growth(rms_distance(emulator.grid, state.mask, *pair))}
     if subject.preset is not None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from torch import Tensor
 
-from nmpm.emulator import Emulator, rollout
-from nmpm.evaluation.shape import measure_shape
+from nmpm.emulator import Emulator
+from nmpm.emulator.rollouts import stream
+from nmpm.evaluation.shape import Shape, measure_shape
 from nmpm.evaluation.stress.lines import Line, Size
-from nmpm.evaluation.stress.subject import Subject, simulate_window
+from nmpm.evaluation.stress.subject import Subject, simulate_scenes
 from nmpm.particles import Particles, Window
+from nmpm.sim import Preset
+from nmpm.sim.twin import twin_of
 
 MAX_DEVIATION = 0.05
 """Share by which height, occupied cells and crowding may differ from the simulator's."""
+
+Shapes = dict[int, list[Shape]]
+"""Shapes by frame, one for each window."""
 
 _GROUP = "settling"
 _NEEDS = f"height, occupied cells and crowding within {MAX_DEVIATION:.0%} of the simulator's"
@@ -23,32 +29,67 @@ def settling(subject: Subject, size: Size) -> Iterator[Line]:
     """Shape beside the simulator's at the same frames, with constraints and without.
 
     Constraints freeze what they take for resting, so that measuring only what rests would test them, not the network.
+    The simulator's own scatter, its twin's shape beside its own, stands beside each figure.
     """
     if subject.preset is None or not subject.emulator.scene.gravity_known:
         yield Line(_GROUP, "shape beside the simulator: there is none, or gravity is unknown", None, {})
         return
-    frames = [round(multiple * subject.preset.frames) for multiple in size.settling_multiples]
-    window = simulate_window(subject, subject.preset, size.scenes, frames[-1])
     forms = {"with constraints": subject.emulator, "without constraints": subject.emulator.unconstrained()}
-    for name, emulator in forms.items():
-        yield _line(name, compare_shapes(emulator, window, frames))
+    if forms["with constraints"].constraints == forms["without constraints"].constraints:
+        del forms["with constraints"]
+    frames = [round(multiple * subject.preset.frames) for multiple in size.settling_multiples]
+    twin, *others = _compare(subject, subject.preset, list(forms.values()), frames, size.settling_scenes)
+    for name, ratios in zip(forms, others, strict=True):
+        yield _line(name, ratios, twin)
 
 
-def compare_shapes(emulator: Emulator, window: Window, frames: list[int]) -> dict[int, dict[str, float]]:
+def compare_shapes(emulator: Emulator, window: Window, frames: Sequence[int]) -> dict[int, dict[str, float]]:
     """Measures of a rollout over those of the recorded trajectories, by frame (from 1) and name."""
-    predicted = rollout(emulator, window.initial, frames[-1])
-    return {frame: _ratios(emulator, window.initial, predicted, window.target, frame) for frame in frames}
+    return _ratios(_predicted(emulator, window.initial, frames), _recorded(emulator, window, frames), frames)
 
 
-def _ratios(emulator: Emulator, state: Particles, predicted: Tensor, target: Tensor, frame: int) -> dict[str, float]:
-    shapes = [
-        measure_shape(emulator.scene, emulator.grid, state, positions[:, frame - 1])
-        for positions in (predicted, target)
-    ]
-    return shapes[0].relative_to(shapes[1])
+def _compare(
+    subject: Subject, preset: Preset, emulators: Sequence[Emulator], frames: Sequence[int], scenes: int
+) -> list[dict[int, dict[str, float]]]:
+    """Measures of the twin and of each emulator over the simulator's, scene by scene, as long ones take memory."""
+    found: list[Shapes] = [{frame: [] for frame in frames} for _ in range(len(emulators) + 2)]
+    truths = simulate_scenes(subject, preset, scenes, max(frames))
+    twins = simulate_scenes(subject, preset, scenes, max(frames), twin_of(preset))
+    for truth, twin in zip(truths, twins, strict=True):
+        shapes = [_recorded(subject.emulator, window, frames) for window in (truth, twin)]
+        shapes += [_predicted(emulator, truth.initial, frames) for emulator in emulators]
+        for kept, own in zip(found, shapes, strict=True):
+            for frame in frames:
+                kept[frame] += own[frame]
+    simulated, *others = found
+    return [_ratios(other, simulated, frames) for other in others]
 
 
-def _line(name: str, ratios: Mapping[int, Mapping[str, float]]) -> Line:
-    figures = {f"{what}_at_{frame}": value for frame, row in ratios.items() for what, value in row.items()}
-    worst = max(abs(value - 1) for value in figures.values())
-    return Line(_GROUP, f"shape beside the simulator, {name}", worst <= MAX_DEVIATION, figures, _NEEDS)
+def _recorded(emulator: Emulator, window: Window, frames: Sequence[int]) -> Shapes:
+    return {frame: [_shape(emulator, window.initial, window.target[:, frame - 1])] for frame in frames}
+
+
+def _predicted(emulator: Emulator, state: Particles, frames: Sequence[int]) -> Shapes:
+    """The shapes of a rollout, of which only one bundle is kept at a time."""
+    shapes, made = {}, 0
+    for bundle in stream(emulator, state, max(frames)):
+        for frame in frames:
+            if made < frame <= made + bundle.shape[1]:
+                shapes[frame] = [_shape(emulator, state, bundle[:, frame - made - 1])]
+        made += bundle.shape[1]
+    return shapes
+
+
+def _shape(emulator: Emulator, state: Particles, position: Tensor) -> Shape:
+    return measure_shape(emulator.scene, emulator.grid, state, position)
+
+
+def _ratios(these: Shapes, those: Shapes, frames: Sequence[int]) -> dict[int, dict[str, float]]:
+    return {frame: Shape.concatenate(these[frame]).relative_to(Shape.concatenate(those[frame])) for frame in frames}
+
+
+def _line(name: str, ratios: Mapping[int, Mapping[str, float]], twin: Mapping[int, Mapping[str, float]]) -> Line:
+    own = {f"{what}_at_{frame}": value for frame, row in ratios.items() for what, value in row.items()}
+    other = {f"twin_{what}_at_{frame}": value for frame, row in twin.items() for what, value in row.items()}
+    worst = max(abs(value - 1) for value in own.values())
+    return Line(_GROUP, f"shape beside the simulator, {name}", worst <= MAX_DEVIATION, own | other, _NEEDS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -63,12 +64,31 @@ class Subject:
         return replace(self, emulator=emulator)
 
 
-def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -> Window:
-    """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the subject's device."""
-    longer, reader = preset.with_frames(frames + 1), RecordingReader(preset_metadata(preset), preset.scene)
-    recordings = []
+def simulate_window(subject: Subject, preset: Preset, count: int, frames: int, solver: Preset | None = None) -> Window:
+    """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the subject's device.
+
+    Args:
+        subject: Gives the seeds of the scenes.
+        preset: Draws their initial states.
+        count: Scenes.
+        frames: Frames after the first two.
+        solver: Simulates them; left out, the preset itself.
+    """
+    return _window(subject, preset, subject.seeds(count), frames, solver)
+
+
+def simulate_scenes(
+    subject: Subject, preset: Preset, count: int, frames: int, solver: Preset | None = None
+) -> Iterator[Window]:
+    """The scenes of `simulate_window` one by one, which bounds the memory of long ones."""
     for seed in subject.seeds(count):
-        trajectory = longer.simulate(seed)
+        yield _window(subject, preset, [seed], frames, solver)
+
+
+def _window(subject: Subject, preset: Preset, seeds: list[int], frames: int, solver: Preset | None) -> Window:
+    reader, recordings = RecordingReader(preset_metadata(preset), preset.scene), []
+    for seed in seeds:
+        trajectory = (solver or preset).simulate_from(preset.draw(seed), frames + 1)
         stored = Trajectory(trajectory.position, trajectory.particle_type, trajectory.attributes)
         recordings.append(reader.recording(stored, f"{preset.name}, seed {seed}"))
     return collate(recordings, preset.scene).to(subject.device)

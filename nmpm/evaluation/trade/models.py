@@ -46,11 +46,12 @@ class ModelChoice(Choice):
 
     @property
     def identity(self) -> Mapping[str, Any]:
+        runtime = self.emulator.runtime.name
         return {
             "recipe": self.emulator.recipe.to_dict(),
             "weights": weights_digest(self.emulator.state_dict()),
             "device": self.device.type,
-        }
+        } | ({"runtime": runtime} if runtime != "eager" else {})  # (stored measurements of before are eager's)
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         state = scenes.window(indices, 0).to(self.device).initial

@@ -39,6 +39,7 @@ class ModelSettings:
         precision: Of the network, see `models.PRECISIONS`.
         constraints: "held" and "free", see `models.CONSTRAINTS`.
         cells: Times as many grid cells along each axis as in training.
+        runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
         batch: Scenes at once.
         threads: Of torch.
     """
@@ -46,6 +47,7 @@ class ModelSettings:
     precision: tuple[str, ...] = ("float32", "bfloat16")
     constraints: tuple[str, ...] = ("held", "free")
     cells: tuple[float, ...] = (1.0,)
+    runtime: tuple[str, ...] = ("eager",)
     batch: tuple[int, ...] = (1, 8)
     threads: tuple[int, ...] = (1,)
 
@@ -230,14 +232,16 @@ def _floors(floors: Floors, preset: Preset) -> Iterator[Choice]:
 
 
 def _models(settings: ModelSettings, name: str, emulator: Emulator, device: torch.device) -> Iterator[Choice]:
-    forms = product(settings.precision, settings.constraints, settings.cells)
-    for precision, constraints, cells in forms:
-        form = with_cells(with_constraints(with_precision(emulator, precision), constraints), cells).to(device)
+    forms = product(settings.precision, settings.constraints, settings.cells, settings.runtime)
+    for precision, constraints, cells, runtime in forms:
+        plain = with_cells(with_constraints(with_precision(emulator, precision), constraints), cells)
+        form = plain.to(device).with_runtime(runtime)
         for batch, threads in product(settings.batch, settings.threads):
             parts = {
                 precision: precision != settings.precision[0],
                 constraints: constraints != settings.constraints[0],
                 f"{cells:g} × cells": cells != 1,
+                runtime: runtime != settings.runtime[0],
                 f"batch {batch}": batch != 1,
                 f"{threads} threads": threads != settings.threads[0],
             }
@@ -249,7 +253,7 @@ def _models(settings: ModelSettings, name: str, emulator: Emulator, device: torc
                     "precision": precision,
                     "constraints": constraints,
                     "cells": "×".join(map(str, form.grid.shape)),
-                    "runtime": "eager",
+                    "runtime": runtime,
                 },
                 batch=batch,
                 threads=threads,

@@ -52,7 +52,7 @@ class Part(nn.Module, ABC):
 
     def __init__(self, emulator: Emulator) -> None:
         super().__init__()
-        self.emulator = copy.deepcopy(emulator).cpu().float().eval().requires_grad_(False)
+        self.emulator = copy.deepcopy(emulator.with_runtime("eager")).cpu().float().eval().requires_grad_(False)
 
     @property
     def device(self) -> torch.device:

@@ -6,9 +6,7 @@ of the domain.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +17,11 @@ import torch
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.recording import RecordingReader
-from nmpm.errors import ConfigError
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.sim import InitialState, Preset
 from nmpm.sim.nudge import nudge
+from nmpm.sim.twin import twin_of
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import iterate_test_scenes, simulation_of
 
@@ -50,18 +48,6 @@ class Twin:
     def to_dict(self) -> dict[str, Any]:
         """As cards state it."""
         return {"substeps": self.substeps, "own_substeps": self.own, **self.errors}
-
-
-def twin_of(preset: Preset) -> Preset:
-    """The preset with half as many substeps; with the fewest that the solver accepts where those are too few for it.
-
-    Where it accepts no fewer, with twice as many.
-    """
-    for substeps in (-(-preset.substeps // 2), preset.stable_substeps):
-        if substeps < preset.substeps:
-            with suppress(ConfigError):
-                return dataclasses.replace(preset, substeps=substeps)
-    return dataclasses.replace(preset, substeps=2 * preset.substeps)
 
 
 def twin_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001

@@ -14,8 +14,9 @@ from nmpm.emulator.rollouts import beyond_walls, rollout
 from nmpm.evaluation.stress import GROUPS, Line, Size, Subject, battery
 from nmpm.evaluation.stress.precision import growth, nudge
 from nmpm.evaluation.stress.report import as_json, summary, write
+from nmpm.evaluation.stress.settling import compare_shapes
 from nmpm.evaluation.stress.sizes import widen_scene
-from nmpm.evaluation.stress.subject import simulate_window
+from nmpm.evaluation.stress.subject import simulate_scenes, simulate_window
 from nmpm.evaluation.stress.trace import Trace, energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
 from nmpm.processors import Pointwise
 from nmpm.sim import load_preset
@@ -29,6 +30,7 @@ TINY = Size(
     compared=8,
     particles=100,
     bundles=4,
+    settling_scenes=2,
     settling_multiples=(0.5, 1.0),
 )  # fmt: skip
 QUIET = Constraints(energy=True, rest_speed=0.05)
@@ -73,6 +75,45 @@ def test_every_group_says_what_it_measured(group, subject):
 def test_a_subject_with_a_simulator_is_compared_with_it():
     (line, *_) = battery(goop(), TINY, {"speeds": GROUPS["speeds"]})
     assert 0 < line.figures["mse"] < line.figures["mse_nothing_moves"]
+
+
+def test_the_simulator_itself_settles_as_its_recordings_and_its_twin_stands_beside():
+    subject = goop()
+    held, free = battery(subject, TINY, {"settling": GROUPS["settling"]})
+    for line in (held, free):
+        twin = {name: value for name, value in line.figures.items() if name.startswith("twin_")}
+        assert set(twin) == {f"twin_{name}" for name in line.figures if not name.startswith("twin_")}
+        assert {name.rsplit("_", 1)[1] for name in twin} == {"10", "20"}
+        assert 0.9 < twin["twin_height_at_20"] < 1.1
+    assert held.figures["twin_height_at_20"] == free.figures["twin_height_at_20"] != 1.0
+    window = simulate_window(subject, subject.preset, 2, 20)
+    ratios = compare_shapes(subject.emulator, window, [10, 20])
+    assert held.figures["height_at_20"] == pytest.approx(ratios[20]["height"], rel=1e-4)
+    unconstrained = subject.with_emulator(subject.emulator.unconstrained())
+    (line,) = battery(unconstrained, TINY, {"settling": GROUPS["settling"]})
+    assert line.figures == free.figures
+
+
+def test_what_constraints_hide_is_reported_without_them():
+    subject = goop(constraints=Constraints(energy=True, rest_speed=0.05), scale=0.5)
+    held = list(battery(subject, TINY, {"long": GROUPS["long"]}))
+    free = list(battery(subject, TINY, {"free": GROUPS["free"]}))
+    assert held[0].passed
+    assert held[0].figures["energy_gain_percent"] <= 1
+    assert free[0].name == held[0].name
+    assert free[0].figures["holds"] == 0
+    assert free[0].figures["energy_gain_percent"] > 100
+    assert {line.passed for line in free} == {None}
+    bare = subject.with_emulator(subject.emulator.unconstrained())
+    assert not list(battery(bare, TINY, {"free": GROUPS["free"]}))
+
+
+def test_scenes_one_by_one_are_those_of_a_window():
+    subject = goop()
+    together = simulate_window(subject, subject.preset, 2, 5)
+    for index, one in enumerate(simulate_scenes(subject, subject.preset, 2, 5)):
+        count = int(one.mask.sum())
+        assert torch.equal(one.target[0], together.target[index, :, :count])
 
 
 def test_a_model_that_makes_energy_fails():

@@ -175,6 +175,19 @@ def test_repeated_choices_are_left_out(scenes):
     assert "carried, free" not in names  # it has no constraints
 
 
+def test_runtimes_are_choices_of_their_own(scenes):
+    pytest.importorskip("openvino")
+    settings = dataclasses.replace(tiny_sweep().models, runtime=("eager", "openvino"), batch=(1,))
+    sweep, models = dataclasses.replace(tiny_sweep(), models=settings), {"carried": tiny_emulator(scenes.scene)}
+    plain, quick = (choice for choice in make_choices(sweep, scenes, models) if choice.kind is Kind.MODEL)
+    assert (plain.name, quick.name) == ("carried", "carried, openvino")
+    assert (plain.settings["runtime"], quick.settings["runtime"]) == ("eager", "openvino")
+    assert quick.identity == dict(plain.identity) | {"runtime": "openvino"}
+    wrong = dataclasses.replace(sweep, models=dataclasses.replace(settings, runtime=("fast",)))
+    with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
+        make_choices(wrong, scenes, models)
+
+
 def test_a_model_of_other_scenes_is_rejected(scenes):
     other = dataclasses.replace(scenes.scene, dt=2 * scenes.scene.dt)
     with pytest.raises(ConfigError, match=r"model other was trained for other scenes .*: dt differ"):

@@ -1,0 +1,177 @@
+"""Kernels that leave resting particles where something holds them up, as `nmpm.emulator.support` does.
+
+Arrays are those of one scene. Nodes are numbered as in the grid state; along an axis they lie `stride` apart.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from nmpm._support.jit import jit
+from nmpm.emulator.contact import SURFACE
+from nmpm.emulator.fused.contact import depths
+from nmpm.emulator.fused.flight import confine
+from nmpm.emulator.support import ENOUGH, REACH
+
+ZERO, HALF = np.float32(0), np.float32(0.5)
+_ENOUGH, _SURFACE = np.float32(ENOUGH), np.float32(SURFACE)
+
+
+@jit
+def support(state: Any, channels: Any, share: Any, gravity: Any, grid: Any, floors: Any, held: Any) -> Any:
+    """Fill in whether the material in each cell is held up.
+
+    Args:
+        state: (size, C), the grid state.
+        channels: Its first channel that is a volume fraction, and the one after the last.
+        share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
+        gravity: (D,).
+        grid: The tuple of shape and periodic axes.
+        floors: (D, 2), as `nmpm.emulator.support.floor_rows`.
+        held: (size,) bool, is filled.
+    """
+    shape, wraps = grid
+    axis, largest = 0, ZERO
+    for d in range(len(shape)):
+        if abs(gravity[d]) > largest:
+            axis, largest = d, abs(gravity[d])
+    held[:] = True
+    if largest == ZERO or wraps[axis]:
+        return
+    bears = np.empty(len(held), np.bool_)
+    for node in range(len(held)):
+        filled = ZERO
+        for channel in range(channels[0], channels[1]):
+            filled += state[node, channel]
+        bears[node] = filled >= _ENOUGH
+    for other in range(len(shape)):
+        if other != axis:
+            bears = _widen(bears, shape, wraps, other)
+    upwards = gravity[axis] > ZERO
+    _sweep(bears, share, shape, axis, upwards, floors[axis, 1 if upwards else 0], held)
+
+
+@jit
+def _stride(shape: Any, axis: Any) -> Any:
+    """How far neighbours along an axis are apart."""
+    stride = 1
+    for d in range(axis + 1, len(shape)):
+        stride *= shape[d]
+    return stride
+
+
+@jit
+def _widen(bears: Any, shape: Any, wraps: Any, axis: Any) -> Any:
+    """(size,): whether a cell or one beside it along an axis bears."""
+    stride, extent = _stride(shape, axis), shape[axis]
+    wide = np.empty_like(bears)
+    for node in range(len(bears)):
+        row = node // stride % extent
+        below = row > 0 or wraps[axis]
+        above = row < extent - 1 or wraps[axis]
+        lower = node - stride if row > 0 else node + (extent - 1) * stride
+        upper = node + stride if row < extent - 1 else node - (extent - 1) * stride
+        wide[node] = bears[node] or (below and bears[lower]) or (above and bears[upper])
+    return wide
+
+
+@jit
+def _sweep(bears: Any, share: Any, shape: Any, axis: Any, upwards: Any, floor: Any, held: Any) -> Any:
+    """Fill in `held` column by column from the floor, which gravity points to, on the way up."""
+    stride, extent = _stride(shape, axis), shape[axis]
+    for first in range(0, len(held), stride * extent):
+        for column in range(first, first + stride):
+            empty, broken = 0, False
+            for row in range(extent):
+                node = column + (extent - 1 - row if upwards else row) * stride
+                held[node] = not broken
+                if row < floor or (len(share) > 0 and share[node] >= _SURFACE):
+                    empty, broken = 0, False
+                elif bears[node]:
+                    empty = 0
+                else:
+                    empty += 1
+                    broken = broken or empty >= REACH
+
+
+@jit
+def rest(
+    cells: Any,
+    path: Any,
+    gravity: Any,
+    speed: Any,
+    free_fall: Any,
+    share: Any,
+    grid: Any,
+    held: Any,
+    drops: Any,
+    bounds: Any,
+    low: Any,
+    high: Any,
+) -> Any:
+    """Leave particles where they started that neither move nor fall, as `nmpm.emulator.constraints.at_rest` says.
+
+    Those that nothing holds up fall instead.
+
+    Args:
+        cells: (N, D) positions at the bundle's start.
+        path: (m, N, D), is changed.
+        gravity: (D,), what a frame adds to a velocity.
+        speed: Cells per frame.
+        free_fall: Share of gravity.
+        share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
+        grid: The tuple of shape and periodic axes.
+        held: (size,) bool, from `support`.
+        drops: (m, D), as `nmpm.emulator.support.drops`.
+        bounds: As for `flight.fly`.
+        low: The first particle.
+        high: The one after the last.
+    """
+    frames, dim = path.shape[0], path.shape[1 + 1]
+    place, value = np.empty((1, dim), np.float32), np.empty(1, np.float32)
+    for p in range(low, high):
+        if not _is_still(cells, path, gravity, speed, free_fall, p):
+            continue
+        falls = not held[_node(cells, grid, p)]
+        if falls and len(share) > 0:
+            for d in range(dim):
+                place[0, d] = cells[p, d] + drops[frames - 1, d]
+            depths(share, place, grid, value)
+            falls = not value[0] > _SURFACE
+        for frame in range(frames):
+            for d in range(dim):
+                x = cells[p, d]
+                if falls:
+                    x = confine(x + drops[frame, d], bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+                path[frame, p, d] = x
+
+
+@jit
+def _is_still(cells: Any, path: Any, gravity: Any, speed: Any, free_fall: Any, p: Any) -> Any:
+    """Whether a particle neither moves nor falls."""
+    frames, dim = path.shape[0], path.shape[1 + 1]
+    half = frames // 2
+    moved, gained, gravity_square = ZERO, ZERO, ZERO
+    for d in range(dim):
+        gravity_square += gravity[d] * gravity[d]
+        way = path[frames - 1, p, d] - cells[p, d]
+        moved += way * way
+        if frames > 1:
+            middle = path[half - 1, p, d]
+            late = (path[frames - 1, p, d] - middle) / np.float32(frames - half)
+            gained += (late - (middle - cells[p, d]) / np.float32(half)) * gravity[d]
+    falls = frames > 1 and gained > free_fall * np.float32(frames) * HALF * gravity_square
+    return np.sqrt(moved) < speed * np.float32(frames) and not falls
+
+
+@jit
+def _node(cells: Any, grid: Any, p: Any) -> Any:
+    """The cell that a particle, whose position is finite, is in."""
+    shape, wraps = grid
+    node = np.int64(0)
+    for d in range(len(shape)):
+        row = np.int64(np.floor(cells[p, d]))
+        node = node * shape[d] + (row % shape[d] if wraps[d] else min(max(row, 0), shape[d] - 1))
+    return node

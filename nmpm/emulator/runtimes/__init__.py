@@ -1,0 +1,35 @@
+"""Runtimes: what computes an emulator's network, or whole bundles, in inference. Weights and results stay the same.
+
+A runtime is added by one file and one line here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from nmpm._support.messages import one_line, suggestion
+from nmpm.emulator.runtimes.base import Runtime
+from nmpm.emulator.runtimes.cuda_graph import CudaGraph
+from nmpm.emulator.runtimes.eager import Eager
+from nmpm.emulator.runtimes.openvino import OpenVINO
+from nmpm.errors import ConfigError
+
+__all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "find_runtime"]
+
+RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType({kind.name: kind for kind in (CudaGraph, OpenVINO, Eager)})
+"""Runtimes by name, the fastest first; the last one runs every network everywhere."""
+
+
+def find_runtime(name: str) -> Runtime:
+    """A runtime of `RUNTIMES`, without any program compiled yet.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    if name not in RUNTIMES:
+        raise ConfigError(
+            f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(RUNTIMES)}."
+            f"{suggestion(name[:60], list(RUNTIMES))}"
+        )
+    return RUNTIMES[name]()

@@ -1,0 +1,70 @@
+"""The contract of runtimes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+
+from nmpm.errors import ConfigError
+from nmpm.processors import GridProcessor
+
+if TYPE_CHECKING:
+    from nmpm.emulator.model import Bundle, Emulator, RolloutContext
+    from nmpm.particles import Particles
+
+
+class Runtime(ABC):
+    """Computes an emulator's network, or whole bundles.
+
+    Weights stay in the emulator. An instance may keep programs compiled from them; copies and unpickled instances start
+    without, so that copied emulators, on other devices or with other weights, compile their own.
+    """
+
+    name: ClassVar[str]
+    fixed_shapes: ClassVar[bool] = True
+    """Whether another shape of the grid costs a compilation, so that `nmpm.emulator.windows` would not pay."""
+
+    def obstacle(self, emulator: Emulator) -> str:  # noqa: ARG002 (none unless overridden)
+        """Why this runtime cannot run the emulator here, with the mend; empty if nothing is known to prevent it."""
+        return ""
+
+    @abstractmethod
+    def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
+        """The network's output (B, m, C_out, *S) for a normalised grid state (B, C_in, *S).
+
+        Args:
+            network: Holds the weights.
+            grid: Float32, or float64 in an emulator of that type.
+            precision: In which the network is to compute.
+
+        Raises:
+            ConfigError: if this runtime cannot run the network, or gradients are asked for that it does not have.
+        """
+
+    def bundle(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        """The bundle that the emulator predicts, see `Emulator.predict`."""
+        return emulator.predict(particles, context)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return type(self)()
+
+    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
+        return type(self), ()
+
+
+def refuse_gradients(runtime: Runtime, network: nn.Module, *inputs: Tensor) -> None:
+    """Make sure that a call is inference.
+
+    Raises:
+        ConfigError: if the network is in training mode, or gradients are enabled and an input or a weight requires one.
+    """
+    tracked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*inputs, *network.parameters()))
+    if network.training or tracked:
+        raise ConfigError(
+            f"The runtime {runtime.name} has no gradients: train, or differentiate rollouts, with the model as loaded,"
+            ' without `optimized`, or with `emulator.with_runtime("eager")`; for inference call `eval()` and'
+            " `requires_grad_(False)`."
+        )

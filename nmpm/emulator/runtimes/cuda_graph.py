@@ -1,0 +1,112 @@
+"""CUDA graphs: a whole bundle, network and all around it, recorded once and launched as one.
+
+On a GPU a small scene's bundle is hundreds of kernels of a few microseconds, each launched from Python; a graph
+launches them all at once. Shapes are fixed: each batch and number of particles has a graph of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator.runtimes.base import Runtime, refuse_gradients
+from nmpm.emulator.runtimes.eager import Eager
+from nmpm.emulator.runtimes.programs import Programs
+from nmpm.errors import ConfigError
+from nmpm.processors import GridProcessor
+from nmpm.transfer.backends import is_chosen
+
+if TYPE_CHECKING:
+    from nmpm.emulator.model import Bundle, Emulator, RolloutContext
+    from nmpm.particles import Particles
+
+T = TypeVar("T")
+
+_WARM_UP = 3
+"""Calls before a graph is recorded: libraries choose kernels and allocate workspaces in them."""
+
+
+class CudaGraph(Runtime):
+    """Records the bundle of each shape of state in its first call, and replays it from then on."""
+
+    name: ClassVar[str] = "cuda-graph"
+
+    def __init__(self) -> None:
+        self._programs: Programs[Recorded] = Programs()
+
+    def obstacle(self, emulator: Emulator) -> str:
+        if emulator.device.type != "cuda":
+            return f"The runtime cuda-graph needs a CUDA GPU; the model is on {emulator.device}."
+        if emulator.constraints.bounds == "error":
+            return "The runtime cuda-graph cannot stop at a particle out of bounds: use constraints.bounds stop."
+        return ""
+
+    def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
+        return Eager().fields(network, grid, precision)
+
+    def bundle(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        if obstacle := self.obstacle(emulator):
+            raise ConfigError(obstacle)
+        state = [getattr(particles, field.name) for field in dataclasses.fields(particles)]
+        inputs = [*state, context.solid, *([] if context.budget is None else [context.budget])]
+        refuse_gradients(self, emulator, *inputs)
+        if is_chosen() or torch.is_autocast_enabled(emulator.device.type):
+            return emulator.predict(particles, context)  # what these choose is not to be recorded
+
+        def predict(copies: Sequence[Tensor]) -> Bundle:
+            own = type(particles)(*copies[: len(state)])
+            budget = None if context.budget is None else copies[-1]
+            return emulator.predict(own, dataclasses.replace(context, solid=copies[len(state)], budget=budget))
+
+        shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
+        recorded = self._programs.find(emulator, shapes, lambda: Recorded(predict, inputs))
+        return recorded(inputs)
+
+
+class Recorded:
+    """A function's recording for inputs of some shapes.
+
+    Args:
+        predict: Of tensors, without reading any back; makes a bundle.
+        inputs: An example, on a GPU; the recording has copies of its own.
+    """
+
+    def __init__(self, predict: Callable[[Sequence[Tensor]], Bundle], inputs: Sequence[Tensor]) -> None:
+        self._inputs = [tensor.clone(memory_format=torch.contiguous_format) for tensor in inputs]
+        self._replay, self._bundle = record(lambda: predict(self._inputs), inputs[0].device)
+
+    def __call__(self, inputs: Sequence[Tensor]) -> Bundle:
+        """The bundle for inputs of these shapes, in fresh memory."""
+        for own, tensor in zip(self._inputs, inputs, strict=True):
+            own.copy_(tensor)
+        self._replay()
+        made = self._bundle
+        return dataclasses.replace(made, position=made.position.clone(), velocity=made.velocity.clone())
+
+
+def record(function: Callable[[], T], device: torch.device) -> tuple[Callable[[], None], T]:
+    """Record the kernels that a function launches on a GPU.
+
+    Returns:
+        Launches them again, on the same memory; the function's result, whose tensors each launch overwrites.
+    """
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.device(device), torch.no_grad():
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            for _ in range(_WARM_UP):
+                function()
+        torch.cuda.current_stream().wait_stream(aside)
+        with torch.cuda.graph(graph):
+            result = function()
+
+    def replay() -> None:
+        with torch.cuda.device(device):
+            graph.replay()
+
+    return replay, result

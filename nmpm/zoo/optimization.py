@@ -1,0 +1,85 @@
+"""Faster runtimes for trained models, compared with torch's own results before they are used."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator import Emulator
+from nmpm.emulator.runtimes import RUNTIMES, Eager
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+
+AUTO = "auto"
+"""Stands for the first of `RUNTIMES` that can run the model here."""
+TOLERANCE = 1e-3
+"""Cells by which positions after one bundle may differ from torch's in float32."""
+_SPEED = 0.2  # cells per frame, of the particles of the example: at rest, the network would have little to say
+_LOG = logging.getLogger(__name__)
+
+
+def optimize(emulator: Emulator, runtime: str, make_example: Callable[[], Particles]) -> Emulator:
+    """The emulator with another runtime, compared with torch on an example.
+
+    Args:
+        emulator: In evaluation mode.
+        runtime: A name of `RUNTIMES`, or "auto".
+        make_example: Makes a state on the emulator's device.
+
+    Raises:
+        ConfigError: if there is no such runtime, it cannot run the model here, or its results differ from torch's. With
+            "auto" the next runtime is tried instead.
+    """
+    names = list(RUNTIMES) if runtime == AUTO else [runtime]
+    for name in names:
+        try:
+            faster = emulator.with_runtime(name)
+            if not isinstance(faster.runtime, Eager):
+                _check_deviation(emulator.with_runtime("eager"), faster, make_example())
+        except ConfigError as error:
+            if name == names[-1]:
+                raise
+            _LOG.info("%s", error)
+        else:
+            return faster
+    raise AssertionError("The last runtime either returns or raises.")
+
+
+def _check_deviation(emulator: Emulator, faster: Emulator, state: Particles) -> None:
+    """Compare one bundle without constraints, whose thresholds would amplify rounding.
+
+    In bfloat16 a runtime may be twice as far from float32 as torch's bfloat16 is: each rounds in places of its own.
+    """
+    moving = _stirred(emulator, state)
+    exact = _positions(emulator.with_network(torch.float32), moving)
+    own, other = (_distance(_positions(form, moving), exact) for form in (emulator, faster))
+    limit = TOLERANCE + 2 * own
+    name, precision = faster.runtime.name, str(emulator.network_precision).removeprefix("torch.")
+    _LOG.info("The runtime %s, %s: within %.1e cells of torch in float32 after a bundle.", name, precision, other)
+    if not other <= limit:
+        raise ConfigError(
+            f"The runtime {name} computes something else than torch: positions after one bundle differ by {other:.2g}"
+            f" cells, where {limit:.2g} are expected in {precision}. Use the runtime eager."
+        )
+
+
+def _stirred(emulator: Emulator, state: Particles) -> Particles:
+    """The state with random velocities."""
+    noise = torch.randn(state.velocity.shape, generator=torch.Generator().manual_seed(0)).to(state.velocity)
+    cell = state.velocity.new_tensor(emulator.grid.spacing)
+    return dataclasses.replace(state, velocity=state.velocity + _SPEED * cell * noise)
+
+
+@torch.no_grad()
+def _positions(emulator: Emulator, state: Particles) -> Tensor:
+    """(B, m, N, D) after one bundle, in cells."""
+    position: Tensor = emulator.unconstrained()(state).position
+    return position / position.new_tensor(emulator.grid.spacing)
+
+
+def _distance(one: Tensor, other: Tensor) -> float:
+    return float((one - other).norm(dim=-1).max())

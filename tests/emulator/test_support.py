@@ -1,0 +1,249 @@
+"""Only what lies on something rests: closed forms, symmetries, and the kernels beside tensor operations."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import box
+from torch import Tensor
+
+from nmpm.data.initial_states import lattice, state_at_rest
+from nmpm.decoders import Absolute
+from nmpm.emulator import Emulator, EmulatorRecipe
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.fused.support import support as fill_support
+from nmpm.emulator.rollouts import rollout
+from nmpm.emulator.support import MAX_DROP, REACH, Support, drops, floor_rows
+from nmpm.grid import Grid
+from nmpm.particles import Particles
+from nmpm.processors import Pointwise
+from nmpm.scene import Scene
+from nmpm.transfer import using
+
+SPACING = 0.01
+WIDTH = 0.84 / 16
+"""Of a cell of `emulator_of` over `box()`."""
+
+
+def emulator_of(scene: Scene, **held) -> Emulator:
+    """An emulator whose network predicts that everything stands still, in the air too."""
+    constraints = Constraints(**({"rest_speed": 0.01} | held))
+    recipe = EmulatorRecipe(scene, 16, 4, processor=Pointwise(hidden=(4,)), decoder=Absolute(), constraints=constraints)
+    emulator = recipe.build().eval().requires_grad_(False)
+    for weights in emulator.processor.parameters():
+        weights.zero_()
+    return emulator
+
+
+def block(low: float, high: float, dim: int = 2, scene: Scene | None = None) -> Particles:
+    """A block of particles at rest between two heights along the last axis."""
+    position = lattice((((0.4, 0.6),) * (dim - 1)) + ((low, high),), 2 * SPACING)
+    return state_at_rest(scene or box(dim), position)
+
+
+def heights(position: Tensor) -> Tensor:
+    return position[..., -1]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_heap_on_the_floor_stays_to_the_bit(dim):
+    heap = block(0.1, 0.2, dim)
+    predicted = rollout(emulator_of(box(dim)), heap, 16)
+    torch.testing.assert_close(predicted, heap.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_drop_under_the_ceiling_comes_down_as_fast_as_from_rest_in_each_bundle(dim):
+    scene, drop = box(dim), block(0.86, 0.9, dim)
+    predicted = rollout(emulator_of(scene), drop, 8)
+    times = torch.tensor([1, 3, 6, 10, 11, 13, 16, 20])
+    fallen = heights(drop.position.unsqueeze(1) - predicted)
+    expected = 9.81 * scene.dt**2 * times.view(1, -1, 1).expand_as(fallen)
+    torch.testing.assert_close(fallen, expected, rtol=1e-2, atol=1e-6)
+    torch.testing.assert_close(predicted[..., :-1], drop.position.unsqueeze(1).expand_as(predicted)[..., :-1])
+
+
+def test_a_drop_comes_to_rest_near_the_floor():
+    scene = box(gravity=(0.0, -98.1))
+    predicted = rollout(emulator_of(scene), block(0.86, 0.9, scene=scene), 480)
+    assert torch.equal(predicted[:, -1], predicted[:, -2])
+    assert heights(predicted[:, -1]).min() < 0.1 + REACH * WIDTH
+    assert heights(predicted[:, -1]).max() < 0.1 + (REACH + 1) * WIDTH
+
+
+def test_a_drop_in_the_air_falls_and_one_on_a_column_stays():
+    heap, drop = block(0.1, 0.5), block(0.75, 0.8)
+    position = torch.cat([heap.position, drop.position], dim=1)
+    both = state_at_rest(box(), position[0])
+    predicted = rollout(emulator_of(box()), both, 4)
+    moved = (predicted[:, -1] - both.position).abs().amax(-1)[0] > 1e-5
+    lower = len(heap.position[0])
+    assert not moved[:lower].any()
+    assert moved[lower:].all()
+
+
+@pytest.mark.parametrize("solids", [True, False])
+def test_what_lies_on_an_obstacle_stays_and_what_hangs_below_it_falls(solids):
+    scene = box(obstacles=True)
+    beam = lattice(((0.3, 0.7), (0.5, 0.6)), SPACING)
+    above, below = (lattice(((0.4, 0.6), ends), 2 * SPACING) for ends in ((0.62, 0.7), (0.42, 0.46)))
+    state = state_at_rest(scene, torch.cat([above, below]), beam)
+    predicted = rollout(emulator_of(scene, solids=solids), state, 8)
+    fallen = heights(state.position - predicted[:, -1])[0]
+    assert (fallen[: len(above)].abs() < 1e-6).all()
+    assert (fallen[len(above) :] > 1e-4).all()
+
+
+def test_what_falls_stops_at_an_obstacle():
+    scene = box(obstacles=True, gravity=(0.0, -98.1))
+    beam = lattice(((0.3, 0.7), (0.3, 0.4)), SPACING)
+    state = state_at_rest(scene, lattice(((0.4, 0.6), (0.8, 0.84)), 2 * SPACING), beam)
+    predicted = rollout(emulator_of(scene), state, 480)
+    assert torch.equal(predicted[:, -1], predicted[:, -2])
+    assert heights(predicted[:, -1]).min() > 0.4 - 0.5 * WIDTH
+    assert heights(predicted[:, -1]).max() < 0.4 + (REACH + 2) * WIDTH
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        box(gravity=(0.0, 0.0)),
+        box(gravity=None),
+        box(boundary=("wall", "periodic"), domain=((0.08, 0.92), (0.1, 0.9))),
+    ],
+    ids=["no gravity", "unknown gravity", "a periodic axis"],
+)
+def test_where_there_is_no_floor_what_rests_stays_to_the_bit(scene):
+    drop = block(0.6, 0.7, scene=scene)
+    predicted = rollout(emulator_of(scene), drop, 8)
+    torch.testing.assert_close(predicted, drop.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-7)
+
+
+def test_falling_gains_no_energy():
+    scene, dt = box(obstacles=True), 0.0025
+    generator = torch.Generator().manual_seed(1)
+    cloud = 0.15 + 0.7 * torch.rand(80, 2, generator=generator)
+    clear = (cloud - 0.45).abs().amax(1) > 0.15  # contact would push out what is in the obstacle
+    state = state_at_rest(scene, cloud[clear], lattice(((0.35, 0.55), (0.4, 0.5)), SPACING))
+    path = rollout(emulator_of(scene), state, 80)
+    steps = path.diff(dim=1, prepend=state.position.unsqueeze(1))
+    energy = (steps.square().sum(-1) / 2 + 9.81 * dt**2 * heights(path)).double()
+    assert (energy <= 9.81 * dt**2 * heights(state.position).unsqueeze(1) + 1e-9).all()
+    assert energy[:, -1].mean() < energy[:, 0].mean() - 1e-7
+
+
+def test_a_bundle_falls_by_half_a_cell_at_most():
+    gravity = torch.tensor([[[0.0, -0.004]], [[3.0, -4.0]]])
+    slow, fast = drops(gravity, 4)[:, :, 0]
+    torch.testing.assert_close(slow[:, 1], -0.004 * torch.tensor([1.0, 3.0, 6.0, 10.0]))
+    torch.testing.assert_close(fast[-1], MAX_DROP * torch.tensor([0.6, -0.8]))
+
+
+@pytest.mark.parametrize(("gap", "held"), [(0, True), (REACH - 1, True), (REACH, False), (REACH + 2, False)])
+def test_gaps_of_less_than_the_reach_are_bridged(gap, held):
+    grid = Grid((5, 12), (0.0, 0.0), (1.0, 1.0), (False, False))
+    scene = box(bounds=((0.0, 5.0), (0.0, 12.0)), domain=((0.0, 5.0), (0.0, 12.0)))
+    filled = torch.zeros(1, 1, 5, 12)
+    filled[..., :3] = 1.0
+    filled[..., 3 + gap] = 1.0
+    support = Support(filled, None, scene, grid).supported_cells(torch.tensor([[[0.0, -1.0]]]))
+    assert support[0, 2, : 4 + min(gap, REACH - 1)].all()
+    assert bool(support[0, 2, 3 + gap]) == held
+
+
+def test_an_overhang_of_a_cell_is_held_and_a_longer_one_not():
+    grid = Grid((8, 8), (0.0, 0.0), (1.0, 1.0), (False, False))
+    scene = box(bounds=((0.0, 8.0),) * 2, domain=((0.0, 8.0),) * 2)
+    filled = torch.zeros(1, 1, 8, 8)
+    filled[..., 2, :] = 1.0
+    filled[..., 3:6, 6] = 1.0
+    support = Support(filled, None, scene, grid).supported_cells(torch.tensor([[[0.0, -1.0]]]))
+    assert support[0, :6, 6].tolist() == [False, True, True, True, False, False]
+
+
+def random_support(seed: int, shape: tuple[int, ...], periodic: tuple[bool, ...], obstacles: bool) -> Support:
+    """Two scenes with random material, obstacles, and wall layers of random thickness."""
+    generator = torch.Generator().manual_seed(seed)
+    layer = (3 * torch.rand(len(shape), 2, generator=generator)).tolist()
+    sides = [
+        (0.0, float(n)) if wraps else (low, n - high)
+        for n, wraps, (low, high) in zip(shape, periodic, layer, strict=True)
+    ]
+    boundary = tuple("periodic" if wraps else "wall" for wraps in periodic)
+    domain = tuple((0.0, float(n)) for n in shape)
+    scene = box(len(shape), bounds=tuple(sides), domain=domain, boundary=boundary, obstacles=True)
+    filled = torch.rand(2, 1, *shape, generator=generator) * (torch.rand(2, 1, *shape, generator=generator) < 0.35)
+    share = torch.rand(2, 1, *shape, generator=generator) * (torch.rand(2, 1, *shape, generator=generator) < 0.15)
+    grid = Grid(shape, (0.0,) * len(shape), (1.0,) * len(shape), periodic)
+    return Support(filled, share if obstacles else None, scene, grid)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    shape=st.lists(st.integers(7, 12), min_size=2, max_size=3).map(tuple),
+    wraps=st.lists(st.booleans(), min_size=3, max_size=3),
+    gravity=st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), min_size=6, max_size=6),
+    obstacles=st.booleans(),
+)
+@settings(max_examples=40, deadline=None)
+def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obstacles):
+    dim = len(shape)
+    support = random_support(seed, shape, tuple(wraps[:dim]), obstacles)
+    pull = torch.tensor(gravity).view(2, 1, 3)[..., :dim]
+    expected = support.supported_cells(pull)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nmpm.emulator.support.can_branch", lambda _: False)
+        assert torch.equal(support.supported_cells(pull), expected)
+    floors, held = np.array(floor_rows(support.scene, support.grid)), np.empty(support.grid.size, np.bool_)
+    for scene in range(2):
+        state = support.filled[scene].flatten(1).T.contiguous().numpy()
+        share = np.empty(0, np.float32) if support.obstacle is None else support.obstacle[scene].flatten().numpy()
+        grid = (support.grid.shape, support.grid.periodic)
+        fill_support(state, (0, 1), share, pull[scene, 0].numpy(), grid, floors, held)
+        assert np.array_equal(held, expected[scene].flatten().numpy())
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("upwards", [False, True])
+def test_support_turns_with_gravity(axis, upwards):
+    shape = (7, 8, 9)
+    support = random_support(3, shape, (False,) * 3, True)
+    open_box = dataclasses.replace(support.scene, bounds=tuple((0.0, float(n)) for n in shape))
+    support = dataclasses.replace(support, scene=open_box)
+    down = torch.zeros(2, 1, 3)
+    down[..., axis] = 1.0 if upwards else -1.0
+    found = support.supported_cells(down)
+
+    def turn(values: Tensor) -> Tensor:
+        """The axis of gravity becomes the last one, with the floor at its lower end."""
+        turned = values.movedim(axis - 3, -1)
+        return turned.flip(-1) if upwards else turned
+
+    sizes = tuple(float(n) for n in turn(support.filled).shape[2:])
+    grid = Grid(tuple(map(int, sizes)), (0.0,) * 3, (1.0,) * 3, (False,) * 3)
+    sides = tuple((0.0, size) for size in sizes)
+    scene = dataclasses.replace(open_box, bounds=sides, domain=sides)
+    assert support.obstacle is not None
+    upright = Support(turn(support.filled), turn(support.obstacle), scene, grid)
+    assert torch.equal(turn(found), upright.supported_cells(torch.tensor([[[0.0, 0.0, -1.0]]]).expand(2, 1, 3)))
+
+
+@pytest.mark.parametrize(("dim", "obstacles"), list(itertools.product((2, 3), (False, True))))
+def test_bundles_are_those_of_tensor_operations(dim, obstacles):
+    scene = box(dim, ("water", "sand"), obstacles=obstacles, boundary=("periodic",) + ("wall",) * (dim - 1),
+                domain=((0.1, 0.9),) + ((0.08, 0.92),) * (dim - 1))  # fmt: skip
+    generator = torch.Generator().manual_seed(dim)
+    position = 0.11 + 0.78 * torch.rand(60 if dim == 2 else 600, dim, generator=generator)
+    beam = lattice(((0.3, 0.5),) * dim, 0.02) if obstacles else None
+    emulator, state = emulator_of(scene), state_at_rest(scene, position, beam)
+    with torch.no_grad():
+        fused = emulator(state).position
+        with using("native"):
+            tensors = emulator(state).position
+    moved = (tensors[:, -1] - state.position).norm(dim=-1) > 1e-5
+    assert 0.1 < moved.float().mean() < 0.95
+    torch.testing.assert_close(fused, tensors, rtol=0, atol=1e-6)

@@ -1,0 +1,78 @@
+"""Faster runtimes of trained models are compared with torch before they are used."""
+
+import logging
+import sys
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from nmpm.emulator.runtimes import Eager, OpenVINO, Runtime
+from nmpm.errors import ConfigError
+from nmpm.transfer import using
+from nmpm.zoo import Pretrained, optimization
+
+
+@pytest.fixture
+def model(small) -> Iterator[Pretrained]:
+    with using("native"):  # kernels would be compiled first
+        yield Pretrained(small.requires_grad_(False), {"name": "small"})
+
+
+class Wrong(Runtime):
+    """Computes something else."""
+
+    name = "openvino"
+
+    def fields(self, network, grid, precision):
+        return 2 * network(grid) + 0.1
+
+
+def test_the_fastest_that_runs_here_is_taken_and_checked(model, caplog):
+    pytest.importorskip("openvino")
+    caplog.set_level(logging.INFO, "nmpm")
+    quick = model.optimized()
+    assert isinstance(quick.emulator.runtime, OpenVINO)
+    assert isinstance(model.emulator.runtime, Eager)
+    assert "openvino, float32: within" in caplog.text
+    state = model.example(count=50)
+    torch.testing.assert_close(quick.rollout(state, 8), model.rollout(state, 8), rtol=0, atol=1e-4)
+    with pytest.raises(ConfigError, match="openvino has no gradients"):
+        quick.differentiable_rollout(model.example(count=50)._map(needs_gradients), 8)
+
+
+def needs_gradients(values):
+    return values.clone().requires_grad_() if values.is_floating_point() else values
+
+
+@pytest.mark.filterwarnings("ignore:This processor has no bfloat16")
+def test_the_precision_is_that_asked_for(model):
+    pytest.importorskip("openvino")
+    quick = model.optimized("openvino", "bfloat16")
+    assert quick.emulator.network_precision == torch.bfloat16
+    with pytest.raises(ConfigError, match="float32 or bfloat16, not in 'float61'"):
+        model.optimized("openvino", "float61")
+
+
+def test_without_a_faster_one_it_is_torch(model, monkeypatch):
+    monkeypatch.setitem(sys.modules, "openvino", None)
+    assert isinstance(model.optimized().emulator.runtime, Eager)
+    assert isinstance(model.optimized("eager").emulator.runtime, Eager)
+    with pytest.raises(ConfigError, match=r"pip install \"nmpm\[openvino\]\""):
+        model.optimized("openvino")
+    with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
+        model.optimized("fast")
+
+
+def test_a_runtime_that_computes_something_else_is_refused(model, monkeypatch):
+    monkeypatch.setattr("nmpm.emulator.runtimes.RUNTIMES", {"openvino": Wrong, "eager": Eager})
+    monkeypatch.setattr(optimization, "RUNTIMES", {"openvino": Wrong, "eager": Eager})
+    with pytest.raises(ConfigError, match="openvino computes something else than torch: positions after one bundle"):
+        model.optimized("openvino")
+    assert isinstance(model.optimized().emulator.runtime, Eager)
+
+
+def test_a_model_on_another_device_says_that_openvino_is_of_the_cpu(model):
+    pytest.importorskip("openvino")
+    with pytest.raises(ConfigError, match="runs on CPUs; the model is on meta"):
+        model.to("meta").optimized("openvino")
