@@ -69,9 +69,6 @@ class Emulator(nn.Module):
 
     Args:
         recipe: Its form.
-
-    Attributes:
-        windows: When the network runs on windows around the particles, see `with_windows`; None for never.
     """
 
     input_mean: Tensor
