@@ -107,7 +107,8 @@ class Support:
             if self.grid.periodic[axis]:
                 continue
             for upwards in (False, True):
-                pulled = largest & ((gravity[:, 0, axis] > 0) == upwards)
+                pull = gravity[:, 0, axis]
+                pulled = largest & (pull > 0 if upwards else pull <= 0)
                 if can_branch(pulled) and not bool(pulled.any()):
                     continue
                 here = pulled.view(-1, *(1,) * self.grid.dim)

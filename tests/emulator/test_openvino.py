@@ -181,6 +181,7 @@ def test_a_missing_package_is_named_with_its_installation(monkeypatch):
 SCRIPT = """
 import faulthandler, os, signal, sys
 faulthandler.enable()
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells make it ignored in background jobs
 import torch
 from scenes import box, cloud
 from nmpm._support.signal_stack import _Stack
