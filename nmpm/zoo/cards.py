@@ -12,7 +12,7 @@ from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {
     "energy": "energy (kinetic plus potential energy never exceeds that of the first state)",
-    "rest_speed": "rest_speed = {value:g} cells per frame (slower particles stay where they are, if something bears them)",
+    "rest_speed": "rest_speed = {value:g} cells per frame (slower particles on firm ground stay where they are)",
     "solids": "solids (no particle enters an obstacle)",
     "density_cap": "density_cap = {value:g} (cells with a larger volume fraction spread)",
     "bounds": "bounds = {value} (no particle leaves the scene's bounds)",
