@@ -69,13 +69,14 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
     card = {"format": CARD_FORMAT} | read_card(folder)
     card |= {"lifecycle": lifecycle(card)}
     card.setdefault("golden", golden_rollout(model.emulator))
-    _write(folder, card)
+    write_card(folder, card)
     for name in measures:
         card |= MEASURES[name](model, folder, data)
-        _write(folder, card)
+        write_card(folder, card)
 
 
-def _write(folder: Path, card: Mapping[str, Any]) -> None:
+def write_card(folder: Path, card: Mapping[str, Any]) -> None:
+    """Write an entry's card, and the chart and README that follow from it."""
     with atomic_write(folder / CARD) as part:
         part.write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
     write_chart(folder)

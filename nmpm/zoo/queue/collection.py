@@ -5,19 +5,17 @@ from __future__ import annotations
 import filecmp
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from nmpm._support.atomic import atomic_write
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.generate import SimulationRequest
 from nmpm.errors import ZooError
-from nmpm.zoo.entries import CARD, load_entry, read_card
-from nmpm.zoo.index import refresh, write_index
+from nmpm.zoo.entries import load_entry, read_card
+from nmpm.zoo.index import refresh, write_card, write_index
 from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.publish import replace
 from nmpm.zoo.queue.plan import Dataset
@@ -62,7 +60,7 @@ def collect(history: History, zoo: Path, run: Command) -> str:
             return f"{name}: the entry is kept, as {reason}."
         replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
         refresh(zoo / name, ["speed"])
-        _extend_card(zoo / name, _references(zoo / name, history))
+        write_card(zoo / name, read_card(zoo / name) | _references(zoo / name, history))
         write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
 
@@ -94,14 +92,6 @@ def _references(entry: Path, history: History) -> dict[str, Any]:
         with atomic_write(kept) as part:
             part.write_text(json.dumps(twin.to_dict(), indent=1), encoding="utf-8")
     return found | {"twin": _read(kept)}
-
-
-def _extend_card(entry: Path, keys: Mapping[str, Any]) -> None:
-    with atomic_write(entry / CARD) as part:
-        part.write_text(
-            yaml.safe_dump(read_card(entry) | dict(keys), sort_keys=False, allow_unicode=True, width=120), "utf-8"
-        )
-    refresh(entry)
 
 
 def _request(dataset: Dataset) -> tuple[str, SimulationRequest]:
