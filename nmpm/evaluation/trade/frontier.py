@@ -18,6 +18,7 @@ from nmpm.evaluation.trade.points import Point
 MEASURES: Mapping[str, str] = MappingProxyType(
     {
         "mse": "MSE of the full rollout",
+        "field": "share of the material in another cell",
         "emd": "earth mover's distance",
         "kinetic": "kinetic energy, relative error",
         "height": "settled height, relative error",

@@ -13,7 +13,7 @@ from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall
 from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure
 from nmpm.evaluation.trade.accuracy import measure_accuracy
-from nmpm.evaluation.trade.errors import measure_errors
+from nmpm.evaluation.trade.errors import field_error, measure_errors
 from nmpm.evaluation.trade.simulators import SimulatorChoice, follow_nearest
 from nmpm.evaluation.trade.table import COLUMNS, csv_text
 from nmpm.evaluation.trade.trivial import TrivialChoice
@@ -155,7 +155,7 @@ def test_free_fall_conserves_energy_and_repeats_free_fall(scenes):
         scenes.scene, dataclasses.replace(window, frames=torch.cat([window.frames[:, :2], falling], 1)), falling,
         tiny_sweep().measures,
     )  # fmt: skip
-    assert found["mse"] == found["kinetic"] == found["height"] == found["crowding"] == 0
+    assert found["mse"] == found["field"] == found["kinetic"] == found["height"] == found["crowding"] == 0
     if not bool((falling[..., 1] <= scenes.scene.bounds[1][0]).any()):
         assert abs(found["gain"]) < 1e-3
 
@@ -215,8 +215,20 @@ def test_the_table_is_tidy(scenes, choices, tmp_path):
     header, *rows = csv_text(points, scenes).splitlines()
     assert header.split(",") == list(COLUMNS)
     table = list(csv.DictReader([header, *rows]))
-    assert len({(row["name"], row["error"]) for row in table}) == len(table) == 6 * len(points)
+    assert len({(row["name"], row["error"]) for row in table}) == len(table) == 7 * len(points)
     first = next(row for row in table if row["name"] == "carried, batch 2" and row["error"] == "mse")
     assert (first["kind"], first["batch"], first["constraints"]) == ("model", "2", "held")
     assert float(first["low"]) <= float(first["value"]) <= float(first["high"])
     assert np.isclose(float(first["frames_per_second"]) * float(first["ms_per_frame"]), 1000, rtol=1e-3)
+
+
+def test_the_field_error_asks_where_material_is_and_not_which_particle(scenes):
+    target = scenes.window([0]).target[0].double()
+    material = scenes.recordings[0].material
+    shuffled = target[:, torch.randperm(target.shape[1], generator=torch.Generator().manual_seed(0))]
+    assert field_error(scenes.scene, shuffled, target, material) < 1e-12
+    left, right = (torch.full_like(target, place) for place in (0.2, 0.8))
+    assert field_error(scenes.scene, left, right, material) == 1
+    half = torch.cat([left[:, ::2], right[:, 1::2]], dim=1)[:, : left.shape[1]]
+    share = 1 - left[:, ::2].shape[1] / left.shape[1]
+    np.testing.assert_allclose(field_error(scenes.scene, half, left, material), share, rtol=1e-6)
