@@ -13,6 +13,7 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.emulator import Emulator
+    from nmpm.evaluation.gns import TrainedGraph
     from nmpm.evaluation.trade import Choice, Point, Scenes, Sweep
 
 DESCRIPTION = """Measure the trade between speed and accuracy: time and errors of emulators, of the simulator with fewer
@@ -49,7 +50,9 @@ def run(words: list[str]) -> None:
 
     sweep = _sweep(chosen)
     scenes = _scenes(chosen.dataset, sweep.scenes)
-    choices = make_choices(sweep, scenes, _models(chosen.models, scenes), find_device(chosen.device))
+    graphs = _graph_folders(chosen.models or [])
+    models = _models(None if chosen.models is None else [n for n in chosen.models if n not in graphs], scenes)
+    choices = make_choices(sweep, scenes, models, find_device(chosen.device), graphs)
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     points = _measure(choices, scenes, sweep, out, chosen.keep_predictions)
@@ -64,7 +67,12 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("dataset", nargs="?", help="an embedded dataset (goop, …), or a folder in native layout")
-    parser.add_argument("--models", nargs="*", metavar="MODEL", help=f"{MODEL} (default: the zoo's of this dataset)")
+    parser.add_argument(
+        "--models",
+        nargs="*",
+        metavar="MODEL",
+        help=f"{MODEL}, or a graph simulator's folder (default: the zoo's of this dataset)",
+    )
     parser.add_argument("--scenes", type=int, help="number of test scenes (default: the sweep's, 20)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: trade/DATASET)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML of what is measured, see --print_config")
@@ -100,14 +108,11 @@ def _sweep(chosen: argparse.Namespace) -> Sweep:
 
 def _scenes(dataset: str, count: int) -> Scenes:
     """Test scenes of a folder, or of an embedded dataset; of the latter only these are simulated if it is missing."""
-    from nmpm.data.catalog import catalog, dataset_folder, ensure, simulation_request
-    from nmpm.data.format import METADATA_FILE
+    from nmpm.data.catalog import catalog, ensure, find_simulated
     from nmpm.evaluation.trade import read_scenes
 
     if dataset in catalog():
-        whole = dataset_folder(dataset, simulation_request(dataset))
-        complete = (whole / METADATA_FILE).is_file()
-        folder = whole if complete else ensure(dataset, {"train": 0, "valid": 0, "test": count})
+        folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
         return read_scenes(dataset, folder, count)
     if not Path(dataset).is_dir():
         raise ConfigError(f"{dataset} is neither a folder nor an embedded dataset: {', '.join(catalog())}.")
@@ -124,6 +129,13 @@ def _models(names: list[str] | None, scenes: Scenes) -> dict[str, Emulator]:
     short = {name: Path(name).name if Path(name).is_dir() else name for name in names}
     unique = len(set(short.values())) == len(short)
     return {short[name] if unique else name: load_model(name).emulator for name in names}
+
+
+def _graph_folders(names: list[str]) -> dict[str, TrainedGraph]:
+    """Those of the models that are folders of graph simulators, by name."""
+    from nmpm.evaluation.gns import is_graph_folder, read_graph
+
+    return {name: read_graph(Path(name)) for name in names if is_graph_folder(Path(name))}
 
 
 def _measure(choices: list[Choice], scenes: Scenes, sweep: Sweep, out: Path, keep: bool) -> list[Point]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from nmpm._support.shipped import user_home
+from nmpm.data.format import METADATA_FILE, read_metadata
 from nmpm.data.generate import SimulationRequest, generate
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -111,6 +112,25 @@ def dataset_folder(name: str, request: SimulationRequest) -> Path:
     """The folder of a request in the cache: the name and a hash of all that determines the data."""
     fingerprint = hashlib.sha256(json.dumps(request.to_dict(), sort_keys=True).encode()).hexdigest()[:10]
     return dataset_home() / "datasets" / f"{name}-{fingerprint}"
+
+
+def find_simulated(name: str, test: int) -> Path | None:
+    """A complete folder of an embedded dataset with at least `test` test trajectories, for whatever it was simulated.
+
+    Trajectories do not depend on how many there are, so that those of a training's data serve as well.
+
+    Raises:
+        DataError: if there is no dataset of that name.
+    """
+    wanted = simulation_request(name).to_dict()
+    for folder in sorted((dataset_home() / "datasets").glob(f"{name}-*")):
+        if not (folder / METADATA_FILE).is_file():
+            continue
+        found = read_metadata(folder).extra.get("simulation", {})
+        same = all(found.get(key) == wanted[key] for key in ("preset", "seed", "revision"))
+        if same and found.get("counts", {}).get("test", 0) >= test:
+            return folder
+    return None
 
 
 def ensure(

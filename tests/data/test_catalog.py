@@ -54,3 +54,12 @@ def test_the_folder_depends_on_all_that_determines_the_data(home):
 def test_an_unknown_name_lists_the_known_ones(ask):
     with pytest.raises(DataError, match=r"'treacle'.*goop"):
         ask("treacle")
+
+
+def test_test_trajectories_are_found_whatever_they_were_simulated_for(home):
+    assert catalog.find_simulated("goop", 1) is None
+    catalog.ensure("goop", counts=COUNTS, frames=2)  # other scenes: shorter
+    assert catalog.find_simulated("goop", 1) is None
+    folder = catalog.ensure("goop", counts={"train": 0, "valid": 0, "test": 2}, workers=1)
+    assert catalog.find_simulated("goop", 1) == catalog.find_simulated("goop", 2) == folder
+    assert catalog.find_simulated("goop", 3) is None

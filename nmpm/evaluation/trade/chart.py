@@ -20,12 +20,14 @@ from nmpm.evaluation.trade.scenes import Scenes
 _MARKERS: Mapping[Kind, dict[str, Any]] = MappingProxyType(
     {
         Kind.MODEL: {"marker": "o", "color": "#2670c8", "label": "emulator"},
+        Kind.GRAPH: {"marker": "^", "color": "#8a4ab0", "label": "graph network"},
         Kind.SIMULATOR: {"marker": "s", "color": "#c8642a", "markerfacecolor": "none", "label": "simulator"},
     }
 )
 _PLACES: Mapping[Kind, Sequence[dict[str, Any]]] = MappingProxyType(  # of names, in turn, in points
     {
         Kind.MODEL: ({"xytext": (-8, -11), "ha": "right"}, {"xytext": (8, -11)}),
+        Kind.GRAPH: ({"xytext": (-8, 6), "ha": "right"},),
         Kind.SIMULATOR: ({"xytext": (8, 5)},),
     }
 )

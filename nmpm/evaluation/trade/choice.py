@@ -24,6 +24,7 @@ class Kind(StrEnum):
     """What a choice is; floors are drawn beside the others and never advised."""
 
     MODEL = "model"
+    GRAPH = "graph"
     SIMULATOR = "simulator"
     TRIVIAL = "trivial"
     FLOOR = "floor"

@@ -126,9 +126,19 @@ def _advice(point: Point, usable: Sequence[Point], where: Mapping[str, Standing]
     return Advice(point.milliseconds, point.name, sentence)
 
 
-_DO = {Kind.MODEL: "Use the emulator", Kind.SIMULATOR: "Run the", Kind.TRIVIAL: "Compute nothing: take"}
+_DO = {
+    Kind.MODEL: "Use the emulator",
+    Kind.GRAPH: "Use the graph network",
+    Kind.SIMULATOR: "Run the",
+    Kind.TRIVIAL: "Compute nothing: take",
+}
 _VERB = {Kind.MODEL: "the best emulator", Kind.SIMULATOR: "the best simulator setting", Kind.TRIVIAL: "the trivial"}
-_OPPOSITE = {Kind.MODEL: (Kind.SIMULATOR,), Kind.SIMULATOR: (Kind.MODEL,), Kind.TRIVIAL: (Kind.MODEL, Kind.SIMULATOR)}
+_OPPOSITE = {
+    Kind.MODEL: (Kind.SIMULATOR,),
+    Kind.GRAPH: (Kind.MODEL, Kind.SIMULATOR),
+    Kind.SIMULATOR: (Kind.MODEL,),
+    Kind.TRIVIAL: (Kind.MODEL, Kind.SIMULATOR),
+}
 
 
 def _rival(point: Point, usable: Sequence[Point], where: Mapping[str, Standing]) -> Point | None:

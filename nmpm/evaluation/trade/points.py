@@ -18,7 +18,7 @@ from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 from nmpm.evaluation.trade.timing import Times, Timing, known_times, quartiles
 
-COMPETING = (Kind.MODEL, Kind.SIMULATOR, Kind.TRIVIAL)
+COMPETING = (Kind.MODEL, Kind.GRAPH, Kind.SIMULATOR, Kind.TRIVIAL)
 """Kinds that a user can choose; floors are not among them."""
 
 

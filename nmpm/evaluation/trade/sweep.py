@@ -8,14 +8,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from itertools import product
+from types import MappingProxyType
 
 import torch
 import yaml
 
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
+from nmpm.evaluation.gns import TrainedGraph
 from nmpm.evaluation.trade.choice import CPU, Choice, Kind, digest
 from nmpm.evaluation.trade.errors import Measures
+from nmpm.evaluation.trade.graphs import graph_choices
 from nmpm.evaluation.trade.models import (
     ModelChoice,
     check_scene,
@@ -160,7 +163,11 @@ def read_sweep(text: str, where: str) -> Sweep:
 
 
 def make_choices(
-    sweep: Sweep, scenes: Scenes, models: Mapping[str, Emulator], device: torch.device = CPU
+    sweep: Sweep,
+    scenes: Scenes,
+    models: Mapping[str, Emulator],
+    device: torch.device = CPU,
+    graphs: Mapping[str, TrainedGraph] = MappingProxyType({}),
 ) -> list[Choice]:
     """All choices of a sweep; the first is the reference that times are compared with.
 
@@ -169,6 +176,7 @@ def make_choices(
         scenes: What is predicted; without simulator there are no choices of it, and no floors.
         models: Trained emulators on the CPU, by name.
         device: Where they compute.
+        graphs: Trained graph simulators, by name.
 
     Raises:
         ConfigError: if a model was trained for other scenes, or there is no such setting.
@@ -180,6 +188,7 @@ def make_choices(
     for name, emulator in models.items():
         check_scene(name, emulator, scenes)
         choices += _without_repetitions(_models(sweep.models, name, emulator, device))
+    choices += graph_choices(graphs, scenes)
     choices += [TrivialChoice(name) for name in sweep.trivial]
     return choices
 

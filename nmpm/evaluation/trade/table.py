@@ -15,7 +15,7 @@ from nmpm.evaluation.trade.frontier import describe_measure, standings
 from nmpm.evaluation.trade.points import Point, measure_names
 from nmpm.evaluation.trade.scenes import Scenes
 
-SETTINGS = ("model", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
+SETTINGS = ("model", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime", "training_minutes")
 """Columns of what was chosen; empty where it does not apply."""
 
 COLUMNS = (

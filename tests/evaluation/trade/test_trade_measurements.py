@@ -11,6 +11,7 @@ import torch
 
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall
+from nmpm.evaluation.gns import GraphRecipe, TrainedGraph
 from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure
 from nmpm.evaluation.trade.accuracy import measure_accuracy
 from nmpm.evaluation.trade.errors import field_error, measure_errors
@@ -188,6 +189,33 @@ def test_runtimes_are_choices_of_their_own(scenes):
     wrong = dataclasses.replace(sweep, models=dataclasses.replace(settings, runtime=("fast",)))
     with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
         make_choices(wrong, scenes, models)
+
+
+def tiny_graph(scene, curve=((1.0, 0.5), (2.0, 0.1))):
+    torch.manual_seed(0)
+    return TrainedGraph(GraphRecipe(scene, width=4, steps=1).build().eval(), 2.0, 10, curve)
+
+
+def test_graph_networks_are_choices_that_say_whether_they_have_converged(scenes, tmp_path):
+    graph = tiny_graph(scenes.scene)
+    with torch.no_grad():
+        graph.simulator.network.decode[-1].weight.zero_()
+        graph.simulator.network.decode[-1].bias.zero_()  # no acceleration: all flies on
+    found = make_choices(tiny_sweep(), scenes, {}, graphs={"here": graph, "there": graph})
+    names = [choice.name for choice in found if choice.kind is Kind.GRAPH]
+    assert names == [f"GNS, 2 min of training, not converged ({name})" for name in ("here", "there")]
+    choice = next(choice for choice in found if choice.kind is Kind.GRAPH)
+    state = scenes.window([0]).initial
+    straight = state.position.unsqueeze(1) + torch.arange(1, 5).view(1, -1, 1, 1) * state.velocity.unsqueeze(1)
+    torch.testing.assert_close(choice.prepare(scenes, [0])(4), straight, atol=1e-5, rtol=0)
+    (point,) = measure([choice], scenes, tiny_sweep(), Store(tmp_path), lambda _: None)
+    assert (point.kind, point.settings["training_minutes"]) == (Kind.GRAPH, 2.0)
+
+
+def test_a_graph_network_of_other_scenes_is_rejected(scenes):
+    other = tiny_graph(dataclasses.replace(scenes.scene, dt=2 * scenes.scene.dt))
+    with pytest.raises(ConfigError, match=r"graph simulator other was trained for other scenes .*: dt differ"):
+        make_choices(tiny_sweep(), scenes, {}, graphs={"other": other})
 
 
 def test_a_model_of_other_scenes_is_rejected(scenes):

@@ -1,5 +1,6 @@
-// The chart: emulators as discs, simulator settings as squares, trivial predictors and floors as lines.
+// The chart: emulators as discs, graph networks as triangles, simulator settings as squares, trivial predictors and floors as lines.
 
+const PLACED = ["model", "graph", "simulator"]; // kinds that are points
 const MARGIN = { left: 74, right: 22, top: 12, bottom: 44 };
 
 class Chart {
@@ -11,7 +12,7 @@ class Chart {
     this.svg.replaceChildren();
     const value = (point) => point.where[measure.name];
     const known = points.filter(value);
-    const placed = known.filter((point) => ["model", "simulator"].includes(point.kind));
+    const placed = known.filter((point) => PLACED.includes(point.kind));
     const levels = known.filter((point) => ["trivial", "floor"].includes(point.kind) && value(point)[0] > 0);
     const visible = placed.filter((point) => !point.exact);
     // A floor far below all points would squeeze them; it is left out, and the page says so.
@@ -65,8 +66,10 @@ class Chart {
     draw(group, "line", { class: "bar", x1: x.at(point.ms[0]), x2: x.at(point.ms[2]), y1: at[1], y2: at[1] });
     draw(group, "circle", { class: "halo", cx: at[0], cy: at[1], r: 13 });
     if (member) draw(group, "circle", { class: "ring", cx: at[0], cy: at[1], r: 10 });
-    if (point.kind === "model") draw(group, "circle", { class: "mark", cx: at[0], cy: at[1], r: advised ? 7 : 5 });
-    else draw(group, "rect", { class: "mark", x: at[0] - (advised ? 7 : 5), y: at[1] - (advised ? 7 : 5), width: advised ? 14 : 10, height: advised ? 14 : 10 });
+    const r = advised ? 7 : 5;
+    if (point.kind === "model") draw(group, "circle", { class: "mark", cx: at[0], cy: at[1], r });
+    else if (point.kind === "graph") draw(group, "path", { class: "mark", d: `M${at[0] - r} ${at[1] + r}h${2 * r}l${-r} ${-2 * r}z` });
+    else draw(group, "rect", { class: "mark", x: at[0] - r, y: at[1] - r, width: 2 * r, height: 2 * r });
     const name = point.name.replace(/^simulator, /, "");
     if (member || advised) draw(group, "text", { class: "label", x: at[0] + 12, y: at[1] - 6 }, name);
     for (const event of ["mouseenter", "focus"]) group.addEventListener(event, () => this.show(point, at));

@@ -1,6 +1,6 @@
 // The page: choices, the card of a point, the budget and its advice.
 
-const KINDS = { model: "emulators", simulator: "simulator", trivial: "trivial", floor: "floors" };
+const KINDS = { model: "emulators", graph: "graph networks", simulator: "simulator", trivial: "trivial", floor: "floors" };
 const element = (id) => document.getElementById(id);
 const trade = JSON.parse(element("data").textContent);
 
@@ -38,7 +38,7 @@ class Page {
 
   // The slider goes from somewhat below the fastest emulator or simulator setting to somewhat above the slowest.
   setRange() {
-    const times = trade.points.filter(({ kind }) => kind === "model" || kind === "simulator").map(({ ms }) => ms[1]);
+    const times = trade.points.filter(({ kind }) => PLACED.includes(kind)).map(({ ms }) => ms[1]);
     const all = times.length ? times : trade.points.map(({ ms }) => ms[1]);
     this.least = Math.min(...all) / 2;
     this.most = Math.max(...all) * 1.2;
