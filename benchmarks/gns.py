@@ -41,15 +41,14 @@ def main() -> None:
     curve: list[tuple[float, float]] = []
     start = time.perf_counter()
     for step, seconds in enumerate(train(simulator, training, settings), 1):
-        if not due or seconds < 60 * due[0]:
-            continue
-        minutes = due.pop(0)
-        curve.append((minutes, validation_loss(simulator, validation, chosen.noise)))
-        wall = (time.perf_counter() - start) / 60
-        sys.stdout.write(f"{minutes:.3g} min ({wall:.3g} by the wall), {step} steps: loss {curve[-1][1]:.4f}\n")
-        sys.stdout.flush()
-        if minutes in chosen.minutes:
-            write_graph(chosen.out / f"minutes-{minutes:g}", TrainedGraph(simulator, minutes, step, tuple(curve)))
+        while due and seconds >= 60 * due[0]:
+            minutes = due.pop(0)
+            curve.append((minutes, validation_loss(simulator, validation, chosen.noise)))
+            wall = (time.perf_counter() - start) / 60
+            sys.stdout.write(f"{minutes:.3g} min ({wall:.3g} by the wall), {step} steps: loss {curve[-1][1]:.4f}\n")
+            sys.stdout.flush()
+            if minutes in chosen.minutes:
+                write_graph(chosen.out / f"minutes-{minutes:g}", TrainedGraph(simulator, minutes, step, tuple(curve)))
 
 
 def _recordings(folder: Path, scene: Scene, split: str) -> list[Recording]:

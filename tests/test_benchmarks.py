@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import io
 import json
 import runpy
@@ -13,7 +14,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from scenes import cloud
 
+from nmpm.data import catalog
+from nmpm.data.generate import generate
+from nmpm.emulator import EmulatorRecipe, rollout
+from nmpm.evaluation.gns import read_graph
+from nmpm.evaluation.trade import Kind, Scenes, make_choices, read_sweep
+from nmpm.processors import Identity, UNet
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
 
@@ -22,8 +30,8 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "recipes", "runtimes", "windows"} | {
-    "against_recordings", "calibration", "dam_break", "kills", "simulators", "stable_substeps",
-    "where_emulation_pays",
+    "against_recordings", "calibration", "dam_break", "gns", "kills", "run_time_knob", "simulators", "stable_substeps",
+    "stiffness", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels and recipes on one thread, and the simulators."""
 
@@ -293,3 +301,75 @@ def test_a_cost_is_fitted_to_all_but_the_widest():
     cases = [script.Case("", 1, count, "", 1, None, None) for count in (100, 200, 400)]
     fit = script.fit_cost(cases, [3.0, 5.0, 18.0])
     assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})
+
+
+# ---- time and error beside the simulator
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "trade").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_sweeps_have_choices_of_their_simulator(path):
+    preset = load_preset(path.stem)
+    sweep = read_sweep(path.read_text(encoding="utf-8"), path.name)
+    choices = make_choices(sweep, Scenes(path.stem, preset.scene, (), preset, ()), {})
+    assert choices[0].name == f"simulator, {preset.substeps} substeps"
+    coarse = {choice.settings["coarser"] for choice in choices if choice.kind is Kind.SIMULATOR}
+    assert coarse == set(sweep.simulator.coarser)
+
+
+def test_a_graph_network_is_trained_and_written_at_the_times_asked_for(tmp_path, monkeypatch):
+    preset = load_preset("goop").coarsened(2).with_frames(6)
+    preset = dataclasses.replace(preset, blocks=dataclasses.replace(preset.blocks, number=(1, 1), particles=(60, 80)))
+    generate(preset, tmp_path / "data", {"train": 1, "valid": 1, "test": 0}, workers=1)
+    monkeypatch.setattr(catalog, "ensure", lambda *_: tmp_path / "data")
+    text = run_script(
+        "gns", "goop", "--minutes", "0.0005", "0.001", "--trajectories", "1", "--width", "4", "--out", str(tmp_path)
+    )
+    first, last = (read_graph(tmp_path / f"minutes-{minutes}") for minutes in ("0.0005", "0.001"))
+    assert (first.minutes, last.minutes) == (0.0005, 0.001)
+    assert first.steps <= last.steps
+    assert last.curve[: len(first.curve)] == first.curve
+    assert text.count("loss") == 8
+
+
+def test_a_model_is_its_own_ensemble_and_commits_whole_bundles():
+    import run_time_knob
+
+    scene = load_preset("goop").scene
+    torch.manual_seed(0)
+    emulator = EmulatorRecipe(scene, cells=16, frames=4, processor=UNet(width=4, depth=2)).build().eval()
+    state = cloud(scene, batch=2)
+    expected = rollout(emulator, state, 10)
+    torch.testing.assert_close(run_time_knob.knob_rollout([emulator], state, 10, 4), expected)
+    torch.testing.assert_close(run_time_knob.knob_rollout([emulator] * 2, state, 10, 4), expected)
+    short = run_time_knob.knob_rollout([emulator], state, 10, 2)
+    torch.testing.assert_close(short[:, :2], expected[:, :2])
+    assert not torch.equal(short, expected)
+
+
+def test_a_shift_moves_the_grid_and_nothing_else():
+    import run_time_knob
+
+    scene = load_preset("goop").scene
+    emulator = EmulatorRecipe(scene, cells=16, frames=4, processor=Identity()).build().eval()
+    moved = run_time_knob.shifted(emulator, (0.25, -0.25))
+    assert moved.scene.bounds == scene.bounds
+    assert moved.grid.shape == emulator.grid.shape
+    expected = (
+        scene.domain[0][0] + 0.25 * emulator.grid.spacing[0],
+        scene.domain[1][0] - 0.25 * emulator.grid.spacing[1],
+    )
+    assert moved.grid.lower == pytest.approx(expected)
+    assert run_time_knob.shifted(emulator, (0.0, 0.0)) is emulator
+
+
+@pytest.mark.parametrize("name", ["goop", "waterramps", "dambreak2d"])
+def test_stiffer_materials_need_substeps_as_sound_is_faster(name):
+    import stiffness
+
+    preset = load_preset(name)
+    one, hundred = (stiffness.stiffer(preset, factor) for factor in (1, 100))
+    assert one.substeps == preset.stable_substeps
+    if name == "waterramps":  # stiffer water is compressed less, and so stiffens less in spray
+        assert 3 * one.substeps < hundred.substeps < 10 * one.substeps
+    else:
+        assert hundred.substeps == pytest.approx(10 * one.substeps, abs=10)

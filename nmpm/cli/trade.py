@@ -24,6 +24,7 @@ _EXAMPLES = """\
 examples:
   nmpm trade goop                                    the zoo's models of goop beside its simulator
   nmpm trade goop --models goop runs/a runs/b        models of your own, by name, run, checkpoint or entry's folder
+  nmpm trade goop --models goop runs/gns/minutes-10  beside a particle-graph network, see benchmarks/gns.py
   nmpm trade FOLDER --models runs/mine               recorded data in native layout: without a simulator
   nmpm trade --print_config > sweep.yaml             what is measured; edit, then: nmpm trade goop --config sweep.yaml
 
