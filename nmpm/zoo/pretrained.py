@@ -94,7 +94,7 @@ class Pretrained:
                 faster than the model was calibrated for, a material is unknown, or gravity is not the model's.
 
         Warns:
-            UserWarning: if the velocities look as if they were per frame.
+            UserWarning: if the velocities look as if they were per frame, or particles start inside an obstacle.
         """
         builder = StateBuilder(self.emulator, position, dtype)
         return builder.build(velocity, material, obstacle, gravity).to(self.emulator.device)
