@@ -52,3 +52,11 @@ def test_the_simulator_at_equal_time_and_at_equal_error():
     name, ratio = ours.at_equal_error
     assert (name, ratio) == ("simulator, 6 substeps", pytest.approx(2.0))
     assert slower.at_equal_time == ("simulator, 6 substeps", pytest.approx(0.5))
+
+
+def test_a_graph_network_is_advised_like_any_other_and_named_as_what_it_is():
+    points = [point("ours", time=1.0, errors=(1.0, 1.2)), point("GNS", Kind.GRAPH, 2.0, (0.5, 0.6))]
+    steps = advise(points, "mse")
+    assert [step.name for step in steps] == ["", "ours", "GNS"]
+    assert steps[-1].sentence.startswith("Use the graph network GNS")
+    assert "the best emulator there, ours" in steps[-1].sentence

@@ -37,6 +37,7 @@ def made_up_points():
         shown,
         point("ours, batch 8", time=0.5, errors=(0.8, 1.2), batch=8),
         point("ours, free", time=0.9, errors=(0.8, 1.2), failures={0: "gains 30% of energy"}),
+        point("GNS, not converged", Kind.GRAPH, 3.0, (2.0, 2.4)),
         point("nothing moves", Kind.TRIVIAL, 0.001, (50.0, 50.0)),
         point("nudged", Kind.FLOOR, 8.0, (1e-9, 1e-9)),
     ]
@@ -63,15 +64,17 @@ def names(page):
 
 
 def test_kinds_are_drawn_apart_and_filters_hide_them(page):
-    assert names(page) == ["simulator, 6 substeps", "ours"]
+    assert names(page) == ["simulator, 6 substeps", "ours", "GNS, not converged"]
     assert page.locator(".point.model circle.mark").count() == 1
     assert page.locator(".point.simulator rect.mark").count() == 1
+    assert page.locator(".point.graph path.mark").count() == 1
     assert page.locator(".level").count() == 2  # nothing moves, and the simulator as shipped; the floor is far below
     assert "nudged: 1e-9" in page.locator("#about").inner_text()
     page.check("#batches")
     page.check("#unstable")
-    assert set(names(page)) == {"simulator, 6 substeps", "ours", "ours, batch 8", "ours, free"}
+    assert set(names(page)) == {"simulator, 6 substeps", "ours", "ours, batch 8", "ours, free", "GNS, not converged"}
     page.uncheck("#kind-model")
+    page.uncheck("#kind-graph")
     assert names(page) == ["simulator, 6 substeps"]
     assert page.locator("#title").inner_text() == "made up </script>: time and error"
 
@@ -89,7 +92,7 @@ def test_the_budget_decides_the_advice(page):
         assert sentence in advice.inner_text()
     assert page.locator(".slow").count() == 0
     page.evaluate("page.budget = 1.2")
-    assert page.locator(".slow").count() == 1
+    assert page.locator(".slow").count() == 2
     page.evaluate("page.budget = 5")
     page.select_option("#pool", "no simulator")
     assert "Use the emulator ours" in advice.inner_text()
@@ -127,5 +130,5 @@ def test_errors_axes_and_themes_change_the_picture(page):
 def test_the_picture_is_drawn(tmp_path):
     draw_chart(tmp_path / "trade.png", made_up_points(), made_up_scenes())
     pixels = np.asarray(Image.open(tmp_path / "trade.png").convert("RGB")).astype(int)
-    for colour in ((38, 112, 200), (200, 100, 42)):
+    for colour in ((38, 112, 200), (138, 74, 176), (200, 100, 42)):
         assert (np.abs(pixels - colour).sum(-1) < 60).sum() > 50
