@@ -60,6 +60,8 @@ class TrajectoryDataModule(LightningDataModule):
         gravity: Acceleration in length/s² per axis, where recorded data do not state it.
         boundary: "wall" or "periodic" per axis, instead of that in the metadata of recorded data.
         bounds: (lower, upper) per axis, likewise.
+        fields: Names of fields that the model is told of, such as [temperature], instead of those that the metadata of
+            recorded data declare; [] for none. Those that evolve are predicted.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
@@ -83,13 +85,14 @@ class TrajectoryDataModule(LightningDataModule):
         gravity: list[float] | None = None,
         boundary: list[Boundary] | None = None,
         bounds: list[tuple[float, float]] | None = None,
+        fields: list[str] | None = None,
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         path = None if path == _OPEN and name is not None else path
-        stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds}
+        stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds, "fields": fields}
         _check_source(path, name, source, stated, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:

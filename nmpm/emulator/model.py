@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,11 +22,13 @@ from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
+from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
 from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows
+from nmpm.emulator.windows.reads import check_reads
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -45,10 +49,18 @@ class Bundle:
     Args:
         position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
         velocity: (B, N, D) at the last frame, in length per frame.
+        fields: (B, m, N) of each evolving field, by name, in its own unit.
     """
 
     position: Tensor
     velocity: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def state_after(self, particles: Particles) -> Particles:
+        """The state at the bundle's last frame, of the particles that it started from."""
+        moved = particles.with_motion(self.position[:, -1], self.velocity)
+        last = {name: values[:, -1] for name, values in self.fields.items()}
+        return moved.with_fields(last) if last else moved
 
 
 @dataclass(frozen=True)
@@ -93,6 +105,7 @@ class Emulator(nn.Module):
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
             self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
+        self.field_scales = FieldScales(scene)
         column = (1,) * scene.dim
         self.register_buffer("input_mean", torch.zeros(inputs, *column))
         self.register_buffer("input_std", torch.ones(inputs, *column))
@@ -220,7 +233,12 @@ class Emulator(nn.Module):
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
-        """What stays the same through a rollout from this state: solids and, if constrained, its energy."""
+        """What stays the same through a rollout from this state: solids and, if constrained, its energy.
+
+        Warns:
+            UserWarning: naming each field that the state lacks.
+        """
+        self.field_scales.warn_of_missing(particles)
         return RolloutContext(self.solid(particles), self.budget(particles))
 
     def solid(self, particles: Particles) -> Tensor:
@@ -261,21 +279,21 @@ class Emulator(nn.Module):
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         own = particles
 
-        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
+        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor, Mapping[str, Tensor]]:
             if coverage is None:
                 output = self.runtime.fields(self.processor, normalised, self.network_precision)
             else:
                 output = coverage.predict(self.processor, normalised.to(self.network_precision))
             readable = None if coverage is None else coverage.readable
             with _full_precision(device):
-                start = Departure(
-                    cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale, readable
-                )
-                return start, steps.path(start, context)
+                flows, scale = output[:, :, : self._flows], self.output_scale[:, : self._flows]
+                start = Departure(cells, velocity, gravity, own.material, own.mask, state, flows, scale, readable)
+                path = steps.path(start, context)
+                return start, path, self._evolve_fields(own, start, path, output) if self.scene.evolving else {}
 
         fixed = self.training or self.runtime.fixed_shapes
         windows = None if fixed else choose_windows(self.windows, self.processor, self.recipe, state)
-        start, path = find_in_windows(windows, find_path)
+        start, path, evolved = find_in_windows(windows, find_path)
         with _full_precision(device):
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
@@ -283,7 +301,23 @@ class Emulator(nn.Module):
                 # Spreading is no motion of the material: the velocity is that of the path without it.
                 path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
             velocity = self.grid.to_displacement(step.to(precision))
-            return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
+            return Bundle(steps.to_length(path, precision), velocity, evolved)  # the last use of the path's memory
+
+    def _evolve_fields(
+        self, particles: Particles, start: Departure, path: Tensor, output: Tensor
+    ) -> Mapping[str, Tensor]:
+        """The evolving fields along a path (B, m, N, D) in cells, (B, m, N) by name."""
+        if start.readable is not None:
+            check_reads(start.cells, path, start.mask, start.readable, self.grid)
+        places = torch.cat([start.cells.unsqueeze(1), path[:, :-1]], dim=1)
+        rates = output[:, :, self._flows :].to(self.precision) * self.output_scale[:, self._flows :]
+        gather = partial(self.advection.gather, material=particles.material)
+        return self.field_scales.evolve(particles, places, rates, gather)
+
+    @property
+    def _flows(self) -> int:
+        """Number of the output channels that are velocities."""
+        return len(self.scene.materials) * self.scene.dim
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
