@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -104,8 +104,7 @@ def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
     return torch.stack(sides).any(0)
 
 
-@dataclass(frozen=True)
-class Rollout:
+class Rollout(NamedTuple):
     """Predicted frames.
 
     Args:

@@ -57,8 +57,8 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], mine: EmulatorRecipe)
     if stored.scene.output_channels != mine.scene.output_channels or stored.scene.fields != mine.scene.fields:
         raise ConfigError(
             f"The checkpoint was trained with the fields {_listed(stored.scene.fields)}, the model has"
-            f" {_listed(mine.scene.fields)}. Declare the same (data.fields), or load the checkpoint by nmpm.Zoo.load,"
-            " which runs on scenes with more or fewer."
+            f" {_listed(mine.scene.fields)}. Declare the same (data.fields); nmpm test, predict and rollout run it on"
+            " scenes with more or fewer."
         )
     theirs, ours = stored.to_dict(), mine.to_dict()
     found = [
