@@ -76,7 +76,7 @@ class PaddedRecordings:
             fields={name: values.to(device) for name, values in self.fields.items()},
         )
 
-    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int) -> Window:
+    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int, particles: int | None = None) -> Window:
         """Gathers consecutive frames of B recordings.
 
         Args:
@@ -84,21 +84,24 @@ class PaddedRecordings:
             starts: First frame of each. On the scene's periodic axes positions are unwrapped from there on, so that
                 differences between frames are displacements.
             length: Frames of the window; each recording must have as many from its start on.
+            particles: Number to which the windows are padded, at least that of each; the largest recording's if left
+                out.
         """
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)
         frame = first[:, None] + torch.arange(length, device=self.frames.device)
-        frames = self.frames[row[:, None], frame]
+        kept = slice(particles)
+        frames = self.frames[:, :, kept][row[:, None], frame]
         unwrap(frames, self.scene)
         return Window(
             frames=frames,
-            material=self.material[row],
-            mask=self.mask[row],
+            material=self.material[:, kept][row],
+            mask=self.mask[:, kept][row],
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
             fields={
-                name: values[row] if values.shape[1] == 1 else values[row[:, None], frame]
+                name: values[:, :, kept][row] if values.shape[1] == 1 else values[:, :, kept][row[:, None], frame]
                 for name, values in self.fields.items()
             },
         )
