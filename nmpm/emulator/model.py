@@ -10,7 +10,6 @@ import copy
 import dataclasses
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -20,6 +19,8 @@ from torch import Tensor, nn
 from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection
+from nmpm.emulator.bundle import Bundle as Bundle
+from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.fields import FieldScales
@@ -40,40 +41,6 @@ if TYPE_CHECKING:
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
-
-
-@dataclass(frozen=True)
-class Bundle:
-    """The m frames that one call predicts.
-
-    Args:
-        position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
-        velocity: (B, N, D) at the last frame, in length per frame.
-        fields: (B, m, N) of each evolving field, by name, in its own unit.
-    """
-
-    position: Tensor
-    velocity: Tensor
-    fields: Mapping[str, Tensor] = field(default_factory=dict)
-
-    def state_after(self, particles: Particles) -> Particles:
-        """The state at the bundle's last frame, of the particles that it started from."""
-        moved = particles.with_motion(self.position[:, -1], self.velocity)
-        last = {name: values[:, -1] for name, values in self.fields.items()}
-        return moved.with_fields(last) if last else moved
-
-
-@dataclass(frozen=True)
-class RolloutContext:
-    """What stays the same from bundle to bundle of a rollout, computed once from its first state.
-
-    Args:
-        solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
-        budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
-    """
-
-    solid: Tensor
-    budget: Tensor | None
 
 
 class Emulator(nn.Module):
