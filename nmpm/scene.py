@@ -210,7 +210,8 @@ def check_field_names(names: Iterable[str]) -> None:
     """
     found: list[str] = []
     for name in names:
-        if not isinstance(name, str) or not name.isidentifier() or name.startswith("gravity_") or name in _RESERVED:
+        taken = str(name).startswith(("gravity_", "velocity_")) or name in _RESERVED
+        if not isinstance(name, str) or not name.isidentifier() or taken:
             raise ConfigError(
                 f"A field cannot be called {str(name)[:40]!r}: give letters, digits and underscores, and none of"
                 f" {', '.join(sorted(_RESERVED))}."

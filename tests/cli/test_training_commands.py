@@ -18,7 +18,7 @@ from nmpm.cli import main
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
-from nmpm.zoo import Zoo
+from nmpm.zoo import Zoo, publish
 
 TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']
 SLOW = ("dambreak2d.yaml", "waterdrop3d.yaml", "wbcsph.yaml")
@@ -320,3 +320,6 @@ def test_a_model_of_a_field_is_tested_on_data_without_it(make_dataset):
     assert main(["rollout", model, "--data", test, "--frames", "5", "--out", "out.h5"]) == 0
     assert Split(Path("out.h5")).fields(0)["temperature"].shape == (7, 11)
     assert Split(Path("out.h5")).read(0).position.shape == (7, 11, 2)
+    publish.add(Path(model), "hot", root="zoo")
+    entry = Zoo.load("hot", root="zoo")
+    assert entry.predict(entry.example(count=4), 3).fields["temperature"].shape == (1, 3, 4)
