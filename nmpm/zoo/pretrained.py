@@ -97,7 +97,8 @@ class Pretrained:
                 faster than the model was calibrated for, a material is unknown, or gravity is not the model's.
 
         Warns:
-            UserWarning: if the velocities look as if they were per frame; naming fields that the model does not have.
+            UserWarning: if the velocities look as if they were per frame, or particles start inside an obstacle; naming
+                fields that the model does not have.
         """
         builder = StateBuilder(self.emulator, position, dtype)
         return builder.build(velocity, material, obstacle, gravity, fields).to(self.emulator.device)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nmpm._support.messages import one_line, suggestion
+from nmpm.emulator.contact import Contact, obstacle_share
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rollouts import check_inputs
@@ -69,6 +70,7 @@ class StateBuilder:
         )
         check_inputs(self.emulator, state)
         self._check_speeds(speed, kind)
+        self._check_obstacles(state)
         return state
 
     def _fields(self, given: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -192,6 +194,23 @@ class StateBuilder:
             warnings.warn(
                 f"{particle_is}, is very slow beside {limit}, up to which the model was calibrated. Velocities are in"
                 f" domain length per second; if yours are per frame, divide them by dt = {self.scene.dt:g} s.",
+                stacklevel=4,
+            )
+
+    def _check_obstacles(self, state: Particles) -> None:
+        """Warn of particles that start inside an obstacle, where recorded ones never are."""
+        if not state.obstacle.shape[1]:
+            return
+        with torch.no_grad():
+            own = state.to(self.emulator.device)
+            share = obstacle_share(self.emulator.solid(own), self.emulator.walls)
+            inside = Contact(share, self.emulator.grid).inside(self.emulator.in_cells(own)[0]).cpu()
+        if inside.any():
+            scene, particle = map(int, inside.nonzero()[0])
+            warnings.warn(
+                f"Scene {scene}: {int(inside[scene].sum())} of {self.count} particles start inside an obstacle, the"
+                f" first of them particle {particle} at {_format(self.position[scene, particle])}. The model was not"
+                " trained for that, and they may hold up the rest: move them or the obstacle.",
                 stacklevel=4,
             )
 

@@ -1,4 +1,5 @@
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from scenes import box
 
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import DataError
+from nmpm.obstacles import Ramp
 from nmpm.processors import Pointwise
 from nmpm.zoo.registry import Pretrained
 
@@ -159,3 +161,18 @@ def test_velocities_per_frame_are_suspected(model):
 @pytest.mark.parametrize("speed", [0.0, 1e-6, 0.1, 1.5])
 def test_plausible_velocities_are_not(model, speed):
     model.state(POSITIONS, velocity=(speed, 0.0))
+
+
+def test_particles_that_start_inside_an_obstacle_are_named():
+    model = model_of(box(obstacles=True))
+    bar = Ramp((0.5, 0.5), 0.4, 0.15, 0.3).particles(0.01)
+    inside = np.array([[0.2, 0.2], [0.5, 0.5], [0.2, 0.8]])
+    with pytest.warns(
+        UserWarning, match=r"Scene 0: 1 of 3 particles start inside.*particle 1 at \(0.5, 0.5\)"
+    ) as caught:
+        model.state(inside, obstacle=bar)
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.state(inside[::2], obstacle=bar)
+        model.state(inside)
