@@ -32,7 +32,7 @@ class GraphRecipe:
         reach: Radius of the graph, in particle spacings.
 
     Raises:
-        ConfigError: if a number is not positive, or an axis is periodic.
+        ConfigError: if a number is not positive, an axis is periodic, or the scene has fields.
     """
 
     scene: Scene
@@ -47,6 +47,8 @@ class GraphRecipe:
                 raise ConfigError(f"{name} = {getattr(self, name)} of a graph simulator must be positive.")
         if any(self.scene.periodic):
             raise ConfigError("Graph simulators are implemented for walls, not for periodic axes.")
+        if self.scene.fields:
+            raise ConfigError(f"Graph simulators read no fields, and the scene has {', '.join(self.scene.fields)}.")
 
     @property
     def radius(self) -> float:

@@ -183,5 +183,7 @@ def test_wrong_settings_are_named():
         GraphRecipe(SCENE, width=0)
     with pytest.raises(ConfigError, match="periodic"):
         GraphRecipe(dataclasses.replace(SCENE, boundary=("periodic", "wall")))
+    with pytest.raises(ConfigError, match="read no fields, and the scene has heat"):
+        GraphRecipe(dataclasses.replace(SCENE, evolving=("heat",)))
     with pytest.raises(ConfigError, match="seconds = 0"):
         GraphTraining(0)
