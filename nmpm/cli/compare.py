@@ -11,7 +11,7 @@ from nmpm.cli.options import MODEL, add_device_option, check_at_least, check_dev
 
 if TYPE_CHECKING:
     from nmpm.emulator import Emulator
-    from nmpm.evaluation.compare import Outcome, Subject
+    from nmpm.evaluation.compare import Candidate, Outcome
     from nmpm.evaluation.trade import Scenes
 
 DESCRIPTION = """Compare models on test scenes that they need not have been trained on: other particle counts, other
@@ -51,8 +51,8 @@ def run(words: list[str]) -> None:
         scenes = find_wider_scenes(chosen.data, chosen.scenes, chosen.wider)
     else:
         scenes = find_scenes(chosen.data, chosen.scenes)
-    subjects = make_predictors(scenes, models, find_device(chosen.device))
-    _report(_measure(subjects, scenes, out), scenes, out)
+    candidates = make_predictors(scenes, models, find_device(chosen.device))
+    _report(_measure(candidates, scenes, out), scenes, out)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,7 +84,7 @@ def _models(names: list[str]) -> dict[str, Emulator]:
     return {short[name] if unique else name: load_model(name).emulator for name in names}
 
 
-def _measure(subjects: list[Subject], scenes: Scenes, out: Path) -> list[Outcome]:
+def _measure(candidates: list[Candidate], scenes: Scenes, out: Path) -> list[Outcome]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -93,8 +93,8 @@ def _measure(subjects: list[Subject], scenes: Scenes, out: Path) -> list[Outcome
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
-        task = progress.add_task("compare", total=count_steps(subjects, scenes))
-        return compare(subjects, scenes, Store(out), lambda what: progress.update(task, advance=1, description=what))
+        task = progress.add_task("compare", total=count_steps(candidates, scenes))
+        return compare(candidates, scenes, Store(out), lambda what: progress.update(task, advance=1, description=what))
 
 
 def _report(outcomes: list[Outcome], scenes: Scenes, out: Path) -> None:

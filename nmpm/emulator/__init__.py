@@ -3,17 +3,20 @@
 from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.model import Bundle, Emulator, RolloutContext
 from nmpm.emulator.recipe import EmulatorRecipe
-from nmpm.emulator.rollouts import rollout, stream, unroll
+from nmpm.emulator.rollouts import Rollout, predict_rollout, rollout, stream, stream_rollout, unroll
 from nmpm.emulator.windows import Windows
 
 __all__ = [
     "Bundle",
     "Emulator",
     "EmulatorRecipe",
+    "Rollout",
     "RolloutContext",
     "Windows",
     "differentiable_rollout",
+    "predict_rollout",
     "rollout",
     "stream",
+    "stream_rollout",
     "unroll",
 ]

@@ -127,4 +127,5 @@ def _metadata(scene: Scene) -> Metadata:
         domain=scene.domain,
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,
+        fields=scene.fields,
     )

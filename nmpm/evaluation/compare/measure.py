@@ -12,7 +12,7 @@ from torch import Tensor
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, NmpmError
 from nmpm.evaluation.compare.outcome import Floats, Outcome
-from nmpm.evaluation.compare.predictors import Subject
+from nmpm.evaluation.compare.predictors import Candidate
 from nmpm.evaluation.trade.accuracy import FAILED
 from nmpm.evaluation.trade.choice import Choice, Kind
 from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, measure_errors
@@ -34,29 +34,29 @@ _MEASURES = Measures(HORIZONS, emd_frames=0)
 _SHOWN = (0.1, 0.3, 1.0)  # of a rollout: a splash, its return, and how it settles
 
 
-def count_steps(subjects: Sequence[Subject], scenes: Scenes, timing: Timing = TIMING) -> int:
+def count_steps(candidates: Sequence[Candidate], scenes: Scenes, timing: Timing = TIMING) -> int:
     """How often `compare` calls its progress."""
-    return len(subjects) * (len(scenes) + timing.rounds)
+    return len(candidates) * (len(scenes) + timing.rounds)
 
 
 def compare(
-    subjects: Sequence[Subject], scenes: Scenes, store: Store, progress: Progress, timing: Timing = TIMING
+    candidates: Sequence[Candidate], scenes: Scenes, store: Store, progress: Progress, timing: Timing = TIMING
 ) -> list[Outcome]:
     """The outcomes of all predictors; what the store knows is not measured again.
 
     Args:
-        subjects: Of `make_predictors`; ratios of times are over the first.
+        candidates: Of `make_predictors`; ratios of times are over the first.
         scenes: What is predicted.
         store: Keeps everything as soon as it is measured.
         progress: Told what was done.
         timing: Rounds and frames of the times.
     """
-    for subject in sorted(subjects, key=lambda one: one.choice.kind is Kind.FLOOR):  # simulations last, as slowest
-        _measure_subject(subject, scenes, store, progress)
-    choices = [subject.choice for subject in subjects]
+    for candidate in sorted(candidates, key=lambda one: one.choice.kind is Kind.FLOOR):  # simulations last, as slowest
+        _measure_candidate(candidate, scenes, store, progress)
+    choices = [candidate.choice for candidate in candidates]
     for _ in measure_times(choices, choices[0], scenes, timing, store):
         progress("times, all in turn")
-    return [_collect(subject, scenes, store, timing) for subject in subjects]
+    return [_collect(candidate, scenes, store, timing) for candidate in candidates]
 
 
 def shown_frames(scenes: Scenes) -> list[int]:
@@ -65,13 +65,13 @@ def shown_frames(scenes: Scenes) -> list[int]:
     return sorted({round(share * last) for share in _SHOWN})
 
 
-def _measure_subject(subject: Subject, scenes: Scenes, store: Store, progress: Progress) -> None:
-    known = store.read(_KIND, _key(subject.choice))
+def _measure_candidate(candidate: Candidate, scenes: Scenes, store: Store, progress: Progress) -> None:
+    known = store.read(_KIND, _key(candidate.choice))
     for index, scene in enumerate(scenes.digests):
-        if scene not in known and not subject.reproduces:
-            known[scene] = _measure_scene(subject.choice, scenes, index)
-            store.write(_KIND, _key(subject.choice), known)
-        progress(f"errors: {subject.choice.name}")
+        if scene not in known and not candidate.reproduces:
+            known[scene] = _measure_scene(candidate.choice, scenes, index)
+            store.write(_KIND, _key(candidate.choice), known)
+        progress(f"errors: {candidate.choice.name}")
 
 
 def _key(choice: Choice) -> dict[str, Any]:
@@ -106,17 +106,17 @@ def _require_finite(predicted: Tensor) -> None:
         raise DataError(f"Positions are not finite from predicted frame {frame + 1} on.")
 
 
-def _collect(subject: Subject, scenes: Scenes, store: Store, timing: Timing) -> Outcome:
-    times = known_times(subject.choice, scenes, timing, store)
+def _collect(candidate: Candidate, scenes: Scenes, store: Store, timing: Timing) -> Outcome:
+    times = known_times(candidate.choice, scenes, timing, store)
     length = min(scenes.frames(index) for index in range(len(scenes)))
-    if subject.reproduces:
+    if candidate.reproduces:
         shown = scenes.recordings[0].frames[2:][shown_frames(scenes)].double().numpy()
-        return Outcome(subject, {"mse": np.zeros(len(scenes))}, np.zeros((len(scenes), length)), shown, {}, times)
-    known = store.read(_KIND, _key(subject.choice))
+        return Outcome(candidate, {"mse": np.zeros(len(scenes))}, np.zeros((len(scenes), length)), shown, {}, times)
+    known = store.read(_KIND, _key(candidate.choice))
     rows = [known.get(scene, {}) for scene in scenes.digests]
     nothing = [np.nan] * length
     return Outcome(
-        subject,
+        candidate,
         errors=_columns([row.get("errors", {}) for row in rows]),
         curves=np.array([row.get("curve", nothing)[:length] for row in rows]),
         frames=_unpack(rows[0].get("frames"), scenes),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.evaluation.bootstrap import interval
-from nmpm.evaluation.compare.predictors import Subject
+from nmpm.evaluation.compare.predictors import Candidate
 from nmpm.evaluation.trade.choice import Kind
 from nmpm.evaluation.trade.timing import Times, quartiles
 
@@ -23,7 +23,7 @@ class Outcome:
     """Errors and times of one predictor on S scenes.
 
     Args:
-        subject: What predicted.
+        candidate: What predicted.
         errors: (S,) of each scene by name, see `nmpm.evaluation.trade.errors`; NaN where the prediction failed.
         curves: (S, T) squared error of each frame, a mean over particles and dimensions, in length²; NaN likewise.
         frames: (F, N, D) positions of the first scene at the shown frames; None where that failed.
@@ -31,7 +31,7 @@ class Outcome:
         times: Milliseconds per frame, one scene at a time.
     """
 
-    subject: Subject
+    candidate: Candidate
     errors: Mapping[str, Floats]
     curves: Floats
     frames: Floats | None
@@ -41,12 +41,12 @@ class Outcome:
     @property
     def name(self) -> str:
         """Of the predictor."""
-        return self.subject.choice.name
+        return self.candidate.choice.name
 
     @property
     def kind(self) -> Kind:
         """Of the predictor."""
-        return self.subject.choice.kind
+        return self.candidate.choice.kind
 
     @property
     def milliseconds(self) -> tuple[float, float, float]:
@@ -71,8 +71,8 @@ class Outcome:
         return {
             "name": self.name,
             "kind": self.kind.value,
-            "settings": dict(self.subject.choice.settings),
-            "scenes_differ_in": list(self.subject.differing),
+            "settings": dict(self.candidate.choice.settings),
+            "scenes_differ_in": list(self.candidate.differing),
             "errors": {
                 name: {
                     "mean": _plain(self.mean(name)),

@@ -39,7 +39,7 @@ def draw_curves(path: Path, outcomes: Sequence[Outcome], scenes: Scenes) -> None
     greys = iter(_TRIVIAL_COLOURS)
     for outcome in outcomes:
         curve = 1e3 * outcome.curves.mean(0)
-        if outcome.subject.reproduces or not np.isfinite(curve).all():
+        if outcome.candidate.reproduces or not np.isfinite(curve).all():
             continue
         style = dict(_STYLES[outcome.kind])
         if outcome.kind is Kind.TRIVIAL:

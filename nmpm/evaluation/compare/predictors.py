@@ -21,7 +21,7 @@ _TWIN = 0.5  # share of the substeps with which the simulator is compared with i
 
 
 @dataclass(frozen=True)
-class Subject:
+class Candidate:
     """Something that predicts scenes, and how far from its own scenes they are.
 
     Args:
@@ -39,7 +39,7 @@ class Subject:
         return self.choice.kind is Kind.SIMULATOR
 
 
-def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torch.device = CPU) -> list[Subject]:
+def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torch.device = CPU) -> list[Candidate]:
     """The simulator of the scenes, if it is known, and its twin; the models; the trivial predictors.
 
     A model of other scenes is rebuilt over these, with grid cells of the size it was trained with, see
@@ -53,19 +53,19 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
     Raises:
         ConfigError: if a model cannot take the scenes, naming it and the reason.
     """
-    simulators = [Subject(choice) for choice in _simulators(scenes)]
+    simulators = [Candidate(choice) for choice in _simulators(scenes)]
     trained = [_model(name, emulator, scenes, device) for name, emulator in models.items()]
-    return [*simulators, *trained, *(Subject(TrivialChoice(name)) for name in PREDICTORS)]
+    return [*simulators, *trained, *(Candidate(TrivialChoice(name)) for name in PREDICTORS)]
 
 
-def _model(name: str, emulator: Emulator, scenes: Scenes, device: torch.device) -> Subject:
+def _model(name: str, emulator: Emulator, scenes: Scenes, device: torch.device) -> Candidate:
     differing = emulator.scene.differences(scenes.scene)
     try:
         adapted = emulator.over(scenes.scene) if differing else emulator
     except ConfigError as error:
         raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
     settings = {"model": name, "cells": "×".join(map(str, adapted.grid.shape))}
-    return Subject(ModelChoice(name, adapted.to(device), settings, device=device), differing)
+    return Candidate(ModelChoice(name, adapted.to(device), settings, device=device), differing)
 
 
 def _simulators(scenes: Scenes) -> list[Choice]:

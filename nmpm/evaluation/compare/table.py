@@ -38,9 +38,9 @@ _CAPTION = (
 def origin_lines(outcomes: Sequence[Outcome]) -> list[str]:
     """One line for each model that was trained on other scenes."""
     return [
-        f"{one.name}: trained on other scenes; what differs: {', '.join(one.subject.differing)}"
+        f"{one.name}: trained on other scenes; what differs: {', '.join(one.candidate.differing)}"
         for one in outcomes
-        if one.subject.differing
+        if one.candidate.differing
     ]
 
 
@@ -63,7 +63,7 @@ def _title(scenes: Scenes) -> str:
 def _figures(outcome: Outcome, horizons: Sequence[int]) -> list[str]:
     time = outcome.milliseconds[1]
     timed = f"{time:.3g}" if math.isfinite(time) else ""
-    if outcome.subject.reproduces:
+    if outcome.candidate.reproduces:
         return [*("" for _ in horizons), "made the scenes", "", "", timed]
     low, high = outcome.interval("mse")
     full = _thousandth(outcome.mean("mse"))

@@ -40,9 +40,9 @@ def narrow(scenes):
     return tiny_emulator(dataclasses.replace(scenes.scene, domain=(half, floor), bounds=(half, scenes.scene.bounds[1])))
 
 
-def run(subjects, scenes, folder):
+def run(candidates, scenes, folder):
     done = []
-    return compare(subjects, scenes, Store(folder), done.append, TIMING), done
+    return compare(candidates, scenes, Store(folder), done.append, TIMING), done
 
 
 def by_name(outcomes):
@@ -51,14 +51,14 @@ def by_name(outcomes):
 
 def test_a_model_at_home_stays_and_another_gets_more_cells_of_the_same_size(scenes, narrow):
     home = tiny_emulator(scenes.scene)
-    subjects = {one.choice.name: one for one in make_predictors(scenes, {"home": home, "narrow": narrow})}
-    assert subjects["home"].choice.emulator is home
-    assert subjects["home"].differing == ()
-    adapted = subjects["narrow"].choice.emulator
+    candidates = {one.choice.name: one for one in make_predictors(scenes, {"home": home, "narrow": narrow})}
+    assert candidates["home"].choice.emulator is home
+    assert candidates["home"].differing == ()
+    adapted = candidates["narrow"].choice.emulator
     assert narrow.grid.shape == (4, 8)
     assert adapted.grid.shape == (8, 8)
     assert adapted.scene == scenes.scene
-    assert subjects["narrow"].differing == ("bounds", "domain")
+    assert candidates["narrow"].differing == ("bounds", "domain")
 
 
 def test_a_model_of_other_time_steps_is_refused_by_name(scenes):
@@ -74,9 +74,9 @@ def test_recorded_scenes_have_no_simulator(scenes):
 
 def test_errors_are_those_of_the_predictions(scenes, tmp_path):
     emulator = tiny_emulator(scenes.scene)
-    subjects = make_predictors(scenes, {"carried": emulator})
-    outcomes, done = run(subjects, scenes, tmp_path)
-    assert len(done) == count_steps(subjects, scenes, TIMING)
+    candidates = make_predictors(scenes, {"carried": emulator})
+    outcomes, done = run(candidates, scenes, tmp_path)
+    assert len(done) == count_steps(candidates, scenes, TIMING)
     found = by_name(outcomes)
     still = found["nothing moves"]
     for index, recording in enumerate(scenes.recordings):
@@ -98,7 +98,7 @@ def test_errors_are_those_of_the_predictions(scenes, tmp_path):
 def test_the_simulator_that_made_the_scenes_is_only_timed_and_its_twin_is_compared(scenes, tmp_path):
     outcomes, _ = run(make_predictors(scenes, {}), scenes, tmp_path)
     shipped = outcomes[0]
-    assert shipped.subject.reproduces
+    assert shipped.candidate.reproduces
     assert shipped.mean("mse") == 0
     last = scenes.recordings[0].frames[2:][shown_frames(scenes)[-1]].numpy()
     np.testing.assert_allclose(shipped.frames[-1], last)
@@ -109,14 +109,14 @@ def test_the_simulator_that_made_the_scenes_is_only_timed_and_its_twin_is_compar
 def test_one_more_model_measures_only_what_is_new(scenes, narrow, tmp_path, monkeypatch):
     first, _ = run(make_predictors(scenes, {"home": tiny_emulator(scenes.scene)}), scenes, tmp_path)
     torch.manual_seed(1)
-    subjects = make_predictors(scenes, {"home": tiny_emulator(scenes.scene), "narrow": narrow})
+    candidates = make_predictors(scenes, {"home": tiny_emulator(scenes.scene), "narrow": narrow})
     prepared = []
-    for subject in subjects:
-        kind = type(subject.choice)
+    for candidate in candidates:
+        kind = type(candidate.choice)
         monkeypatch.setattr(kind, "prepare", _recording(kind.prepare, prepared))
-    again, _ = run(subjects, scenes, tmp_path)
+    again, _ = run(candidates, scenes, tmp_path)
     # The reference is timed again for the ratio of the new model's time.
-    assert set(prepared) <= {"narrow", subjects[0].choice.name}
+    assert set(prepared) <= {"narrow", candidates[0].choice.name}
     assert by_name(again)["home"].to_dict()["errors"] == by_name(first)["home"].to_dict()["errors"]
 
 

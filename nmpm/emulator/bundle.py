@@ -1,0 +1,44 @@
+"""What one call of the emulator predicts, and what stays the same from call to call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from nmpm.particles import Particles
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """The m frames that one call predicts.
+
+    Args:
+        position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
+        velocity: (B, N, D) at the last frame, in length per frame.
+        fields: (B, m, N) of each evolving field, by name, in its own unit.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def state_after(self, particles: Particles) -> Particles:
+        """The state at the bundle's last frame, of the particles that it started from."""
+        moved = particles.with_motion(self.position[:, -1], self.velocity)
+        last = {name: values[:, -1] for name, values in self.fields.items()}
+        return moved.with_fields(last) if last else moved
+
+
+@dataclass(frozen=True)
+class RolloutContext:
+    """What stays the same from bundle to bundle of a rollout, computed once from its first state.
+
+    Args:
+        solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
+        budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
+    """
+
+    solid: Tensor
+    budget: Tensor | None
