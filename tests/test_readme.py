@@ -114,6 +114,7 @@ def test_there_is_something_to_test():
         "view",
         "stress",
         "trade",
+        "compare",
         "inspect",
         "convert",
         "export",
