@@ -30,8 +30,8 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "windows"} | {
-    "against_recordings", "calibration", "dam_break", "gns", "kills", "run_time_knob", "simulators", "stable_substeps",
-    "stiffness", "where_emulation_pays",
+    "against_recordings", "calibration", "dam_break", "generalisation", "gns", "kills", "run_time_knob", "simulators",
+    "stable_substeps", "stiffness", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -373,3 +373,21 @@ def test_stiffer_materials_need_substeps_as_sound_is_faster(name):
         assert 3 * one.substeps < hundred.substeps < 10 * one.substeps
     else:
         assert hundred.substeps == pytest.approx(10 * one.substeps, abs=10)
+
+
+# ---- beyond a model's own scenes
+
+
+@pytest.mark.skipif("goop" not in Zoo.list(), reason="the zoo holds no goop model")
+def test_times_are_per_frame_and_drawn_beside_those_of_simulators(tmp_path):
+    import generalisation
+
+    rows = {count: generalisation.measure_times({"goop": Zoo.load("goop")}, count, rounds=1) for count in (100, 1000)}
+    assert all(0 < row["goop"].least <= row["goop"].median for row in rows.values())
+    stated = {"particles": [90, 110], "predictors": [{"kind": "simulator", "ms_per_frame": {"median": 2.5}}]}
+    stated["predictors"].append({"kind": "model", "ms_per_frame": {"median": 1.0}})
+    (tmp_path / "compare.json").write_text(json.dumps(stated))
+    simulated = generalisation.simulator_times([tmp_path])
+    assert simulated == {100: 2.5}
+    generalisation.draw_times(tmp_path / "times.png", rows, simulated)
+    assert (tmp_path / "times.png").stat().st_size > 0

@@ -137,8 +137,8 @@ def calibrate_fields(scales: FieldScales, windows: Sequence[Window]) -> None:
 
 
 def _values(window: Window, name: str) -> Tensor:
-    """The values (K,) of a field, of real particles or of scenes, in float64 where there is any."""
-    values = window.fields[name].to("cpu", torch.float64)
+    """The values (K,) of a field, of real particles or of scenes, in float64 on the CPU."""
+    values = window.fields[name].cpu().double()
     if values.shape[2] == 1:
         return values.flatten()
     return values[window.mask.cpu().unsqueeze(1).expand_as(values)]

@@ -132,6 +132,19 @@ class Pretrained:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
 
+    def over(self, scene: Scene) -> Pretrained:
+        """The same weights for other scenes, on a grid over their domain with cells of the size of this model's.
+
+        Args:
+            scene: With another domain, bounds or obstacles, or other particles' volume, such as
+                `dataclasses.replace(model.scene, bounds=…, domain=…)`. Materials, gravity, time step and kinds of
+                boundary must be this model's.
+
+        Raises:
+            ConfigError: if one of them is not, or the domain is not a whole number of cells.
+        """
+        return dataclasses.replace(self, emulator=self.emulator.over(scene))
+
     def with_windows(self, windows: Windows | None) -> Pretrained:
         """The same model with other limits for windows around the particles; None: always the whole grid."""
         return dataclasses.replace(self, emulator=self.emulator.with_windows(windows))

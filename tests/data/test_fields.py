@@ -6,6 +6,7 @@ import pytest
 import torch
 from conftest import made_up_metadata, made_up_trajectory
 
+from nmpm.data.convert.arrays import write_trajectories
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.inspection import inspect
@@ -136,6 +137,18 @@ def test_an_inspection_says_what_varies_and_which_channels_that_makes(folder):
     assert found.channels["still"].endswith("not declared: no channel (--data.fields)")
     assert {"temperature", "friction", "stiffness", "force", "still"} <= set(found.varies)
     assert "wind" not in found.channels
+
+
+def test_arrays_are_written_with_the_fields_of_their_scene(folder, tmp_path):
+    scene = infer_scene(folder, fields=["temperature"])
+    run = made_up_trajectory(12, 4, fields=("temperature",))
+    types = np.zeros(4, dtype=int)
+    path = tmp_path / "new" / "train.h5"
+    with pytest.raises(DataError, match="trajectory 0 has no field temperature, which the scene has"):
+        write_trajectories(path, [Trajectory(run.position, types)], scene)
+    write_trajectories(path, [Trajectory(run.position, types, fields=run.fields)], scene)
+    assert read_metadata(path.parent).fields == ("temperature",)
+    assert infer_scene(path.parent).evolving == ("temperature",)
 
 
 def test_names_in_metadata_are_checked(folder):
