@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.windows import Memory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -18,8 +21,8 @@ from nmpm.transfer.chunks import can_branch
 def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
-    Once a bundle ends in exactly the state that it started from, as a scene at rest does, all further ones would be the
-    same: it is yielded again without a call. Only on a CPU, as comparing states elsewhere would halt the device.
+    Once a scene's bundle ends in exactly the state that it started from, as at rest, all further ones would be the
+    same: it is repeated without a call. Only on a CPU, as comparing states elsewhere would halt the device.
 
     Args:
         emulator: Predicts m frames a call.
@@ -29,26 +32,61 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     """
     if monitor is not None:
         monitor.start(emulator, particles)
-    context = emulator.context(particles)
-    repeated: Bundle | None = None
+    calls = _Calls(emulator, particles)
     for remaining in reversed(range(bundles)):
-        bundle = emulator(particles, context) if repeated is None else repeated
+        bundle = calls.predict(particles)
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
             if not remaining:
                 monitor.read()
         yield bundle
         after = particles.with_motion(bundle.position[:, -1], bundle.velocity)
-        if repeated is None and not emulator.training and _is_same_motion(particles, after):
-            repeated = bundle
+        calls.let_sleep(particles, after)
         particles = after
 
 
-def _is_same_motion(before: Particles, after: Particles) -> bool:
-    """Whether two states have the same positions and velocities, to the bit; False where asking would cost."""
-    if not can_branch(after.position) or after.position.requires_grad:
-        return False
-    return torch.equal(before.velocity, after.velocity) and torch.equal(before.position, after.position)
+class _Calls:
+    """The calls of a rollout, of the scenes that are not at rest.
+
+    Args:
+        emulator: Predicts m frames a call.
+        particles: The state to start from.
+    """
+
+    def __init__(self, emulator: Emulator, particles: Particles) -> None:
+        context = emulator.context(particles)
+        self._emulator, self._count = emulator, len(particles.position)
+        self._context = self._own = context if emulator.training else dataclasses.replace(context, memory=Memory())
+        self._awake, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
+
+    def predict(self, particles: Particles) -> Bundle:
+        """The next bundle of all scenes."""
+        if len(self._awake) == self._count:
+            self._last = self._emulator(particles, self._own)
+        elif self._awake:
+            moving = self._emulator(particles.scenes(self._awake), self._own)
+            position, velocity = self._last.position.clone(), self._last.velocity.clone()
+            position[self._awake], velocity[self._awake] = moving.position, moving.velocity
+            self._last = Bundle(position, velocity)
+        return self._last
+
+    def let_sleep(self, before: Particles, after: Particles) -> None:
+        """Leave scenes out of further calls that the last one left as they were, to the bit.
+
+        All or none where another number of scenes would be compiled anew.
+        """
+        if self._emulator.training or not can_branch(after.position) or after.position.requires_grad:
+            return
+        awake = [scene for scene in self._awake if not _is_same_motion(before, after, scene)]
+        if len(awake) == len(self._awake) or (awake and self._emulator.shapes_are_compiled):
+            return
+        self._awake, self._own = awake, self._context.scenes(awake)
+
+
+def _is_same_motion(before: Particles, after: Particles, scene: int) -> bool:
+    """Whether a scene has the same positions and velocities in two states, to the bit."""
+    pairs = ((before.velocity, after.velocity), (before.position, after.position))
+    return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:
