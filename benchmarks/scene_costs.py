@@ -107,7 +107,7 @@ def roll_out_plainly(emulator: Emulator, particles: Particles, bundles: int) -> 
         context = whole.context(particles)
         for _ in range(bundles):
             found.append(whole(particles, context))
-            particles = particles.with_motion(found[-1].position[:, -1], found[-1].velocity)
+            particles = found[-1].state_after(particles)
     return found
 
 
@@ -123,7 +123,7 @@ def states_before_rest(emulator: Emulator, start: Particles) -> list[Particles]:
     context, states = emulator.context(start), [start]
     for _ in range(2 * ROLLOUT):
         bundle = emulator(states[-1], context)
-        after = states[-1].with_motion(bundle.position[:, -1], bundle.velocity)
+        after = bundle.state_after(states[-1])
         if torch.equal(after.position, states[-1].position) and torch.equal(after.velocity, states[-1].velocity):
             break
         states.append(after)

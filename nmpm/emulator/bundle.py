@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from nmpm.emulator.windows.memory import Memory
+from nmpm.particles import Particles
 
 if TYPE_CHECKING:
     from nmpm.emulator.fused.surroundings import Surroundings
@@ -20,10 +22,18 @@ class Bundle:
     Args:
         position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
         velocity: (B, N, D) at the last frame, in length per frame.
+        fields: (B, m, N) of each evolving field, by name, in its own unit.
     """
 
     position: Tensor
     velocity: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def state_after(self, particles: Particles) -> Particles:
+        """The state at the bundle's last frame, of the particles that it started from."""
+        moved = particles.with_motion(self.position[:, -1], self.velocity)
+        last = {name: values[:, -1] for name, values in self.fields.items()}
+        return moved.with_fields(last) if last else moved
 
 
 @dataclass(frozen=True)

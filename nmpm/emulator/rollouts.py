@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,7 +41,7 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
             if not remaining:
                 monitor.read()
         yield bundle
-        after = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        after = bundle.state_after(particles)
         calls.let_sleep(particles, after)
         particles = after
 
@@ -65,10 +66,16 @@ class _Calls:
             self._last = self._emulator(particles, self._own)
         elif self._awake:
             moving = self._emulator(particles.scenes(self._awake), self._own)
-            position, velocity = self._last.position.clone(), self._last.velocity.clone()
-            position[self._awake], velocity[self._awake] = moving.position, moving.velocity
-            self._last = Bundle(position, velocity)
+            fields = {name: self._put(values, moving.fields[name]) for name, values in self._last.fields.items()}
+            position = self._put(self._last.position, moving.position)
+            self._last = Bundle(position, self._put(self._last.velocity, moving.velocity), fields)
         return self._last
+
+    def _put(self, values: Tensor, moving: Tensor) -> Tensor:
+        """Values (B, …) with those of the scenes that are awake replaced."""
+        values = values.clone()
+        values[self._awake] = moving
+        return values
 
     def let_sleep(self, before: Particles, after: Particles) -> None:
         """Leave scenes out of further calls that the last one left as they were, to the bit.
@@ -77,15 +84,18 @@ class _Calls:
         """
         if self._emulator.training or not can_branch(after.position) or after.position.requires_grad:
             return
-        awake = [scene for scene in self._awake if not _is_same_motion(before, after, scene)]
+        awake = [scene for scene in self._awake if not _is_same_state(before, after, scene)]
         if len(awake) == len(self._awake) or (awake and self._emulator.shapes_are_compiled):
             return
         self._awake, self._own = awake, self._context.scenes(awake)
 
 
-def _is_same_motion(before: Particles, after: Particles, scene: int) -> bool:
-    """Whether a scene has the same positions and velocities in two states, to the bit."""
-    pairs = ((before.velocity, after.velocity), (before.position, after.position))
+def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
+    """Whether a scene has the same motion and fields in two states, to the bit."""
+    pairs = [(before.velocity, after.velocity), (before.position, after.position)]
+    if any(name not in before.fields for name in after.fields):
+        return False
+    pairs += [(before.fields[name], values) for name, values in after.fields.items()]
     return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
 
@@ -102,7 +112,10 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
         DataError: naming the weight or statistic; or scene, particle and value.
     """
     real = particles.mask
-    states = {name: ~getattr(particles, name).isfinite().all(-1) & real for name in ("position", "velocity")}
+    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
+    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
+    given = {name: values.expand(*real.shape, -1) for name, values in (vectors | numbers).items()}
+    states = {name: ~values.isfinite().all(-1) & real for name, values in given.items()}
     beyond = beyond_walls(emulator.scene, particles.position) & real
     weights = emulator.state_dict()
     unsound = [~values.isfinite().all() for values in weights.values()]
@@ -117,7 +130,7 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
             scene, particle = map(int, bad.nonzero()[0])
             raise DataError(
                 f"Scene {scene} of the batch, particle {particle}: its {name} is"
-                f" {getattr(particles, name)[scene, particle].tolist()}; it must be finite."
+                f" {given[name][scene, particle].tolist()}; it must be finite."
             )
     scene, particle = map(int, beyond.nonzero()[0])
     raise DataError(
@@ -135,11 +148,49 @@ def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
     return torch.stack(sides).any(0)
 
 
+class Rollout(NamedTuple):
+    """Predicted frames.
+
+    Args:
+        position: (B, T, N, D) in domain length.
+        fields: (B, T, N) of each evolving field, by name, in its own unit.
+    """
+
+    position: Tensor
+    fields: Mapping[str, Tensor]
+
+    @classmethod
+    def join(cls, parts: Sequence[Rollout]) -> Rollout:
+        """Consecutive parts, at least one, as one."""
+        names = parts[0].fields
+        fields = {name: torch.cat([part.fields[name] for part in parts], dim=1) for name in names}
+        return cls(torch.cat([part.position for part in parts], dim=1), fields)
+
+    def cpu(self) -> Rollout:
+        """The same on the CPU."""
+        return Rollout(self.position.cpu(), {name: values.cpu() for name, values in self.fields.items()})
+
+
 def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Iterator[Tensor]:
-    """Predict `frames` frames without gradients, yielding each bundle as it is made.
+    """Predict `frames` frames without gradients, yielding each bundle's positions as it is made.
 
     Yields:
         (B, <= m, N, D) positions in domain length; the last bundle is cut to the frames asked for.
+
+    Raises:
+        As `stream_rollout`.
+    """
+    for part in stream_rollout(emulator, particles, frames, monitor):
+        yield part.position
+
+
+def stream_rollout(
+    emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None
+) -> Iterator[Rollout]:
+    """Predict `frames` frames of positions and evolving fields without gradients, yielding each bundle as it is made.
+
+    Yields:
+        Up to m frames; the last bundle is cut to the frames asked for.
 
     Raises:
         ValueError: if `frames` is negative.
@@ -153,9 +204,12 @@ def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monit
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode
-            position = next(bundles).position[:, : frames - made]
-        made += position.shape[1]
-        yield position
+            bundle = next(bundles)
+        kept = slice(frames - made)
+        fields = {name: values[:, kept] for name, values in bundle.fields.items()}
+        part = Rollout(bundle.position[:, kept], fields)
+        made += part.position.shape[1]
+        yield part
 
 
 def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Tensor:
@@ -165,11 +219,22 @@ def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Moni
         (B, frames, N, D) positions in domain length.
 
     Raises:
+        As `predict_rollout`.
+    """
+    return predict_rollout(emulator, particles, frames, monitor).position
+
+
+def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Rollout:
+    """Predict `frames` frames of positions and evolving fields without gradients.
+
+    Raises:
         ValueError: if `frames` is negative.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
     """
-    bundles = list(stream(emulator, particles, frames, monitor))
-    if not bundles:
-        return particles.position.new_zeros(particles.position.shape[0], 0, *particles.position.shape[1:])
-    return torch.cat(bundles, dim=1)
+    parts = list(stream_rollout(emulator, particles, frames, monitor))
+    if parts:
+        return Rollout.join(parts)
+    batch, *rest = particles.position.shape
+    none = particles.position.new_zeros(batch, 0, *rest)
+    return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))

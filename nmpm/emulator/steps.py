@@ -75,7 +75,7 @@ class TensorSteps(Steps):
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         own = self.emulator
         cells, velocity, gravity = own.in_cells(particles)
-        state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid)
+        state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid, own.field_scales)
         return cells, velocity, gravity, state
 
     def path(self, start: Departure, context: RolloutContext) -> Tensor:

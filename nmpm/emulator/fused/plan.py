@@ -149,6 +149,8 @@ def make_plan(recipe: EmulatorRecipe) -> Plan | None:
     shares = _SHARES.get(type(recipe.decoder))
     if scene.dim == 1 or not nodes or shares is None or constraints.bounds not in ("stop", "reflect"):
         return None
+    if scene.fields:
+        return None
     if not grid.resolves(torch.float32):
         return None
     return Plan(
