@@ -32,8 +32,8 @@ class _Batched:
         """The same in float64; indices and masks keep their types."""
         return self.map(lambda values: values.double() if values.is_floating_point() else values)
 
-    def scenes(self, chosen: slice) -> Self:
-        """Some of the scenes: views (B', …) of the tensors, the padding that of the whole batch."""
+    def scenes(self, chosen: slice | list[int]) -> Self:
+        """Some of the scenes, (B', …): views of the tensors for a slice; the padding is that of the whole batch."""
         return self.map(lambda values: values[chosen])
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:

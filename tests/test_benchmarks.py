@@ -29,7 +29,7 @@ ROOT = Path(__file__).parent.parent / "benchmarks"
 if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
-WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "windows"} | {
+WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "calibration", "dam_break", "generalisation", "gns", "kills", "run_time_knob", "simulators",
     "stable_substeps", "stiffness", "where_emulation_pays",
 }  # fmt: skip

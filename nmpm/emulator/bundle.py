@@ -1,13 +1,18 @@
-"""What one call of the emulator predicts, and what stays the same from call to call."""
+"""What a call of the emulator predicts, and what stays the same between the calls of a rollout."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from nmpm.emulator.windows.memory import Memory
 from nmpm.particles import Particles
+
+if TYPE_CHECKING:
+    from nmpm.emulator.fused.surroundings import Surroundings
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,18 @@ class RolloutContext:
     Args:
         solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
         budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
+        surroundings: What the kernels have prepared of each scene's solids; None for nothing.
+        memory: What the network has predicted last, which is computed again only where it has seen something else; None
+            to compute everything in each call.
     """
 
     solid: Tensor
     budget: Tensor | None
+    surroundings: tuple[Surroundings, ...] | None = None
+    memory: Memory | None = None
+
+    def scenes(self, chosen: list[int]) -> RolloutContext:
+        """That of some of the scenes, with a memory of their own."""
+        own = None if self.surroundings is None else tuple(self.surroundings[scene] for scene in chosen)
+        budget = None if self.budget is None else self.budget[chosen]
+        return RolloutContext(self.solid[chosen], budget, own, None if self.memory is None else Memory())

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.particles import Particles
 

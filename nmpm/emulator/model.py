@@ -28,7 +28,7 @@ from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
-from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows
+from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows, usable_memory
 from nmpm.emulator.windows.reads import check_reads
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -129,6 +129,11 @@ class Emulator(nn.Module):
         real = (weight.dtype for weight in self.processor.parameters() if weight.is_floating_point())
         return next(real, self.precision)
 
+    @property
+    def shapes_are_compiled(self) -> bool:
+        """Whether another shape of the state, such as fewer scenes, would cost a compilation."""
+        return self.runtime.fixed_shapes or self.processor._compiled_call_impl is not None
+
     def with_network(self, precision: torch.dtype) -> Emulator:
         """This emulator if its network has weights of this type, else a copy with the network's weights converted.
 
@@ -206,7 +211,9 @@ class Emulator(nn.Module):
             UserWarning: naming each field that the state lacks.
         """
         self.field_scales.warn_of_missing(particles)
-        return RolloutContext(self.solid(particles), self.budget(particles))
+        solid = self.solid(particles)
+        surroundings = steps_for(self, self._plan, particles, solid).survey(solid)
+        return RolloutContext(solid, self.budget(particles), surroundings)
 
     def solid(self, particles: Particles) -> Tensor:
         """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
@@ -249,6 +256,8 @@ class Emulator(nn.Module):
         def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor, Mapping[str, Tensor]]:
             if coverage is None:
                 output = self.runtime.fields(self.processor, normalised, self.network_precision)
+                if memory is not None:
+                    memory.keep(output)
             else:
                 output = coverage.predict(self.processor, normalised.to(self.network_precision))
             readable = None if coverage is None else coverage.readable
@@ -258,15 +267,17 @@ class Emulator(nn.Module):
                 path = steps.path(start, context)
                 return start, path, self._evolve_fields(own, start, path, output) if self.scene.evolving else {}
 
-        fixed = self.training or self.runtime.fixed_shapes
-        windows = None if fixed else choose_windows(self.windows, self.processor, self.recipe, state)
+        windows = memory = None
+        if not (self.training or self.runtime.fixed_shapes):
+            memory = usable_memory(context.memory, self.windows, self.processor, self.recipe, state)
+            windows = choose_windows(self.windows, self.processor, self.recipe, state, memory)
         start, path, evolved = find_in_windows(windows, find_path)
         with _full_precision(device):
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
             if self.constraints.density_cap and not self.training:
                 # Spreading is no motion of the material: the velocity is that of the path without it.
-                path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
+                path = steps.uncrowded(start, path, context)
             velocity = self.grid.to_displacement(step.to(precision))
             return Bundle(steps.to_length(path, precision), velocity, evolved)  # the last use of the path's memory
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.windows import Memory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -19,8 +22,8 @@ from nmpm.transfer.chunks import can_branch
 def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
-    Once a bundle ends in exactly the state that it started from, as a scene at rest does, all further ones would be the
-    same: it is yielded again without a call. Only on a CPU, as comparing states elsewhere would halt the device.
+    Once a scene's bundle ends in exactly the state that it started from, as at rest, all further ones would be the
+    same: it is repeated without a call. Only on a CPU, as comparing states elsewhere would halt the device.
 
     Args:
         emulator: Predicts m frames a call.
@@ -30,29 +33,70 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     """
     if monitor is not None:
         monitor.start(emulator, particles)
-    context = emulator.context(particles)
-    repeated: Bundle | None = None
+    calls = _Calls(emulator, particles)
     for remaining in reversed(range(bundles)):
-        bundle = emulator(particles, context) if repeated is None else repeated
+        bundle = calls.predict(particles)
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
             if not remaining:
                 monitor.read()
         yield bundle
         after = bundle.state_after(particles)
-        if repeated is None and not emulator.training and _is_same_state(particles, after):
-            repeated = bundle
+        calls.let_sleep(particles, after)
         particles = after
 
 
-def _is_same_state(before: Particles, after: Particles) -> bool:
-    """Whether two states have the same motion and fields, to the bit; False where asking would cost."""
-    if not can_branch(after.position) or after.position.requires_grad:
+class _Calls:
+    """The calls of a rollout, of the scenes that are not at rest.
+
+    Args:
+        emulator: Predicts m frames a call.
+        particles: The state to start from.
+    """
+
+    def __init__(self, emulator: Emulator, particles: Particles) -> None:
+        context = emulator.context(particles)
+        self._emulator, self._count = emulator, len(particles.position)
+        self._context = self._own = context if emulator.training else dataclasses.replace(context, memory=Memory())
+        self._awake, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
+
+    def predict(self, particles: Particles) -> Bundle:
+        """The next bundle of all scenes."""
+        if len(self._awake) == self._count:
+            self._last = self._emulator(particles, self._own)
+        elif self._awake:
+            moving = self._emulator(particles.scenes(self._awake), self._own)
+            fields = {name: self._put(values, moving.fields[name]) for name, values in self._last.fields.items()}
+            position = self._put(self._last.position, moving.position)
+            self._last = Bundle(position, self._put(self._last.velocity, moving.velocity), fields)
+        return self._last
+
+    def _put(self, values: Tensor, moving: Tensor) -> Tensor:
+        """Values (B, …) with those of the scenes that are awake replaced."""
+        values = values.clone()
+        values[self._awake] = moving
+        return values
+
+    def let_sleep(self, before: Particles, after: Particles) -> None:
+        """Leave scenes out of further calls that the last one left as they were, to the bit.
+
+        All or none where another number of scenes would be compiled anew.
+        """
+        if self._emulator.training or not can_branch(after.position) or after.position.requires_grad:
+            return
+        awake = [scene for scene in self._awake if not _is_same_state(before, after, scene)]
+        if len(awake) == len(self._awake) or (awake and self._emulator.shapes_are_compiled):
+            return
+        self._awake, self._own = awake, self._context.scenes(awake)
+
+
+def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
+    """Whether a scene has the same motion and fields in two states, to the bit."""
+    pairs = [(before.velocity, after.velocity), (before.position, after.position)]
+    if any(name not in before.fields for name in after.fields):
         return False
-    if not (torch.equal(before.velocity, after.velocity) and torch.equal(before.position, after.position)):
-        return False
-    earlier = before.fields
-    return all(name in earlier and torch.equal(earlier[name], values) for name, values in after.fields.items())
+    pairs += [(before.fields[name], values) for name, values in after.fields.items()]
+    return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:

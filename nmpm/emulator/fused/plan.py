@@ -61,6 +61,7 @@ class Plan:
         obstacles: Whether there can be obstacles.
         solids: Whether particles must keep clear of them.
         floors: As `nmpm.emulator.support.floor_rows`.
+        density_cap: Volume fraction above which cells are overfull; 0 for no cap.
     """
 
     shape: tuple[int, ...]
@@ -80,6 +81,7 @@ class Plan:
     obstacles: bool
     solids: bool
     floors: tuple[tuple[int, int], ...]
+    density_cap: float
 
     def to_text(self) -> str:
         """The plan as JSON."""
@@ -169,6 +171,7 @@ def make_plan(recipe: EmulatorRecipe) -> Plan | None:
         obstacles=scene.obstacles,
         solids=constraints.solids,
         floors=floor_rows(scene, grid),
+        density_cap=constraints.density_cap,
     )
 
 

@@ -21,7 +21,8 @@ from nmpm.processors import GridProcessor
 from nmpm.transfer.backends import is_chosen
 
 if TYPE_CHECKING:
-    from nmpm.emulator.model import Bundle, Emulator, RolloutContext
+    from nmpm.emulator.bundle import Bundle, RolloutContext
+    from nmpm.emulator.model import Emulator
     from nmpm.particles import Particles
 
 T = TypeVar("T")
