@@ -41,42 +41,50 @@ def fly_back(
         of_state: (size, C), gradient with respect to the grid state.
         of_fields: (m, size, C), gradient with respect to the fields.
     """
-    own, smoothed, carries = decoder[0], decoder[1], decoder[3] > ZERO
+    carries = decoder[3] > ZERO
     for frame in range(len(path) - 1, -1, -1):
         slope = slopes[frame]
         here, target = (path[frame - 1], slopes[frame - 1]) if frame > 0 else (cells, place)
-        stop_at_bounds(path[frame], mask, bounds, slope)
-        add(slope, ONE, target)
         if carries and frame > 0:  # the velocity of the frame before is a difference of positions
-            add(slope, ONE, target)
-            add(slope, -ONE, slopes[frame - 2] if frame > 1 else place)
+            pass_on(path[frame], mask, bounds, slope, target, target)
+            subtract_from(slopes[frame - 2] if frame > 1 else place, slope)
         else:
-            add(slope, ONE, speed)
+            pass_on(path[frame], mask, bounds, slope, target, speed)
         gather_adjoint(fields[frame], material, mask, here, grid[0], grid[1], slope, target, of_fields[frame])
-    if smoothed != ZERO:
-        share = smoothed * speed
-        gather_adjoint(state, material, mask, cells, grid[0], grid[1], share, place, of_state)
-    for p in range(len(speed)):
-        for d in range(speed.shape[1]):
-            speed[p, d] *= own
+    if decoder[1] != ZERO:
+        smoothed = decoder[1] * speed
+        gather_adjoint(state, material, mask, cells, grid[0], grid[1], smoothed, place, of_state)
+    speed *= decoder[0]
 
 
 @jit
-def stop_at_bounds(cells: Any, mask: Any, bounds: Any, slope: Any) -> Any:
-    """Set the gradient (N, D) to 0 for padding and where positions (N, D) were stopped at a bound."""
-    for p in range(len(cells)):
-        for d in range(cells.shape[1]):
-            free = cells[p, d] > bounds[0, d] and cells[p, d] < bounds[1, d]
-            if not (free and mask[p]):
-                slope[p, d] = ZERO
+def pass_on(cells: Any, mask: Any, bounds: Any, slope: Any, place: Any, base: Any) -> Any:
+    """Add the gradient of positions x + v, (N, D), to those of x and of v.
+
+    Args:
+        cells: (N, D), the positions.
+        mask: (N,) bool.
+        bounds: As for `flight.fly`.
+        slope: (N, D) gradient; is set to 0 for padding and where a bound stopped the position.
+        place: (N, D) gradient with respect to x.
+        base: (N, D) gradient with respect to v.
+    """
+    for d in range(cells.shape[1]):
+        lowest, highest = bounds[0, d], bounds[1, d]
+        for p in range(len(cells)):
+            x = cells[p, d]
+            pull = slope[p, d] if mask[p] and x > lowest and x < highest else ZERO
+            slope[p, d] = pull
+            place[p, d] += pull
+            base[p, d] += pull
 
 
 @jit
-def add(values: Any, factor: Any, total: Any) -> Any:
-    """Add (N, D) values times a factor."""
+def subtract_from(total: Any, values: Any) -> Any:
+    """Subtract (N, D) values."""
     for p in range(len(values)):
         for d in range(values.shape[1]):
-            total[p, d] += factor * values[p, d]
+            total[p, d] -= values[p, d]
 
 
 @jit

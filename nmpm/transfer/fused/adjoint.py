@@ -74,24 +74,30 @@ def _follows(x: Any, count: Any, wraps: Any) -> Any:
 def _gather_adjoint_2d(
     field: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, slope: Any, place: Any, nodes: Any
 ) -> Any:
+    many, walls = len(material) > 0, not (wraps[0] or wraps[1])
     for p in range(len(cells)):
         if not mask[p]:
             continue
-        first = 2 * material[p] if len(material) else 0
-        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        col = 2 * material[p] if many else 0
+        if walls:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], False)
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], False)
+        else:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
         a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
-        along_x, along_y = ZERO, ZERO
-        for k in range(2):
-            col, pull = first + k, slope[p, k]
-            along_x += pull * ((ONE - y) * (field[c, col] - field[a, col]) + y * (field[d, col] - field[b, col]))
-            along_y += pull * ((ONE - x) * (field[b, col] - field[a, col]) + x * (field[d, col] - field[c, col]))
-            nodes[a, col] += (ONE - x) * (ONE - y) * pull
-            nodes[b, col] += (ONE - x) * y * pull
-            nodes[c, col] += x * (ONE - y) * pull
-            nodes[d, col] += x * y * pull
+        u, v = slope[p, 0], slope[p, 1]
+        at_a = u * field[a, col] + v * field[a, col + 1]
+        at_b = u * field[b, col] + v * field[b, col + 1]
+        at_c = u * field[c, col] + v * field[c, col + 1]
+        at_d = u * field[d, col] + v * field[d, col + 1]
+        along_x = (ONE - y) * (at_c - at_a) + y * (at_d - at_b)
+        along_y = (ONE - x) * (at_b - at_a) + x * (at_d - at_c)
         place[p, 0] += _follows(cells[p, 0], shape[0], wraps[0]) * along_x
         place[p, 1] += _follows(cells[p, 1], shape[1], wraps[1]) * along_y
+        for node, weight in ((a, (ONE - x) * (ONE - y)), (b, (ONE - x) * y), (c, x * (ONE - y)), (d, x * y)):
+            nodes[node, col] += weight * u
+            nodes[node, col + 1] += weight * v
 
 
 @jit
