@@ -57,7 +57,9 @@ def fill(emulator: Emulator, share: float) -> Particles:
     """Resting water in a corner that fills this share of the box, as densely as in the training."""
     scene = emulator.scene
     step = scene.particle_volume ** (1 / scene.dim)
-    sides = [torch.arange(low + step / 2, low + (high - low) * share**0.5, step) for low, high in scene.bounds]
+    sides = [
+        torch.arange(low + step / 2, low + (high - low) * share ** (1 / scene.dim), step) for low, high in scene.bounds
+    ]
     position = torch.stack(torch.meshgrid(*sides, indexing="ij"), dim=-1).reshape(1, -1, scene.dim)
     count = position.shape[1]
     return Particles(
@@ -75,7 +77,7 @@ def fill(emulator: Emulator, share: float) -> Particles:
 def measure(emulator: Emulator, state: Particles, rounds: int) -> dict[str, Any]:
     """Seconds of the network and of a call, on windows and on the whole grid, and the cells of the windows."""
     whole, context, network = emulator.with_windows(None), emulator.context(state), emulator.processor
-    _, _, _, grid_state = steps_for(emulator, emulator._plan, state).rasterise(state, context.solid)
+    _, _, _, grid_state = steps_for(emulator, emulator._plan, state, context.solid).rasterise(state, context.solid)
     inputs = emulator.normalise(grid_state).to(emulator.network_precision)
     chosen = []
 

@@ -2,14 +2,15 @@
 
 Shapes, once for the whole package: B scenes in a batch, N particles (padded to the largest scene), M static
 particles (likewise), D space dimensions, T frames. Positions are in domain length, velocities in length per frame
-(v_t = p_t - p_{t-1}), gravity in length per frame squared.
+(v_t = p_t - p_{t-1}), gravity in length per frame squared. Fields are further numbers by name, in units of their own:
+one for each particle, such as a temperature, or one for each scene, such as a friction angle.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Self
 
 import torch
@@ -21,23 +22,27 @@ class _Batched:
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
         """The same on another device; `non_blocking` copies from pinned memory to a GPU do not block the host."""
-        return self._map(lambda values: values.to(device, non_blocking=non_blocking))
+        return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Self:
         """The same in page-locked host memory, from which a GPU copies asynchronously."""
-        return self._map(Tensor.pin_memory)
+        return self.map(Tensor.pin_memory)
 
     def double(self) -> Self:
         """The same in float64; indices and masks keep their types."""
-        return self._map(lambda values: values.double() if values.is_floating_point() else values)
+        return self.map(lambda values: values.double() if values.is_floating_point() else values)
 
-    def scenes(self, chosen: slice) -> Self:
-        """Some of the scenes: views (B', …) of the tensors, the padding that of the whole batch."""
-        return self._map(lambda values: values[chosen])
+    def scenes(self, chosen: slice | list[int]) -> Self:
+        """Some of the scenes, (B', …): views of the tensors for a slice; the padding is that of the whole batch."""
+        return self.map(lambda values: values[chosen])
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]  # (both subclasses are dataclasses)
-        return type(self)(**{name: change(getattr(self, name)) for name in names})
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The same with a function applied to each tensor, those of fields among them."""
+        changed = {
+            name: change(value) if isinstance(value, Tensor) else {key: change(own) for key, own in value.items()}
+            for name, value in vars(self).items()
+        }
+        return type(self)(**changed)
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class Particles(_Batched):
         obstacle: (B, M, D) positions of particles that do not move; M may be 0.
         obstacle_mask: (B, M) bool, False for padding.
         gravity: (B, D) in length per frame squared; zero where unknown.
+        fields: By name, (B, N) values of the particles, or (B, 1) where each scene has one value.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -64,6 +70,7 @@ class Particles(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -76,10 +83,15 @@ class Particles(_Batched):
             "gravity": (batch, dim),
         }
         _check_shapes(self, expected)
+        _check_fields(self.fields, [(batch, count), (batch, 1)], "Particles")
 
     def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
         """The same particles elsewhere: (B, N, D) positions and velocities."""
         return dataclasses.replace(self, position=position, velocity=velocity)
+
+    def with_fields(self, fields: Mapping[str, Tensor]) -> Particles:
+        """The same particles with some fields replaced or added: (B, N) or (B, 1) by name."""
+        return dataclasses.replace(self, fields={**self.fields, **fields})
 
 
 @dataclass(frozen=True)
@@ -89,6 +101,8 @@ class Window(_Batched):
     Args:
         frames: (B, T, N, D) positions in domain length, T >= 2.
         material, mask, obstacle, obstacle_mask, gravity: as in `Particles`.
+        fields: By name, (B, T, N) values of the particles, or (B, 1, N) if they are constant in time, or (B, 1, 1)
+            where each scene has one value.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -100,6 +114,7 @@ class Window(_Batched):
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -113,6 +128,7 @@ class Window(_Batched):
             "gravity": (batch, dim),
         }
         _check_shapes(self, expected)
+        _check_fields(self.fields, [(batch, frames, count), (batch, 1, count), (batch, 1, 1)], "Window")
 
     @classmethod
     def of(cls, state: Particles) -> Self:
@@ -124,6 +140,7 @@ class Window(_Batched):
             obstacle=state.obstacle,
             obstacle_mask=state.obstacle_mask,
             gravity=state.gravity,
+            fields={name: values.unsqueeze(1) for name, values in state.fields.items()},
         )
 
     @property
@@ -137,6 +154,7 @@ class Window(_Batched):
             obstacle=self.obstacle,
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
+            fields={name: values[:, min(1, values.shape[1] - 1)] for name, values in self.fields.items()},
         )
 
     @property
@@ -144,9 +162,23 @@ class Window(_Batched):
         """The frames to predict, (B, T - 2, N, D)."""
         return self.frames[:, 2:]
 
+    def field_target(self, name: str) -> Tensor:
+        """A field at the frames to predict, (B, T - 2, N)."""
+        values = self.fields[name]
+        ahead = values if values.shape[1] == 1 else values[:, 2:]
+        return ahead.expand(-1, self.frames.shape[1] - 2, self.frames.shape[2])
+
 
 def _check_shapes(owner: object, expected: dict[str, tuple[int, ...]]) -> None:
     for name, shape in expected.items():
         found = tuple(getattr(owner, name).shape)
         if found != shape:
             raise ValueError(f"{type(owner).__name__}.{name} has shape {found}, expected {shape}.")
+
+
+def _check_fields(fields: Mapping[str, Tensor], allowed: list[tuple[int, ...]], owner: str) -> None:
+    for name, values in fields.items():
+        if tuple(values.shape) not in allowed:
+            raise ValueError(
+                f"{owner}.fields[{name!r}] has shape {tuple(values.shape)}, expected {' or '.join(map(str, allowed))}."
+            )

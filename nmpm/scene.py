@@ -1,14 +1,15 @@
 """The fixed facts of a dataset's scenes: bounds, domain, materials, gravity, and which of them vary.
 
 A `Scene` alone decides the grid channels of a model: a scene of one material in a box has a velocity, a volume fraction
-and a wall channel; gravity becomes channels only where it varies, obstacles only where there are any.
+and a wall channel; gravity becomes channels only where it varies, obstacles only where there are any, further fields,
+such as a temperature, only where they are declared and vary.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
@@ -17,6 +18,8 @@ from nmpm.errors import ConfigError
 
 Boundary = Literal["wall", "periodic"]
 Interval = tuple[float, float]
+
+_RESERVED = frozenset({"position", "particle_type", "velocity", "volume", "solid", "gravity"})
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,9 @@ class Scene:
         gravity_varies: Whether each trajectory has its own gravity, so that the model must be told.
         obstacles: Whether there are particles that do not move.
         densities: Mass density of each material, in kg per length ** dim; all the same when left out.
+        evolving: Names of per-particle fields that change in time and are predicted, such as a temperature.
+        properties: Names of per-particle fields that are constant in time, such as a stiffness.
+        parameters: Names of numbers that each trajectory has one of, such as a friction angle.
 
     Raises:
         ConfigError: if the facts contradict each other.
@@ -49,6 +55,9 @@ class Scene:
     gravity_varies: bool = False
     obstacles: bool = False
     densities: tuple[float, ...] = ()
+    evolving: tuple[str, ...] = ()
+    properties: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.boundary:
@@ -77,6 +86,7 @@ class Scene:
             raise ConfigError(f"Scene.densities = {self.densities} needs one entry for each of {self.materials}.")
         if not all(0 < density < math.inf for density in self.densities):
             raise ConfigError(f"Scene.densities = {self.densities} must be positive and finite.")
+        check_field_names(self.fields)
 
     @property
     def dim(self) -> int:
@@ -109,6 +119,16 @@ class Scene:
         return float(self.particle_volume ** (1 / self.dim))
 
     @property
+    def particle_fields(self) -> tuple[str, ...]:
+        """Names of the fields of which each particle has a value, those that are predicted first."""
+        return self.evolving + self.properties
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of all fields that the model is told, those of particles first."""
+        return self.particle_fields + self.parameters
+
+    @property
     def input_channels(self) -> tuple[str, ...]:
         """Names of the grid channels the processor sees, in order."""
         axes = "xyz"[: self.dim]
@@ -116,12 +136,14 @@ class Scene:
         names += [f"{m}.volume" for m in self.materials]
         names += ["solid"] if self.walled else []
         names += [f"gravity_{a}" for a in axes] if self.gravity_varies else []
-        return tuple(names)
+        names += [f"{m}.{f}" for m in self.materials for f in self.particle_fields]
+        return (*names, *self.parameters)
 
     @property
     def output_channels(self) -> tuple[str, ...]:
-        """Names of the velocity channels that the processor predicts for each frame, in order."""
-        return self.input_channels[: self.dim * len(self.materials)]
+        """Names of the channels that the processor predicts for each frame: velocities, then rates of fields."""
+        rates = (f"{m}.{f}" for m in self.materials for f in self.evolving)
+        return (*self.input_channels[: self.dim * len(self.materials)], *rates)
 
     def material_index(self, name: str) -> int:
         """Channel position of a material.
@@ -136,8 +158,8 @@ class Scene:
     def differences(self, other: Scene) -> tuple[str, ...]:
         """Names of the facts that differ between a model's scene and its data's, and may not.
 
-        Names of materials and their densities are not compared; volumes of particles, which may be estimates, are
-        compared to 5%.
+        Names of materials, their densities and fields are not compared; volumes of particles, which may be estimates,
+        are compared to 5%.
         """
         facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles")
         found = [name for name in facts if getattr(self, name) != getattr(other, name)]
@@ -147,11 +169,20 @@ class Scene:
             found.append("particle_volume")
         return tuple(found)
 
+    def with_fields_of(self, other: Scene) -> Self:
+        """The same scene with another's fields: what a model of that other scene is told about this one."""
+        return dataclasses.replace(
+            self, evolving=other.evolving, properties=other.properties, parameters=other.parameters
+        )
+
     def to_dict(self) -> dict[str, Any]:
-        """The scene as plain lists, strings and numbers; without densities if there are none, as in older files."""
+        """The scene as plain lists, strings and numbers; without densities and fields if there are none, as in older
+        files.
+        """
         plain = dataclasses.asdict(self)
-        if not self.densities:
-            del plain["densities"]
+        for name in ("densities", "evolving", "properties", "parameters"):
+            if not plain[name]:
+                del plain[name]
         return {key: to_lists(value) for key, value in plain.items()}
 
     @classmethod
@@ -169,3 +200,22 @@ class Scene:
             return cls(**{key: to_tuples(value) for key, value in plain.items()})
         except TypeError as error:
             raise ConfigError(f"Scene cannot be read: {error}.") from error
+
+
+def check_field_names(names: Iterable[str]) -> None:
+    """Make sure that names of fields can name channels.
+
+    Raises:
+        ConfigError: if one is no identifier, is taken by a channel that every scene has, or occurs twice.
+    """
+    found: list[str] = []
+    for name in names:
+        taken = str(name).startswith(("gravity_", "velocity_")) or name in _RESERVED
+        if not isinstance(name, str) or not name.isidentifier() or taken:
+            raise ConfigError(
+                f"A field cannot be called {str(name)[:40]!r}: give letters, digits and underscores, and none of"
+                f" {', '.join(sorted(_RESERVED))}."
+            )
+        if name in found:
+            raise ConfigError(f"The field {name!r} is given twice.")
+        found.append(name)

@@ -69,14 +69,22 @@ def wait_until(page, condition):
     pytest.fail(f"not within 5 s: {condition}")
 
 
-def made_up_trajectory(frames: int, particles: int, seed: int = 0, statics: int = 0, dim: int = 2) -> Trajectory:
-    """Goop (7) that drifts slowly through the middle of [0.1, 0.9] ** dim, and boundary particles (3) that rest."""
+def made_up_trajectory(
+    frames: int, particles: int, seed: int = 0, statics: int = 0, dim: int = 2, fields: tuple[str, ...] = ()
+) -> Trajectory:
+    """Goop (7) that drifts slowly through the middle of [0.1, 0.9] ** dim, and boundary particles (3) that rest.
+
+    Fields evolve; those of particles that rest are NaN.
+    """
     rng = np.random.default_rng((seed, frames, particles))
     start = rng.uniform(0.3, 0.7, size=(1, particles + statics, dim))
     drift = rng.normal(scale=1e-3, size=(frames, particles + statics, dim)).cumsum(axis=0)
     drift[:, particles:] = 0
     types = np.r_[np.full(particles, 7), np.full(statics, 3)]
-    return Trajectory((start + drift).astype(np.float32), types, {"seed": seed})
+    values = {name: 1 + 0.01 * rng.normal(size=(frames, len(types))).cumsum(axis=0) for name in fields}
+    for own in values.values():
+        own[:, particles:] = np.nan
+    return Trajectory((start + drift).astype(np.float32), types, {"seed": seed}, values)
 
 
 def made_up_metadata(dim: int = 2, **changes: object) -> Metadata:
@@ -103,14 +111,15 @@ def make_dataset(tmp_path: Path) -> Callable[..., Path]:
         test: Sizes = ((12, 5), (15, 4), (12, 6)),
         statics: int = 0,
         dim: int = 2,
+        fields: tuple[str, ...] = (),
         **changes: object,
     ) -> Path:
         folder = tmp_path / "dataset"
         for name, sizes in (("train", train), ("valid", valid), ("test", test)):
-            runs = [made_up_trajectory(*size, seed=i, statics=statics, dim=dim) for i, size in enumerate(sizes)]
+            runs = [made_up_trajectory(*size, i, statics, dim, fields) for i, size in enumerate(sizes)]
             if runs:
                 write_split(folder / f"{name}.h5", runs)
-        write_metadata(folder, made_up_metadata(dim, **changes))
+        write_metadata(folder, made_up_metadata(dim, fields=fields, **changes))
         return folder
 
     return make

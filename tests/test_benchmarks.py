@@ -21,11 +21,11 @@ ROOT = Path(__file__).parent.parent / "benchmarks"
 if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
-WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "recipes", "runtimes", "windows"} | {
+WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "calibration", "dam_break", "kills", "simulators", "stable_substeps",
     "where_emulation_pays",
 }  # fmt: skip
-"""These measure the CPU alone: export runtimes, kernels and recipes on one thread, and the simulators."""
+"""These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -293,3 +293,21 @@ def test_a_cost_is_fitted_to_all_but_the_widest():
     cases = [script.Case("", 1, count, "", 1, None, None) for count in (100, 200, 400)]
     fit = script.fit_cost(cases, [3.0, 5.0, 18.0])
     assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})
+
+
+# ---- beyond a model's own scenes
+
+
+@pytest.mark.skipif("goop" not in Zoo.list(), reason="the zoo holds no goop model")
+def test_times_are_per_frame_and_drawn_beside_those_of_simulators(tmp_path):
+    import generalisation
+
+    rows = {count: generalisation.measure_times({"goop": Zoo.load("goop")}, count, rounds=1) for count in (100, 1000)}
+    assert all(0 < row["goop"].least <= row["goop"].median for row in rows.values())
+    stated = {"particles": [90, 110], "predictors": [{"kind": "simulator", "ms_per_frame": {"median": 2.5}}]}
+    stated["predictors"].append({"kind": "model", "ms_per_frame": {"median": 1.0}})
+    (tmp_path / "compare.json").write_text(json.dumps(stated))
+    simulated = generalisation.simulator_times([tmp_path])
+    assert simulated == {100: 2.5}
+    generalisation.draw_times(tmp_path / "times.png", rows, simulated)
+    assert (tmp_path / "times.png").stat().st_size > 0

@@ -11,19 +11,25 @@ def state(batch: int = 3) -> Particles:
     return cloud(box(), count=5, batch=batch, statics=2)
 
 
+def tensors(whole):
+    """All tensors by name, those of fields among them."""
+    found = vars(whole)
+    return {name: values for name, values in found.items() if name != "fields"} | dict(found["fields"])
+
+
 @pytest.mark.parametrize("whole", [state(), Window.of(state())], ids=["Particles", "Window"])
 def test_double_leaves_indices_and_masks(whole):
-    for name, values in vars(whole.double()).items():
+    for name, values in tensors(whole.double()).items():
         assert values.dtype == KEPT.get(name, torch.float64)
-        torch.testing.assert_close(values, getattr(whole, name), check_dtype=False, rtol=0, atol=0)
+        torch.testing.assert_close(values, tensors(whole)[name], check_dtype=False, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("whole", [state(), Window.of(state())], ids=["Particles", "Window"])
 def test_some_scenes_are_views(whole):
     some = whole.scenes(slice(1, 3))
-    for name, values in vars(some).items():
-        assert torch.equal(values, getattr(whole, name)[1:])
-        assert values.untyped_storage().data_ptr() == getattr(whole, name).untyped_storage().data_ptr()
+    for name, values in tensors(some).items():
+        assert torch.equal(values, tensors(whole)[name][1:])
+        assert values.untyped_storage().data_ptr() == tensors(whole)[name].untyped_storage().data_ptr()
 
 
 def test_a_window_of_a_state_starts_there_and_predicts_nothing():

@@ -28,7 +28,7 @@ SMALLER = {
     "range(20)": "range(3)",
 }
 LAUNCHERS = ("srun", "torchrun")
-RECORDED = ("FOLDER", "goop-as-in-the-paper")
+RECORDED = ("FOLDER", "channel", "goop-as-in-the-paper")
 TRAINING = ("fit", "validate", "test", "predict")
 
 
@@ -114,6 +114,7 @@ def test_there_is_something_to_test():
         "view",
         "stress",
         "trade",
+        "compare",
         "inspect",
         "convert",
         "export",

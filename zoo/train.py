@@ -4,12 +4,14 @@
     python zoo/train.py --threads 1          # once per core, or with --device cuda:0, cuda:1 once per GPU
     python zoo/train.py goop wbcsph --hours 8
     python zoo/train.py --data waterdrop=FOLDER   # with recorded data
+    python zoo/train.py goop --fresh         # from random weights, not from those of the zoo's entry
     python zoo/train.py --status
     python zoo/train.py --collect            # make entries of the best weights so far, also while others train
 
-A dataset is simulated first if it is missing. Everything lies in `runs/zoo/NAME`; after any interruption, kill -9 too,
-the same command goes on from the last checkpoint. Several of these processes share the work: each takes a dataset that
-no other one has.
+A dataset is simulated first if it is missing. Where the zoo has an entry with the curve of its training, training goes
+on from its weights, and the hours that it took count. Everything lies in `runs/zoo/NAME`; after any interruption,
+kill -9 too, the same command goes on from the last checkpoint. Several of these processes share the work: each takes a
+dataset that no other one has.
 """
 
 from __future__ import annotations
@@ -49,6 +51,7 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--hours", type=float, help="stop after this time; the next call goes on")
     parser.add_argument("--threads", type=int, help="processor threads of this process (default: all)")
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1, mps")
+    parser.add_argument("--fresh", action="store_true", help="start from random weights where nothing has been started")
     parser.add_argument("--status", action="store_true", help="print how far each dataset is, and train nothing")
     parser.add_argument("--collect", action="store_true", help="make entries of the best weights, and train nothing")
     return parser.parse_args(words)
@@ -67,9 +70,9 @@ def main(words: list[str] | None = None) -> int:
         data = dict(entry.split("=", 1) if "=" in entry else (entry, "") for entry in chosen.data)
         plan = Plan.read(chosen.queue).with_data(data).select(chosen.names)
         if chosen.status:
-            return print_status(plan, chosen.runs)
+            return print_status(plan, chosen)
         if chosen.collect:
-            return max([collect_entry(history, chosen.zoo) for history in histories(plan, chosen.runs)], default=0)
+            return max([collect_entry(history, chosen.zoo) for history in histories(plan, chosen)], default=0)
         with interruptions(chosen.hours):
             return train_all(plan, chosen)
     except NmpmError as error:
@@ -85,24 +88,24 @@ def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
     failed: set[str] = set()
     while True:
         done = False
-        for history, number in ready(plan, chosen.runs, failed):
+        for history, number in ready(plan, chosen, failed):
             with taken(history.folder) as mine:
                 if not mine or history.next_round() != number:
                     continue
                 done = True
-                say(f"{history.dataset.name}, training {number}. {remaining(plan, chosen.runs)}")
+                say(f"{history.dataset.name}, training {number}. {remaining(plan, chosen)}")
                 if not train(history, number, chosen):
                     failed.add(history.dataset.name)
             break
         if not done:
             names = ", ".join(sorted(failed)) or "none"
-            say(f"nothing is left to take. {remaining(plan, chosen.runs)} Failed: {names}.")
+            say(f"nothing is left to take. {remaining(plan, chosen)} Failed: {names}.")
             return 1 if failed else 0
 
 
-def ready(plan: Plan, runs: Path, failed: set[str]) -> Iterator[tuple[History, int]]:
+def ready(plan: Plan, chosen: argparse.Namespace, failed: set[str]) -> Iterator[tuple[History, int]]:
     """Datasets with the number of their next training: all first ones, then all second ones, …."""
-    waiting = (h for h in histories(plan, runs) if h.dataset.name not in failed and not h.waits_for())
+    waiting = (h for h in histories(plan, chosen) if h.dataset.name not in failed and not h.waits_for())
     rounds = [(number, order, h) for order, h in enumerate(waiting) if (number := h.next_round()) is not None]
     yield from ((history, number) for number, _, history in sorted(rounds, key=lambda entry: entry[:2]))
 
@@ -159,30 +162,31 @@ def device_options(device: str) -> list[str]:
     return ["--trainer.accelerator", kind, "--trainer.devices", f"[{index}]" if index else "1"]
 
 
-def histories(plan: Plan, runs: Path) -> list[History]:
+def histories(plan: Plan, chosen: argparse.Namespace) -> list[History]:
     """How far each dataset is."""
     from nmpm.zoo.queue.trainings import History
 
-    return [History(dataset, runs / dataset.name, plan.extension) for dataset in plan.datasets]
+    entries = {d.name: None if chosen.fresh or not d.publish else chosen.zoo / d.name for d in plan.datasets}
+    return [History(d, chosen.runs / d.name, plan.extension, entries[d.name]) for d in plan.datasets]
 
 
-def remaining(plan: Plan, runs: Path) -> str:
+def remaining(plan: Plan, chosen: argparse.Namespace) -> str:
     """Hours of training that are left, in words."""
-    hours = [history.hours_left() for history in histories(plan, runs)]
+    hours = [history.hours_left() for history in histories(plan, chosen)]
     least, most = (sum(column) for column in zip(*hours, strict=True)) if hours else (0.0, 0.0)
     return f"Left: {least:.1f} h of training, {most:.1f} h if every dataset is extended to its limit."
 
 
-def print_status(plan: Plan, runs: Path) -> int:
+def print_status(plan: Plan, chosen: argparse.Namespace) -> int:
     """A line per dataset."""
-    for history in histories(plan, runs):
+    for history in histories(plan, chosen):
         trainings, best = history.trainings, history.best()
         hours = sum(training.seconds() for training in trainings) / 3600
         error = "not validated" if best is None else f"validation MSE {1e3 * best.error():.4g} ×10⁻³"
         state = "stopped" if history.next_round() is None else f"training {history.next_round()}"
         state = f"needs {history.waits_for()}" if history.waits_for() else state
         sys.stdout.write(f"{history.dataset.name:<22} {state:<27} {hours:5.2f} h  {error}\n")
-    sys.stdout.write(f"{remaining(plan, runs)}\n")
+    sys.stdout.write(f"{remaining(plan, chosen)}\n")
     return 0
 
 

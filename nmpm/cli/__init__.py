@@ -21,6 +21,7 @@ COMMANDS = {
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
     "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
+    "compare": ("nmpm.cli.compare", "Compare models on scenes that need not be their own."),
     "trade": ("nmpm.cli.trade", "Measure time and errors of models, the simulator and trivial predictors."),
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF or MP4."),
@@ -44,6 +45,7 @@ first steps:
   nmpm render out.h5                           draw the rollout
   nmpm view out.h5                             play it in a browser
   nmpm stress goop                             test it at the extremes
+  nmpm compare waterramps --data waterdrop-xl  does a model hold for other scenes than its own?
   nmpm trade goop                              what accuracy costs in time: model or simulator?
 
 Add --help to any command for its options; fit --print_config prints a whole configuration.

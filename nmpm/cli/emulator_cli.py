@@ -28,6 +28,7 @@ from nmpm.cli.options import check_folder
 from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
+from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
@@ -80,8 +81,17 @@ class EmulatorCLI(LightningCLI):
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
         if self.words[0] == "fit":
             parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
-        parser.link_arguments("data.scene", "model.scene", apply_on="instantiate")
+        parser.link_arguments("data.scene", "model.scene", apply_on="instantiate", compute_fn=self._model_scene)
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
+
+    def _model_scene(self, scene: Scene) -> Scene:
+        """The data's scene; with the fields of the checkpoint that is to be judged, which the data may lack."""
+        config = self.config[self.subcommand]
+        if self.subcommand == "fit" or not config["ckpt_path"]:
+            return scene
+        path = self._run_folder(config).checkpoint(str(config["ckpt_path"]))
+        stored = read_checkpoint(path).get("hyper_parameters", {}).get("scene")
+        return scene.with_fields_of(Scene.from_dict(stored)) if isinstance(stored, dict) else scene
 
     def before_instantiate_classes(self) -> None:
         """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder.
@@ -133,8 +143,11 @@ class EmulatorCLI(LightningCLI):
     @property
     def run_folder(self) -> RunFolder:
         """Where this run's files are."""
+        return self._run_folder(self.config_init[self.subcommand])
+
+    def _run_folder(self, config: Any) -> RunFolder:
         files = {"last": self._checkpoint_file("resume"), "best": self._checkpoint_file("checkpoint")}
-        return RunFolder(Path(self.config_init[self.subcommand]["trainer"]["default_root_dir"]), files)
+        return RunFolder(Path(config["trainer"]["default_root_dir"]), files)
 
     def _checkpoint_file(self, saver: str) -> Path:
         config = self.config[self.subcommand][saver]

@@ -118,7 +118,8 @@ def _native_origin(path: Path, options: Options) -> FolderSource:
     from nmpm.data.loading.sources import FolderSource, StatedFacts
 
     boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
-    return FolderSource(path, StatedFacts(options.family, options.gravity, boundary, options.bounds))  # type: ignore[arg-type]  # (argparse gives plain lists)
+    facts = StatedFacts(options.family, options.gravity, boundary, options.bounds, options.fields)  # type: ignore[arg-type]  # (argparse gives plain lists)
+    return FolderSource(path, facts)
 
 
 def lines(found: Inspection) -> Iterator[str]:
@@ -135,6 +136,8 @@ def lines(found: Inspection) -> Iterator[str]:
     yield _format_label("materials", ", ".join(f"{name} ({_span(n)})" for name, n in found.materials.items()))
     if found.fields:
         yield _format_label("fields", ", ".join(f"{name} {shape}" for name, shape in found.fields.items()))
+    for index, (name, text) in enumerate(found.channels.items()):
+        yield from _format_long("" if index else "channels", f"{name} {text}")
     yield _format_label("varies", ", ".join(found.varies) or "nothing but the initial state")
     yield _format_label("bounds", _box(found.stated_bounds) + " stated")
     yield _format_label("", _box(found.observed) + " observed")
@@ -160,6 +163,11 @@ def lines(found: Inspection) -> Iterator[str]:
 
 def _format_label(label: str, text: str) -> str:
     return f"  {label:<10}{text}"
+
+
+def _format_long(label: str, text: str) -> Iterator[str]:
+    """A label and its text, on further lines where it is long."""
+    yield from textwrap.wrap(text, _WIDTH, initial_indent=_format_label(label, ""), subsequent_indent=" " * 14)
 
 
 def _span(values: Range) -> str:

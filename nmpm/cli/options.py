@@ -122,6 +122,7 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--dt", type=float, help="seconds between stored frames")
     group.add_argument("--gravity", metavar="X,Y[,Z]", help="acceleration in length/s², e.g. 0,-9.81")
     group.add_argument("--boundary", metavar="KIND,...", help='"wall" or "periodic" per axis, e.g. periodic,wall')
+    group.add_argument("--fields", metavar="NAME,...", help="fields that models are told of, e.g. temperature")
 
 
 def data_options(chosen: argparse.Namespace) -> Options:
@@ -143,6 +144,7 @@ def data_options(chosen: argparse.Namespace) -> Options:
         dt=chosen.dt,
         gravity=_parse("--gravity", chosen.gravity, _numbers, "a number for each axis, e.g. 0,-9.81"),
         periodic=_parse("--boundary", chosen.boundary, _kinds, '"wall" or "periodic" for each axis'),
+        fields=_parse("--fields", chosen.fields, _field_names, "names, e.g. temperature,stiffness"),
     )
 
 
@@ -192,6 +194,14 @@ def _intervals(text: str) -> tuple[tuple[float, float], ...]:
     if any(len(pair) != 2 or not pair[0] < pair[1] for pair in pairs):
         raise ValueError(text)
     return tuple((pair[0], pair[1]) for pair in pairs)
+
+
+def _field_names(text: str) -> tuple[str, ...]:
+    from nmpm.scene import check_field_names
+
+    names = tuple(name.strip() for name in text.split(","))
+    check_field_names(names)
+    return names
 
 
 def _kinds(text: str) -> tuple[bool, ...]:

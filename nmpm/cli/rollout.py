@@ -97,8 +97,10 @@ def _recorded_state(model: Pretrained, path: Path, index: int) -> Particles:
     from nmpm.data.format import Split, read_metadata
     from nmpm.data.loading.padded_batch import collate
     from nmpm.data.loading.recording import SplitRecordings
+    from nmpm.emulator.fields import warn_of_ignored
 
     metadata = read_metadata(path.parent, _family(model))
+    warn_of_ignored(model.scene, metadata.fields)
     recordings = SplitRecordings(Split(path), metadata, model.scene)
     if index >= len(recordings):
         raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(recordings) - 1}.")
@@ -114,23 +116,23 @@ def _family(model: Pretrained) -> str | None:
 
 def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
     """Predict, and write the two frames of the start and the prediction, with what is needed to draw them."""
-    import torch
     from rich.console import Console
     from rich.progress import track
 
     from nmpm.data.format import write_split
     from nmpm.data.predictions import predicted_trajectory
-    from nmpm.emulator import stream
+    from nmpm.emulator import Rollout, stream_rollout
     from nmpm.emulator.monitor import Monitor, Policy
 
     count, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
-    bundles = stream(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
+    bundles = stream_rollout(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
     # On the CPU, as a device may have less memory than a long rollout needs.
     shown = track(
         bundles, "rollout", count, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
     )
-    positions = [bundle.cpu() for bundle in shown]
+    rollout = Rollout.join([bundle.cpu() for bundle in shown])
     origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
-    predicted = predicted_trajectory(model.scene, state.to("cpu"), torch.cat(positions, dim=1), origin)
+    start = state.to("cpu")
+    predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields)
     write_split(chosen.out, [predicted])
     sys.stdout.write(monitor.report() + "\n")

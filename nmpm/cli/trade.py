@@ -45,10 +45,10 @@ def run(words: list[str]) -> None:
     out = chosen.out or Path("trade") / Path(chosen.dataset).name
     check_folder("--out", out)
     from nmpm._support.devices import find_device
-    from nmpm.evaluation.trade import make_choices
+    from nmpm.evaluation.trade import find_scenes, make_choices
 
     sweep = _sweep(chosen)
-    scenes = _scenes(chosen.dataset, sweep.scenes)
+    scenes = find_scenes(chosen.dataset, sweep.scenes)
     choices = make_choices(sweep, scenes, _models(chosen.models, scenes), find_device(chosen.device))
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
@@ -96,22 +96,6 @@ def _sweep(chosen: argparse.Namespace) -> Sweep:
     fitting = tuple(batch for batch in sweep.models.batch if batch <= chosen.scenes)
     models = dataclasses.replace(sweep.models, batch=fitting or (1,))
     return dataclasses.replace(sweep, scenes=chosen.scenes, models=models)
-
-
-def _scenes(dataset: str, count: int) -> Scenes:
-    """Test scenes of a folder, or of an embedded dataset; of the latter only these are simulated if it is missing."""
-    from nmpm.data.catalog import catalog, dataset_folder, ensure, simulation_request
-    from nmpm.data.format import METADATA_FILE
-    from nmpm.evaluation.trade import read_scenes
-
-    if dataset in catalog():
-        whole = dataset_folder(dataset, simulation_request(dataset))
-        complete = (whole / METADATA_FILE).is_file()
-        folder = whole if complete else ensure(dataset, {"train": 0, "valid": 0, "test": count})
-        return read_scenes(dataset, folder, count)
-    if not Path(dataset).is_dir():
-        raise ConfigError(f"{dataset} is neither a folder nor an embedded dataset: {', '.join(catalog())}.")
-    return read_scenes(Path(dataset).name, Path(dataset), count)
 
 
 def _models(names: list[str] | None, scenes: Scenes) -> dict[str, Emulator]:

@@ -54,12 +54,16 @@ class TrajectoryDataModule(LightningDataModule):
         passes: How often the windows of a buffer are drawn, on average, before the next buffer.
         emphasis: Fraction of the training windows that is drawn in proportion to the motion in them, in [0, 1]; the
             rest is drawn uniformly. Useful where recordings end with a long rest.
+        bucket_batches: Training batches in a row whose windows are sorted by their number of particles and dealt to
+            them anew, so that a large scene does not make small ones pay for padding; 1 for none.
         seed: Seed of the order of the training windows.
         family: Meaning of the type ids in recorded data where its metadata does not state it: "deepmind",
             "lagrangebench", "jax-sph".
         gravity: Acceleration in length/s² per axis, where recorded data do not state it.
         boundary: "wall" or "periodic" per axis, instead of that in the metadata of recorded data.
         bounds: (lower, upper) per axis, likewise.
+        fields: Names of fields that the model is told of, such as [temperature], instead of those that the metadata of
+            recorded data declare; [] for none. Those that evolve are predicted.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
@@ -78,18 +82,20 @@ class TrajectoryDataModule(LightningDataModule):
         buffer_size: int = 16,
         passes: float = 4,
         emphasis: float = 0.0,
+        bucket_batches: int = 1,
         seed: int = 0,
         family: str | None = None,
         gravity: list[float] | None = None,
         boundary: list[Boundary] | None = None,
         bounds: list[tuple[float, float]] | None = None,
+        fields: list[str] | None = None,
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         path = None if path == _OPEN and name is not None else path
-        stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds}
+        stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds, "fields": fields}
         _check_source(path, name, source, stated, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
@@ -97,6 +103,7 @@ class TrajectoryDataModule(LightningDataModule):
         self.data_source = _make_source(path, name, source, StatedFacts(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
+        self.bucket_batches = bucket_batches
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
         self._provider: RecordingProvider | None = None
         self._history: _BatchHistory | None = None
@@ -148,6 +155,7 @@ class TrajectoryDataModule(LightningDataModule):
             passes=self.passes,
             seed=self.seed,
             emphasis=self.emphasis,
+            bucket=self.bucket_batches,
             start=history.start,
         )
         plan = plan.resume_after(self.batches_seen, history.batch_size, history.world, world)

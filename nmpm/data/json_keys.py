@@ -13,8 +13,8 @@ from typing import Any
 
 from nmpm._support.limits import WHOLE
 from nmpm._support.messages import one_line
-from nmpm.errors import DataError
-from nmpm.scene import Interval
+from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Interval, check_field_names
 
 
 class JsonKeys:
@@ -71,6 +71,17 @@ def parse_densities(value: Any) -> dict[str, float]:
     if not isinstance(value, Mapping):
         raise TypeError('positive numbers by material, e.g. {"water": 1000}')
     return {str(name): parse_positive(density) for name, density in value.items()}
+
+
+def parse_field_names(value: Any) -> tuple[str, ...]:
+    """Names of fields from a list."""
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise ValueError('a list of names of fields, e.g. ["temperature"]')
+    try:
+        check_field_names(value)
+    except ConfigError as error:
+        raise ValueError(f"a list of names of fields ({error})") from error
+    return tuple(value)
 
 
 def parse_whole(value: Any) -> int:

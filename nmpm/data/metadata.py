@@ -2,8 +2,8 @@
 
 Required are `bounds`, `dt`, `dim` and `sequence_length` (as in DeepMind's files this may be one less than the frames
 stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `domain`, `gravity` (length/s²),
-`particle_volume` (length ** dim), `densities` ({"water": 1000}, kg / length ** dim) and
-`periodic_boundary_conditions`. All other keys are kept unchanged.
+`particle_volume` (length ** dim), `densities` ({"water": 1000}, kg / length ** dim), `periodic_boundary_conditions` and
+`fields` (["temperature"], see `nmpm.data.fields`). All other keys are kept unchanged.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from nmpm.data.json_keys import (
     flags_parser,
     intervals_parser,
     parse_densities,
+    parse_field_names,
     parse_ids,
     parse_names,
     parse_positive,
@@ -55,6 +56,7 @@ class Metadata:
         gravity: Acceleration in length/s² per axis, or None where unknown.
         particle_volume: Volume of a particle in length ** dim, or None where unknown.
         densities: Mass density of materials in kg / length ** dim, by name; empty where unknown.
+        fields: Names of the fields that every trajectory has, which models are told of.
         extra: Every other key of the file, unchanged.
     """
 
@@ -69,6 +71,7 @@ class Metadata:
     gravity: tuple[float, ...] | None = None
     particle_volume: float | None = None
     densities: dict[str, float] = field(default_factory=dict)
+    fields: tuple[str, ...] = ()
     extra: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -142,6 +145,7 @@ def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None
         gravity=keys.take("gravity", vector_parser(dim), None),
         particle_volume=keys.take("particle_volume", parse_positive, None),
         densities=keys.take("densities", parse_densities, {}),
+        fields=keys.take("fields", parse_field_names, ()),
         extra=keys.left,
     )
 
@@ -165,6 +169,7 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         "gravity": metadata.gravity,
         "particle_volume": metadata.particle_volume,
         "densities": metadata.densities or None,
+        "fields": metadata.fields or None,
     }
     plain = {key: value for key, value in plain.items() if value is not None} | metadata.extra
     path = Path(folder) / METADATA_FILE

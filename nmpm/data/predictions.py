@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -17,7 +18,14 @@ from nmpm.scene import Scene
 BOUNDARY = 3  # DeepMind's id of particles that do not move
 
 
-def predicted_trajectory(scene: Scene, state: Particles, predicted: Tensor, model: str, index: int = 0) -> Trajectory:
+def predicted_trajectory(
+    scene: Scene,
+    state: Particles,
+    predicted: Tensor,
+    model: str,
+    index: int = 0,
+    fields: Mapping[str, Tensor] | None = None,
+) -> Trajectory:
     """One scene of a batch: the two frames that the rollout started from, then the prediction.
 
     Args:
@@ -26,6 +34,8 @@ def predicted_trajectory(scene: Scene, state: Particles, predicted: Tensor, mode
         predicted: (B, T, N, D) positions in domain length.
         model: What predicted, in words.
         index: Which scene of the batch.
+        fields: (B, T, N) predicted fields by name; stored as further datasets (T + 2, N), NaN for obstacles. The first
+            two frames have the state's values, the first predicted ones where the state lacks them.
     """
     real = state.mask[index]
     start = torch.stack([state.position[index] - state.velocity[index], state.position[index]])
@@ -41,7 +51,17 @@ def predicted_trajectory(scene: Scene, state: Particles, predicted: Tensor, mode
         "static_types": np.array([BOUNDARY]),
     }
     ids = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
-    return Trajectory(np.concatenate([position, resting], axis=1), ids, attributes)
+    stored = {
+        name: _field_frames(state.fields.get(name, values[:, 0])[index], values[index], real, len(obstacle))
+        for name, values in (fields or {}).items()
+    }
+    return Trajectory(np.concatenate([position, resting], axis=1), ids, attributes, stored)
+
+
+def _field_frames(start: Tensor, predicted: Tensor, real: Tensor, obstacles: int) -> np.ndarray:
+    """(T + 2, N + M) values of a scene: those of the start (N,) or (1,) twice, then (T, N) predicted ones."""
+    frames = torch.cat([start.expand(2, predicted.shape[1]), predicted])[:, real].cpu().numpy()
+    return np.pad(frames.astype(np.float32), ((0, 0), (0, obstacles)), constant_values=np.nan)
 
 
 def _type_ids(scene: Scene) -> dict[int, str]:

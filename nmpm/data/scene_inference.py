@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from nmpm.data.fields import Kind, require_fields, survey_fields
 from nmpm.data.format import METADATA_FILE, Metadata, Split, read_metadata, split_paths
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Boundary, Interval, Scene
+from nmpm.scene import Boundary, Interval, Scene, check_field_names
 
 _WALL_LAYER = 0.025  # of the extent; DeepMind's 0.1-0.9 becomes the paper's 0.08-0.92
 _SAMPLE_BYTES = 2**27
@@ -24,6 +25,7 @@ def infer_scene(
     gravity: Sequence[float] | None = None,
     boundary: Sequence[Boundary] | None = None,
     bounds: Sequence[Interval] | None = None,
+    fields: Sequence[str] | None = None,
 ) -> Scene:
     """Infers the scene of a dataset.
 
@@ -32,8 +34,10 @@ def infer_scene(
     are), and the bounds themselves on a periodic axis. Materials are the types that move and occur, in order of id.
     The particle volume is the metadata's, or else (median distance to the nearest neighbour in first frames) ** dim.
 
-    Sampled are the positions of `train.h5` (or else `valid.h5`, `test.h5`): all of them up to 128 MiB, evenly spaced
-    trajectories beyond that. Types and gravities are read from all its trajectories.
+    Fields are those that the metadata or the user names and that differ anywhere in the sample.
+
+    Sampled are the positions and fields of `train.h5` (or else `valid.h5`, `test.h5`): all of them up to 128 MiB,
+    evenly spaced trajectories beyond that. Types and gravities are read from all its trajectories.
 
     Args:
         folder: The dataset's folder.
@@ -41,9 +45,11 @@ def infer_scene(
         gravity: Acceleration in length/s², where the files do not state it.
         boundary: "wall" or "periodic" per axis, instead of the metadata's.
         bounds: (lower, upper) per axis, instead of the metadata's.
+        fields: Names, instead of the metadata's.
 
     Raises:
-        DataError: if files are missing or wrong, or a position lies outside the domain that the metadata states.
+        DataError: if files are missing or wrong, a trajectory lacks a field, or a position lies outside the domain that
+            the metadata states.
         ConfigError: if an argument does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
     folder = Path(folder)
@@ -64,6 +70,7 @@ def infer_scene(
         for found in gravities:
             check_gravity(metadata.gravity, found, split.path)
     materials = _materials(types, metadata, split)
+    kinds = _kinds_of_fields(split, metadata, metadata.fields if fields is None else tuple(fields))
     return Scene(
         bounds=widened,
         domain=domain,
@@ -75,7 +82,18 @@ def infer_scene(
         gravity_varies=len(gravities) > 1,
         obstacles=bool(types & metadata.static_types),
         densities=_densities(materials, metadata),
+        evolving=tuple(name for name, kind in kinds.items() if kind == "evolving"),
+        properties=tuple(name for name, kind in kinds.items() if kind == "property"),
+        parameters=tuple(name for name, kind in kinds.items() if kind == "parameter"),
     )
+
+
+def _kinds_of_fields(split: Split, metadata: Metadata, names: Sequence[str]) -> dict[str, Kind]:
+    """The kinds of the declared fields, in their order."""
+    check_field_names(names)
+    require_fields(split, names)
+    facts = survey_fields(split, metadata, names, _sample(split))
+    return {name: facts[name].kind for name in names}
 
 
 def _override(
@@ -159,8 +177,7 @@ class _ObservedExtents:
 
 
 def _observe(split: Split, metadata: Metadata) -> _ObservedExtents:
-    sizes = [4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split))]
-    sample = range(0, len(split), max(1, -(-sum(sizes) // _SAMPLE_BYTES)))
+    sample = _sample(split)
     measured = set(sample[:: -(-len(sample) // _SPACING_TRAJECTORIES)])
     moving: list[list[np.ndarray]] = []
     everything: list[list[np.ndarray]] = []
@@ -176,6 +193,12 @@ def _observe(split: Split, metadata: Metadata) -> _ObservedExtents:
         if index in measured:
             spacing.append(_spacing(trajectory.position[0, kind], metadata))
     return _ObservedExtents(_union(moving, metadata), _union(everything, metadata), np.concatenate(spacing))
+
+
+def _sample(split: Split) -> range:
+    """Indices of evenly spaced trajectories, of so many bytes of positions in all."""
+    sizes = [4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split))]
+    return range(0, len(split), max(1, -(-sum(sizes) // _SAMPLE_BYTES)))
 
 
 def _union(extents: list[list[np.ndarray]], metadata: Metadata) -> np.ndarray:

@@ -147,12 +147,12 @@ class Advection:
         return Flight(start.cells, start.velocity, carried, start.gravity, start.material, fields, share)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
-        """Each particle's own material's velocity: fields (B, materials * D, *S) at cells (B, N, D) → (B, N, D)."""
+        """Each particle's own material's values: fields (B, materials * V, *S) at cells (B, N, D) → (B, N, V)."""
         gathered = self.transfer.g2p(fields, cells, self.grid)
         if len(self.scene.materials) == 1:
             return gathered
-        split = gathered.unflatten(-1, (len(self.scene.materials), self.scene.dim))
-        chosen = material[..., None, None].expand(-1, -1, 1, self.scene.dim)
+        split = gathered.unflatten(-1, (len(self.scene.materials), -1))
+        chosen = material[..., None, None].expand(-1, -1, 1, split.shape[-1])
         own: Tensor = split.gather(2, chosen).squeeze(2)
         return own
 

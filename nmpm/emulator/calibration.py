@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nmpm._support.collectives import all_gather, rank_and_world_size
+from nmpm.emulator.fields import calibrate_fields, true_rates
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rasterise import grid_state, volume_fraction
 from nmpm.particles import Window
@@ -34,7 +35,7 @@ class _Inputs:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """What the decoder leaves of one material's true velocities: (m, D) mean square over particles."""
+    """What the decoder leaves of one material's true velocities or fields: (m, V) mean square over particles."""
 
     particles: int
     square: Tensor
@@ -46,8 +47,9 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
 
     Inputs get mean and standard deviation per channel over all cells, and the limits to which they are clipped; outputs
     the root mean square of what is left of the true velocities once the decoder's known part is taken out, per frame of
-    the bundle and component. Where several processes train together, all of them call this, each with windows of its
-    own, and get the statistics of all windows. The windows may be on any device.
+    the bundle and component, and of the evolving fields' changes. Fields get mean and standard deviation. Where several
+    processes train together, all of them call this, each with windows of its own, and get the statistics of all. The
+    windows may be on any device.
 
     Raises:
         ValueError: if there is no window or one is too short.
@@ -55,6 +57,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
     windows = [window.to(emulator.device) for window in windows]
+    calibrate_fields(emulator.field_scales, windows)
     inputs = _combine(all_gather(_inputs(emulator, windows)))
     emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
@@ -128,18 +131,23 @@ def _combine(parts: Sequence[_Inputs]) -> _Inputs:
 def _state(emulator: Emulator, window: Window) -> Tensor:
     start, grid = window.initial, emulator.grid
     cells, velocity = grid.to_cells(start.position), grid.to_cell_displacement(start.velocity)
-    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, emulator.solid(start))
+    solid = emulator.solid(start)
+    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, solid, emulator.field_scales)
 
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
-    """For each material, the part of the velocity that the network has to predict."""
-    unknown = [_unknown_velocity(emulator, window) for window in windows]
-    found = []
-    for index in range(len(emulator.scene.materials)):
-        chosen = [window.mask & (window.material == index) for window in windows]
-        values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(unknown, chosen, strict=True)])
-        found.append(_Unknowns(len(values), _shareable(values.square().mean(0))))
-    return found
+    """For each material the part of the velocity that the network has to predict, then of each the fields' rates."""
+    unknown = [[_unknown_velocity(emulator, window) for window in windows]]
+    if emulator.scene.evolving:
+        unknown.append([true_rates(emulator.field_scales, window, emulator.frames) for window in windows])
+    return [_mean_square(parts, index, windows) for parts in unknown for index in range(len(emulator.scene.materials))]
+
+
+def _mean_square(parts: Sequence[Tensor], index: int, windows: Sequence[Window]) -> _Unknowns:
+    """Of values (B, m, N, V) in each window, over the particles of a material."""
+    chosen = [window.mask & (window.material == index) for window in windows]
+    values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(parts, chosen, strict=True)])
+    return _Unknowns(len(values), _shareable(values.square().mean(0)))
 
 
 def _root_mean_square(parts: Sequence[_Unknowns]) -> Tensor:

@@ -71,11 +71,15 @@ class Contact:
         """
         return self.hold_touching(start, path) if can_branch(start) else self.hold_all(start, path)
 
+    def inside(self, places: Tensor) -> Tensor:
+        """(B, K) bool: whether places (B, K, D) in cells are deeper in an obstacle than its surface."""
+        return self._scene_depth(places) > SURFACE
+
     def hold_touching(self, start: Tensor, path: Tensor) -> Tensor:
         """`hold` for a CPU: treats the particles that touch, and returns the same tensor if there are none."""
         steps = path.diff(dim=1, prepend=start.unsqueeze(1))
         pieces = _pieces(_length(steps).amax(1))
-        inside = self._scene_depth(start) > SURFACE
+        inside = self.inside(start)
         touching = inside.clone()
         for piece in range(_largest(pieces)):
             share = (piece / pieces).clamp(max=1).view(-1, 1, 1, 1)

@@ -29,8 +29,11 @@ from nmpm.transfer.linear import linear_g2p
 MAX_SHIFT = 0.5
 """Cells that a particle moves along an axis at most: an obstacle of one cell cannot be jumped over."""
 
-_SWEEPS = 8  # of the Jacobi iteration: pressure reaches as many cells in a bundle
-_CLOSED = 1e-3  # open share of a cell's faces below which it is solid
+SWEEPS = 8
+"""Of the Jacobi iteration: pressure reaches as many cells in a bundle."""
+
+CLOSED = 1e-3
+"""Open share of a cell's faces below which it is solid."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +75,9 @@ class Crowding:
         """Displacement at the nodes along each axis, D tensors (B, 1, *S), for their excess (B, 1, *S)."""
         faces = self._faces(excess.dtype)
         diagonal = sum((face + _roll(face, 1, axis) for axis, face in enumerate(faces)), start=excess.new_zeros(()))
-        inverse = torch.where(diagonal > _CLOSED, 1 / diagonal.clamp(min=_CLOSED), 0.0)
+        inverse = torch.where(diagonal > CLOSED, 1 / diagonal.clamp(min=CLOSED), 0.0)
         pressure = (inverse * excess).clamp(min=0)
-        for _ in range(_SWEEPS - 1):
+        for _ in range(SWEEPS - 1):
             left = excess
             for axis, flux in enumerate(_fluxes(pressure, faces)):
                 left = left - flux + _roll(flux, 1, axis)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.particles import Particles
 
@@ -27,7 +28,7 @@ def recomputing_unroll(emulator: Emulator, particles: Particles, bundles: int) -
     for _ in range(bundles):
         bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
         yield bundle
-        particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        particles = bundle.state_after(particles)
 
 
 def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,13 +19,17 @@ from torch import Tensor, nn
 from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection
+from nmpm.emulator.bundle import Bundle as Bundle
+from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
+from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
-from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows
+from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows, usable_memory
+from nmpm.emulator.windows.reads import check_reads
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -36,32 +41,6 @@ if TYPE_CHECKING:
 
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
-
-
-@dataclass(frozen=True)
-class Bundle:
-    """The m frames that one call predicts.
-
-    Args:
-        position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
-        velocity: (B, N, D) at the last frame, in length per frame.
-    """
-
-    position: Tensor
-    velocity: Tensor
-
-
-@dataclass(frozen=True)
-class RolloutContext:
-    """What stays the same from bundle to bundle of a rollout, computed once from its first state.
-
-    Args:
-        solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
-        budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
-    """
-
-    solid: Tensor
-    budget: Tensor | None
 
 
 class Emulator(nn.Module):
@@ -93,6 +72,7 @@ class Emulator(nn.Module):
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
             self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
+        self.field_scales = FieldScales(scene)
         column = (1,) * scene.dim
         self.register_buffer("input_mean", torch.zeros(inputs, *column))
         self.register_buffer("input_std", torch.ones(inputs, *column))
@@ -148,6 +128,11 @@ class Emulator(nn.Module):
         """Type of the network's weights, in which it computes unless autocast says otherwise."""
         real = (weight.dtype for weight in self.processor.parameters() if weight.is_floating_point())
         return next(real, self.precision)
+
+    @property
+    def shapes_are_compiled(self) -> bool:
+        """Whether another shape of the state, such as fewer scenes, would cost a compilation."""
+        return self.runtime.fixed_shapes or self.processor._compiled_call_impl is not None
 
     def with_network(self, precision: torch.dtype) -> Emulator:
         """This emulator if its network has weights of this type, else a copy with the network's weights converted.
@@ -220,8 +205,15 @@ class Emulator(nn.Module):
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
-        """What stays the same through a rollout from this state: solids and, if constrained, its energy."""
-        return RolloutContext(self.solid(particles), self.budget(particles))
+        """What stays the same through a rollout from this state: solids and, if constrained, its energy.
+
+        Warns:
+            UserWarning: naming each field that the state lacks.
+        """
+        self.field_scales.warn_of_missing(particles)
+        solid = self.solid(particles)
+        surroundings = steps_for(self, self._plan, particles, solid).survey(solid)
+        return RolloutContext(solid, self.budget(particles), surroundings)
 
     def solid(self, particles: Particles) -> Tensor:
         """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
@@ -261,29 +253,49 @@ class Emulator(nn.Module):
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         own = particles
 
-        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor]:
+        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor, Mapping[str, Tensor]]:
             if coverage is None:
                 output = self.runtime.fields(self.processor, normalised, self.network_precision)
+                if memory is not None:
+                    memory.keep(output)
             else:
                 output = coverage.predict(self.processor, normalised.to(self.network_precision))
             readable = None if coverage is None else coverage.readable
             with _full_precision(device):
-                start = Departure(
-                    cells, velocity, gravity, own.material, own.mask, state, output, self.output_scale, readable
-                )
-                return start, steps.path(start, context)
+                flows, scale = output[:, :, : self._flows], self.output_scale[:, : self._flows]
+                start = Departure(cells, velocity, gravity, own.material, own.mask, state, flows, scale, readable)
+                path = steps.path(start, context)
+                return start, path, self._evolve_fields(own, start, path, output) if self.scene.evolving else {}
 
-        fixed = self.training or self.runtime.fixed_shapes
-        windows = None if fixed else choose_windows(self.windows, self.processor, self.recipe, state)
-        start, path = find_in_windows(windows, find_path)
+        windows = memory = None
+        if not (self.training or self.runtime.fixed_shapes):
+            memory = usable_memory(context.memory, self.windows, self.processor, self.recipe, state)
+            windows = choose_windows(self.windows, self.processor, self.recipe, state, memory)
+        start, path, evolved = find_in_windows(windows, find_path)
         with _full_precision(device):
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
             if self.constraints.density_cap and not self.training:
                 # Spreading is no motion of the material: the velocity is that of the path without it.
-                path = self.advection.uncrowded_path(start, path, context.solid, context.budget)
+                path = steps.uncrowded(start, path, context)
             velocity = self.grid.to_displacement(step.to(precision))
-            return Bundle(steps.to_length(path, precision), velocity)  # the last use of the path's memory
+            return Bundle(steps.to_length(path, precision), velocity, evolved)  # the last use of the path's memory
+
+    def _evolve_fields(
+        self, particles: Particles, start: Departure, path: Tensor, output: Tensor
+    ) -> Mapping[str, Tensor]:
+        """The evolving fields along a path (B, m, N, D) in cells, (B, m, N) by name."""
+        if start.readable is not None:
+            check_reads(start.cells, path, start.mask, start.readable, self.grid)
+        places = torch.cat([start.cells.unsqueeze(1), path[:, :-1]], dim=1)
+        rates = output[:, :, self._flows :].to(self.precision) * self.output_scale[:, self._flows :]
+        gather = partial(self.advection.gather, material=particles.material)
+        return self.field_scales.evolve(particles, places, rates, gather)
+
+    @property
+    def _flows(self) -> int:
+        """Number of the output channels that are velocities."""
+        return len(self.scene.materials) * self.scene.dim
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""

@@ -11,8 +11,9 @@ from enum import Enum
 import torch
 from torch import Tensor
 
+from nmpm.emulator.bundle import Bundle
 from nmpm.emulator.constraints import MOST_GAIN, energy, lowest_potential, mass_shares
-from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.errors import NmpmError
 from nmpm.particles import Particles
@@ -20,7 +21,7 @@ from nmpm.transfer.chunks import can_branch
 
 _CROWDING_EVERY = 16  # bundles: its sum over particles costs as much as all the rest
 _READ_EVERY = 16  # bundles, where reading measures back halts the device
-_AT_WALLS, _CROWDING_LIMIT = "particles at the walls", "crowding limit"
+_AT_WALLS, _CROWDING_LIMIT, _RESTING = "particles at the walls", "crowding limit", "at rest"
 
 
 class Policy(Enum):
@@ -84,6 +85,7 @@ class Monitor:
         incidents: The first of each kind in this rollout.
         peaks: The largest value of each measure in this rollout, by the names that incidents have.
         at_walls: Particles at the scene's bounds or beyond, when crowding was last measured.
+        rest_share: Mean share of the particles that a bundle leaves where they were, as `rest_speed` does.
     """
 
     policy: Policy = Policy.WARN
@@ -93,8 +95,10 @@ class Monitor:
     incidents: list[Incident] = field(default_factory=list)
     peaks: dict[str, float] = field(default_factory=dict)
     at_walls: int = 0
+    rest_share: float = 0.0
     _frames: int = 0
     _bundles: int = 0
+    _judged: int = 0
     _padded: bool = False
     _reference: _Reference | None = None
     _unread: list[tuple[int, dict[str, Tensor]]] = field(default_factory=list)
@@ -102,6 +106,7 @@ class Monitor:
     def start(self, emulator: Emulator, particles: Particles) -> None:
         """Reset, and take a state as the one that a rollout starts from."""
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
+        self.rest_share, self._judged = 0.0, 0
         self._unread = []
         self._padded = not can_branch(particles.mask) or not bool(particles.mask.all())
         if not emulator.scene.gravity_known:
@@ -154,7 +159,9 @@ class Monitor:
         if self._padded:
             moving = moving.masked_fill(~particles.mask.unsqueeze(-1), 0.0)
         # A NaN position makes the last velocity NaN, and with it the largest, so checking that suffices.
-        found = {"speed": moving.abs().amax((1, 2)) / min(emulator.grid.spacing)}
+        held = (bundle.position[:, -1] == particles.position).all(-1) & particles.mask
+        found = {_RESTING: (held.sum(1) / particles.mask.sum(1).clamp(min=1)).to(bundle.velocity)}
+        found |= {"speed": moving.abs().amax((1, 2)) / min(emulator.grid.spacing)}
         if self._reference is not None:
             last, fall = bundle.position[:, -1], particles.gravity.unsqueeze(1)
             now = energy(last, bundle.velocity, fall, self._reference.share)
@@ -176,6 +183,8 @@ class Monitor:
 
     def _judge(self, frame: int, measures: Mapping[str, Tensor]) -> None:
         """Take in the (B,) measures of the bundle that ends with a frame, on the CPU."""
+        self._judged += 1
+        self.rest_share += (float(measures[_RESTING].mean()) - self.rest_share) / self._judged
         speed = measures["speed"]
         if not math.isfinite(float(speed.max())):
             self._note("not finite", frame, (~speed.isfinite()).float(), 0.0)
@@ -204,4 +213,5 @@ class Monitor:
         """What was seen, in a sentence or two."""
         seen = ", ".join(f"{what} {value:.3g}" for what, value in self.peaks.items() if what != "not finite")
         passed = "; ".join(map(str, self.incidents)) or "none"
-        return f"{self._frames} frames; most: {seen}; {self.at_walls} particles at the walls. Limits passed: {passed}."
+        found = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"
+        return f"{self._frames} frames; most: {seen}; {found}. Limits passed: {passed}."

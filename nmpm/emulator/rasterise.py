@@ -7,6 +7,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from nmpm.emulator.fields import FieldScales
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -14,7 +15,14 @@ from nmpm.transfer import Transfer
 
 
 def grid_state(
-    scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, cells: Tensor, velocity: Tensor, solid: Tensor
+    scene: Scene,
+    grid: Grid,
+    transfer: Transfer,
+    particles: Particles,
+    cells: Tensor,
+    velocity: Tensor,
+    solid: Tensor,
+    scales: FieldScales | None = None,
 ) -> Tensor:
     """The grid state in grid units, (B, C_in, *S).
 
@@ -22,10 +30,11 @@ def grid_state(
         scene: Says which channels there are.
         grid: What to rasterise onto.
         transfer: How to.
-        particles: Gives materials, mask and gravity.
+        particles: Gives materials, mask, gravity and fields.
         cells: (B, N, D) positions in cells.
         velocity: (B, N, D) in cells per frame.
         solid: (B, C_solid, *S).
+        scales: Of the scene's fields; needed where it has any.
     """
     membership = _membership(particles, len(scene.materials))
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
@@ -33,9 +42,19 @@ def grid_state(
     volume = count * (scene.particle_volume / grid.cell_volume)
     parts = [mean, volume, solid]
     if scene.gravity_varies:
-        gravity = grid.to_cell_displacement(particles.gravity)
-        parts.append(gravity.reshape(*gravity.shape, *(1,) * grid.dim).expand(-1, -1, *grid.shape))
+        parts.append(_constant(grid.to_cell_displacement(particles.gravity), grid))
+    if scales is not None and scene.particle_fields:
+        values = scales.of_particles(particles)
+        sums, count = transfer.sums(values, membership.to(values.dtype), cells, grid)
+        parts.append(sums / _positive(count).repeat_interleave(values.shape[-1], dim=1))
+    if scales is not None and scene.parameters:
+        parts.append(_constant(scales.of_scene(particles), grid))
     return torch.cat(parts, dim=1)
+
+
+def _constant(values: Tensor, grid: Grid) -> Tensor:
+    """(B, C) values on all of the grid, (B, C, *S)."""
+    return values.reshape(*values.shape, *(1,) * grid.dim).expand(-1, -1, *grid.shape)
 
 
 def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, walls: Tensor) -> Tensor:

@@ -86,12 +86,13 @@ class EmulatorRecipe:
 
         Args:
             scene: Other bounds and domain, finer or coarser particles, perhaps obstacles where there were walls
-                already; all else must be the same.
+                already; all else must be the same. Its fields are the emulator's, whatever the scene has.
 
         Raises:
             ConfigError: if channels, time step or gravity differ, the domain is not a whole number of cells, or the
                 processor cannot take the grid.
         """
+        scene = scene.with_fields_of(self.scene)
         for name in ("input_channels", "dt", "boundary", "gravity"):
             if getattr(scene, name) != getattr(self.scene, name):
                 raise ConfigError(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from nmpm.emulator.model import Bundle, Emulator
+from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.windows import Memory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -18,8 +22,8 @@ from nmpm.transfer.chunks import can_branch
 def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
-    Once a bundle ends in exactly the state that it started from, as a scene at rest does, all further ones would be the
-    same: it is yielded again without a call. Only on a CPU, as comparing states elsewhere would halt the device.
+    Once a scene's bundle ends in exactly the state that it started from, as at rest, all further ones would be the
+    same: it is repeated without a call. Only on a CPU, as comparing states elsewhere would halt the device.
 
     Args:
         emulator: Predicts m frames a call.
@@ -29,26 +33,70 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     """
     if monitor is not None:
         monitor.start(emulator, particles)
-    context = emulator.context(particles)
-    repeated: Bundle | None = None
+    calls = _Calls(emulator, particles)
     for remaining in reversed(range(bundles)):
-        bundle = emulator(particles, context) if repeated is None else repeated
+        bundle = calls.predict(particles)
         if monitor is not None:
             monitor.see(emulator, particles, bundle)
             if not remaining:
                 monitor.read()
         yield bundle
-        after = particles.with_motion(bundle.position[:, -1], bundle.velocity)
-        if repeated is None and not emulator.training and _is_same_motion(particles, after):
-            repeated = bundle
+        after = bundle.state_after(particles)
+        calls.let_sleep(particles, after)
         particles = after
 
 
-def _is_same_motion(before: Particles, after: Particles) -> bool:
-    """Whether two states have the same positions and velocities, to the bit; False where asking would cost."""
-    if not can_branch(after.position) or after.position.requires_grad:
+class _Calls:
+    """The calls of a rollout, of the scenes that are not at rest.
+
+    Args:
+        emulator: Predicts m frames a call.
+        particles: The state to start from.
+    """
+
+    def __init__(self, emulator: Emulator, particles: Particles) -> None:
+        context = emulator.context(particles)
+        self._emulator, self._count = emulator, len(particles.position)
+        self._context = self._own = context if emulator.training else dataclasses.replace(context, memory=Memory())
+        self._awake, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
+
+    def predict(self, particles: Particles) -> Bundle:
+        """The next bundle of all scenes."""
+        if len(self._awake) == self._count:
+            self._last = self._emulator(particles, self._own)
+        elif self._awake:
+            moving = self._emulator(particles.scenes(self._awake), self._own)
+            fields = {name: self._put(values, moving.fields[name]) for name, values in self._last.fields.items()}
+            position = self._put(self._last.position, moving.position)
+            self._last = Bundle(position, self._put(self._last.velocity, moving.velocity), fields)
+        return self._last
+
+    def _put(self, values: Tensor, moving: Tensor) -> Tensor:
+        """Values (B, …) with those of the scenes that are awake replaced."""
+        values = values.clone()
+        values[self._awake] = moving
+        return values
+
+    def let_sleep(self, before: Particles, after: Particles) -> None:
+        """Leave scenes out of further calls that the last one left as they were, to the bit.
+
+        All or none where another number of scenes would be compiled anew.
+        """
+        if self._emulator.training or not can_branch(after.position) or after.position.requires_grad:
+            return
+        awake = [scene for scene in self._awake if not _is_same_state(before, after, scene)]
+        if len(awake) == len(self._awake) or (awake and self._emulator.shapes_are_compiled):
+            return
+        self._awake, self._own = awake, self._context.scenes(awake)
+
+
+def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
+    """Whether a scene has the same motion and fields in two states, to the bit."""
+    pairs = [(before.velocity, after.velocity), (before.position, after.position)]
+    if any(name not in before.fields for name in after.fields):
         return False
-    return torch.equal(before.velocity, after.velocity) and torch.equal(before.position, after.position)
+    pairs += [(before.fields[name], values) for name, values in after.fields.items()]
+    return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:
@@ -64,7 +112,10 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
         DataError: naming the weight or statistic; or scene, particle and value.
     """
     real = particles.mask
-    states = {name: ~getattr(particles, name).isfinite().all(-1) & real for name in ("position", "velocity")}
+    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
+    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
+    given = {name: values.expand(*real.shape, -1) for name, values in (vectors | numbers).items()}
+    states = {name: ~values.isfinite().all(-1) & real for name, values in given.items()}
     beyond = beyond_walls(emulator.scene, particles.position) & real
     weights = emulator.state_dict()
     unsound = [~values.isfinite().all() for values in weights.values()]
@@ -79,7 +130,7 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
             scene, particle = map(int, bad.nonzero()[0])
             raise DataError(
                 f"Scene {scene} of the batch, particle {particle}: its {name} is"
-                f" {getattr(particles, name)[scene, particle].tolist()}; it must be finite."
+                f" {given[name][scene, particle].tolist()}; it must be finite."
             )
     scene, particle = map(int, beyond.nonzero()[0])
     raise DataError(
@@ -97,11 +148,49 @@ def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
     return torch.stack(sides).any(0)
 
 
+class Rollout(NamedTuple):
+    """Predicted frames.
+
+    Args:
+        position: (B, T, N, D) in domain length.
+        fields: (B, T, N) of each evolving field, by name, in its own unit.
+    """
+
+    position: Tensor
+    fields: Mapping[str, Tensor]
+
+    @classmethod
+    def join(cls, parts: Sequence[Rollout]) -> Rollout:
+        """Consecutive parts, at least one, as one."""
+        names = parts[0].fields
+        fields = {name: torch.cat([part.fields[name] for part in parts], dim=1) for name in names}
+        return cls(torch.cat([part.position for part in parts], dim=1), fields)
+
+    def cpu(self) -> Rollout:
+        """The same on the CPU."""
+        return Rollout(self.position.cpu(), {name: values.cpu() for name, values in self.fields.items()})
+
+
 def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Iterator[Tensor]:
-    """Predict `frames` frames without gradients, yielding each bundle as it is made.
+    """Predict `frames` frames without gradients, yielding each bundle's positions as it is made.
 
     Yields:
         (B, <= m, N, D) positions in domain length; the last bundle is cut to the frames asked for.
+
+    Raises:
+        As `stream_rollout`.
+    """
+    for part in stream_rollout(emulator, particles, frames, monitor):
+        yield part.position
+
+
+def stream_rollout(
+    emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None
+) -> Iterator[Rollout]:
+    """Predict `frames` frames of positions and evolving fields without gradients, yielding each bundle as it is made.
+
+    Yields:
+        Up to m frames; the last bundle is cut to the frames asked for.
 
     Raises:
         ValueError: if `frames` is negative.
@@ -115,9 +204,12 @@ def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monit
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode
-            position = next(bundles).position[:, : frames - made]
-        made += position.shape[1]
-        yield position
+            bundle = next(bundles)
+        kept = slice(frames - made)
+        fields = {name: values[:, kept] for name, values in bundle.fields.items()}
+        part = Rollout(bundle.position[:, kept], fields)
+        made += part.position.shape[1]
+        yield part
 
 
 def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Tensor:
@@ -127,11 +219,22 @@ def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Moni
         (B, frames, N, D) positions in domain length.
 
     Raises:
+        As `predict_rollout`.
+    """
+    return predict_rollout(emulator, particles, frames, monitor).position
+
+
+def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Rollout:
+    """Predict `frames` frames of positions and evolving fields without gradients.
+
+    Raises:
         ValueError: if `frames` is negative.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
     """
-    bundles = list(stream(emulator, particles, frames, monitor))
-    if not bundles:
-        return particles.position.new_zeros(particles.position.shape[0], 0, *particles.position.shape[1:])
-    return torch.cat(bundles, dim=1)
+    parts = list(stream_rollout(emulator, particles, frames, monitor))
+    if parts:
+        return Rollout.join(parts)
+    batch, *rest = particles.position.shape
+    none = particles.position.new_zeros(batch, 0, *rest)
+    return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))

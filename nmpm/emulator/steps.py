@@ -20,11 +20,17 @@ from nmpm.particles import Particles
 from nmpm.transfer.backends import kernels_take
 
 if TYPE_CHECKING:
-    from nmpm.emulator.model import Emulator, RolloutContext
+    from nmpm.emulator.bundle import RolloutContext
+    from nmpm.emulator.fused.surroundings import Surroundings
+    from nmpm.emulator.model import Emulator
 
 
 class Steps(ABC):
     """What a call does before and after the network."""
+
+    def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
+        """What these steps prepare for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
+        return None
 
     @abstractmethod
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -47,6 +53,10 @@ class Steps(ABC):
         """
 
     @abstractmethod
+    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+        """The path (B, m, N, D) with its overfull cells spread, see `Advection.uncrowded_path`."""
+
+    @abstractmethod
     def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
         """The path in domain length and of this type.
 
@@ -65,7 +75,7 @@ class TensorSteps(Steps):
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         own = self.emulator
         cells, velocity, gravity = own.in_cells(particles)
-        state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid)
+        state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid, own.field_scales)
         return cells, velocity, gravity, state
 
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
@@ -73,6 +83,9 @@ class TensorSteps(Steps):
         if self.emulator.training:
             return advection.free_path(start)
         return advection.constrained_path(start, context.solid, context.budget)
+
+    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+        return self.emulator.advection.uncrowded_path(start, path, context.solid, context.budget)
 
     def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
         return self.emulator.grid.to_length(path.to(precision))
@@ -90,6 +103,12 @@ class FusedSteps(Steps):
     plan: Plan
     walls: Tensor
 
+    def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
+        if torch.compiler.is_compiling() or not (self.plan.obstacles or self.plan.density_cap):
+            return None
+        found: tuple[Surroundings, ...] = _kernels().survey_rollout(self.plan, solid, self.walls)
+        return found
+
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         own = particles
         cells, velocity, gravity, state = _kernels().rasterise(
@@ -98,12 +117,20 @@ class FusedSteps(Steps):
         return cells, velocity, gravity, state
 
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
-        windows = () if start.readable is None else (start.readable,)  # never in traced graphs
+        known = () if torch.compiler.is_compiling() else (start.readable, context.surroundings)
         path: Tensor = _kernels().predict_path(
             self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
-            start.output, start.scale, context.solid, self.walls, context.budget, *windows,
+            start.output, start.scale, context.solid, self.walls, context.budget, *known,
         )  # fmt: skip
         return path
+
+    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+        known = () if torch.compiler.is_compiling() else (context.surroundings,)
+        spread: Tensor = _kernels().uncrowd(
+            self.plan, start.cells, start.gravity, start.material, start.mask, path, context.solid, self.walls,
+            context.budget, *known,
+        )  # fmt: skip
+        return spread
 
     def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:  # noqa: ARG002 (float32, as the path)
         positions: Tensor = _kernels().to_length(self.plan, path)

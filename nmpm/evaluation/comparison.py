@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall, still
-from nmpm.metrics import MSE, RolloutMetric
+from nmpm.metrics import MSE, FieldMSE, RolloutMetric
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
@@ -31,6 +31,7 @@ class Comparison(nn.Module):
         if sum(isinstance(metric, MSE) for metric in metrics) != 1:
             raise ConfigError("model.metrics needs nmpm.metrics.MSE once: the best checkpoint is chosen by it.")
         self.scene = scene
+        self.field_errors = FieldMSE(scene.evolving)
         self.metrics = nn.ModuleDict(
             {
                 kind: nn.ModuleList(metric.clone() for metric in metrics if kind == "model" or metric.compared)
@@ -43,8 +44,15 @@ class Comparison(nn.Module):
         """The squared errors of each of `PREDICTORS`."""
         return {kind: next(metric for metric in own if isinstance(metric, MSE)) for kind, own in self._by_predictor()}
 
-    def update(self, window: Window, predicted: Tensor) -> None:
-        """Add whole trajectories and the model's rollouts of them, (B, T - 2, N, D)."""
+    def update(self, window: Window, predicted: Tensor, fields: Mapping[str, Tensor] | None = None) -> None:
+        """Add whole trajectories and the model's rollouts of them.
+
+        Args:
+            window: The trajectories, of T frames.
+            predicted: (B, T - 2, N, D) positions.
+            fields: (B, T - 2, N) evolving fields by name.
+        """
+        self.field_errors.update(window, fields or {})
         frames = window.target.shape[1]
         rollouts = {
             "model": predicted,
@@ -57,13 +65,17 @@ class Comparison(nn.Module):
 
     def reset(self) -> None:
         """Forget everything added."""
+        self.field_errors.reset()
         for _, own in self._by_predictor():
             for metric in own:
                 metric.reset()
 
     def compute(self) -> dict[str, Tensor]:
-        """Means over trajectories: "mse", "mse@8", … of the model, "still/mse", … of the trivial predictors."""
-        return {
+        """Means over trajectories: "mse", "mse@8", … of the model, "still/mse", … of the trivial predictors.
+
+        Errors of fields, "mse_temperature", stand beside that of nothing changing, "still/mse_temperature".
+        """
+        return self.field_errors.compute() | {
             name if kind == "model" else f"{kind}/{name}": value
             for kind, own in self._by_predictor()
             for metric in own

@@ -1,4 +1,5 @@
-"""Training losses: the squared error of positions, and beside it that of the density that they make on the grid.
+"""Training losses: the squared error of positions, and beside it those of the density that they make on the grid and
+of the fields that particles carry.
 
 Position errors may be tempered: those of each window and bundle raised to a power below 1, so that splashes, whose
 errors nothing can reduce much, do not drown what can be learnt elsewhere.
@@ -6,6 +7,7 @@ errors nothing can reduce much, do not drown what can be learnt elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -54,6 +56,47 @@ class TrainingError:
         if not self.density_weight:
             return error
         return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
+
+
+@dataclass(frozen=True)
+class FieldError:
+    """The error of the fields that evolve, such as a temperature, in units of their spread in the training data.
+
+    Args:
+        weight: Beside the position error in cells²; 0 for none.
+        power: As for position errors, see `TrainingError`.
+    """
+
+    weight: float = 1.0
+    power: float = 1.0
+
+    def __call__(
+        self, predicted: Mapping[str, Tensor], window: Window, spread: Mapping[str, Tensor], frames: int
+    ) -> Tensor | float:
+        """The weighted error (), a mean over particles, summed over fields; 0 without fields.
+
+        Args:
+            predicted: (B, K m, N) by name, m frames to a bundle. Those that the window lacks are left out.
+            window: The truth.
+            spread: () of each field.
+            frames: m.
+        """
+        if not self.weight:
+            return 0.0
+        total: Tensor | float = 0.0
+        for name, values in predicted.items():
+            if name in window.fields:
+                target = window.field_target(name)[:, : values.shape[1]]
+                errors = field_errors((values - target) / spread[name], window.mask, frames)
+                total = total + tempered_error(errors, window.mask, self.power)
+        return self.weight * total
+
+
+def field_errors(difference: Tensor, mask: Tensor, frames: int) -> Tensor:
+    """Mean squared difference (B, T, N) of each of B windows and of each bundle of `frames` frames, (B, T / frames)."""
+    squared = difference.square() * mask.unsqueeze(1)
+    bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
+    return bundles.mean(-1) / mask.sum(1, keepdim=True)
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:

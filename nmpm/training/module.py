@@ -18,9 +18,10 @@ from torch import Tensor
 from nmpm._support.collectives import global_mean, normal_like, rank_slice
 from nmpm._support.digests import weights_digest
 from nmpm._support.specs import class_path
-from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, rollout, unroll
+from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Rollout, predict_rollout, unroll
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
+from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.gradients import recomputing_unroll
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
@@ -30,7 +31,7 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirror_windows
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.losses import TrainingError
+from nmpm.training.losses import FieldError, TrainingError
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
 from nmpm.training.parts import (
     adopt_optimizer_arguments,
@@ -54,8 +55,11 @@ class EmulatorModule(LightningModule):
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error; 0 for none.
+        field_weight: Weight of the error of evolving fields, such as a temperature, in units of their spread; 0 for
+            none.
         error_power: Power, in (0, 1], to which the position error, in cells², of each window and bundle is raised
-            before the mean. At 0.5, calm windows and early bundles weigh as much as splashes; at 1, mean squares.
+            before the mean, as are those of fields. At 0.5, calm windows and early bundles weigh as much as splashes;
+            at 1, mean squares.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
@@ -75,6 +79,7 @@ class EmulatorModule(LightningModule):
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         density_weight: float = 4.0,
+        field_weight: float = 1.0,
         error_power: float = 0.5,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
@@ -94,6 +99,7 @@ class EmulatorModule(LightningModule):
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
         self.error = TrainingError(density_weight, error_power)
+        self.field_error = FieldError(field_weight, error_power)
         self.position_noise, self.mirror = position_noise, tuple(mirror)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
@@ -104,6 +110,7 @@ class EmulatorModule(LightningModule):
             "unroll_growth": unroll_growth,
             "schedule": dataclasses.asdict(self.schedule),
             "density_weight": density_weight,
+            "field_weight": field_weight,
             "error_power": error_power,
             "position_noise": position_noise,
             "mirror": list(mirror),
@@ -139,10 +146,14 @@ class EmulatorModule(LightningModule):
 
         Raises:
             ConfigError: naming the facts in which they differ.
+
+        Warns:
+            UserWarning: naming the fields that the model was trained without.
         """
         scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
         if isinstance(scene, Scene):
             check_same_scene(self.emulator.scene, scene)
+            warn_of_ignored(self.emulator.scene, scene.fields)
 
     def on_fit_start(self) -> None:
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
@@ -211,28 +222,35 @@ class EmulatorModule(LightningModule):
             draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
             batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
         bundles = self._unroll(self._add_position_noise(batch.initial), self.bundles(self._progress()))
-        error = self._error(torch.cat([bundle.position for bundle in bundles], dim=1), batch)
+        error = self._error(Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles]), batch)
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged)
         return loss
 
-    def _error(self, predicted: Tensor, batch: Window) -> Tensor:
-        """The error of predicted positions (B, K m, N, D), in float32 whatever autocast says."""
+    def _error(self, predicted: Rollout, batch: Window) -> Tensor:
+        """The error of K m predicted frames, in float32 whatever autocast says."""
         emulator = self.emulator
-        with torch.autocast(predicted.device.type, enabled=False):
-            return self.error(predicted, batch, emulator.scene, emulator.grid, emulator.frames)
+        with torch.autocast(predicted.position.device.type, enabled=False):
+            error = self.error(predicted.position, batch, emulator.scene, emulator.grid, emulator.frames)
+            spread = emulator.field_scales.spread
+            return error + self.field_error(predicted.fields, batch, spread, emulator.frames)
 
-    def validation_step(self, batch: Window, batch_idx: int) -> None:
-        self.valid_errors.update(batch, self.predict_step(batch, batch_idx))
+    def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
+        predicted = self._predict(batch)
+        self.valid_errors.update(batch, predicted.position, predicted.fields)
 
-    def test_step(self, batch: Window, batch_idx: int) -> Tensor:
-        predicted = self.predict_step(batch, batch_idx)
-        self.test_errors.update(batch, predicted)
-        return predicted
+    def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        predicted = self._predict(batch)
+        self.test_errors.update(batch, predicted.position, predicted.fields)
+        return predicted.position
 
-    def predict_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
-        """(B, T - 2, N, D) predicted positions."""
-        return rollout(self.emulator, batch.initial, batch.target.shape[1])
+    def predict_step(self, batch: Window, batch_idx: int) -> Tensor | Rollout:  # noqa: ARG002
+        """(B, T - 2, N, D) predicted positions; with the fields where the scene has any that evolve."""
+        predicted = self._predict(batch)
+        return predicted if predicted.fields else predicted.position
+
+    def _predict(self, batch: Window) -> Rollout:
+        return predict_rollout(self.emulator, batch.initial, batch.target.shape[1])
 
     def on_validation_epoch_start(self) -> None:
         self.valid_errors.reset()

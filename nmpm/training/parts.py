@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from torch.optim import Optimizer
@@ -54,6 +54,12 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], mine: EmulatorRecipe)
     names = {field.name for field in dataclasses.fields(EmulatorRecipe)}
     stored = EmulatorRecipe.from_dict({name: value for name, value in hyper_parameters.items() if name in names})
     check_same_scene(stored.scene, mine.scene)
+    if stored.scene.output_channels != mine.scene.output_channels or stored.scene.fields != mine.scene.fields:
+        raise ConfigError(
+            f"The checkpoint was trained with the fields {_listed(stored.scene.fields)}, the model has"
+            f" {_listed(mine.scene.fields)}. Declare the same (data.fields); nmpm test, predict and rollout run it on"
+            " scenes with more or fewer."
+        )
     theirs, ours = stored.to_dict(), mine.to_dict()
     found = [
         f"{name} = {old}, not {new}"
@@ -133,6 +139,10 @@ def adopt_optimizer_arguments(checkpoint: Mapping[str, Any], optimizer: Optimize
         if rates and len(schedule.get("base_lrs", ())) == len(rates):
             schedule["base_lrs"] = rates
     return list(changed)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
 
 
 def _differences(theirs: Any, mine: Any, name: str) -> Iterator[tuple[str, Any, Any]]:

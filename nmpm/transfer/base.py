@@ -68,10 +68,18 @@ class Transfer(ABC):
         Returns:
             (B, M D, *S) momentum, all axes of a material together, and (B, M, *S) numbers.
         """
-        momentum = (membership.unsqueeze(-1) * velocity.unsqueeze(-2)).flatten(-2)
-        sums = self.p2g(torch.cat([momentum, membership], dim=-1), cells, grid)
-        momentum, count = sums.split([momentum.shape[-1], membership.shape[-1]], dim=1)
-        return momentum, count
+        return self.sums(velocity, membership, cells, grid)
+
+    def sums(self, values: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Sums of any values (B, N, V), and the number of particles, of each material on the nodes, as `momentum`.
+
+        Returns:
+            (B, M V, *S) sums, all values of a material together, and (B, M, *S) numbers.
+        """
+        own = (membership.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
+        sums = self.p2g(torch.cat([own, membership], dim=-1), cells, grid)
+        summed, count = sums.split([own.shape[-1], membership.shape[-1]], dim=1)
+        return summed, count
 
     def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Interpolate a grid field (B, C, *S) at `cells` (B, N, D), (B, N, C)."""

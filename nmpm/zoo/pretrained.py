@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, Windows, differentiable_rollout, rollout
+from nmpm.emulator import Emulator, Rollout, Windows, differentiable_rollout, predict_rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -73,6 +73,7 @@ class Pretrained:
         obstacle: ArrayLike | Tensor | None = None,
         gravity: ArrayLike | Tensor | None = None,
         dtype: torch.dtype = torch.float32,
+        fields: Mapping[str, ArrayLike | Tensor] | None = None,
     ) -> Particles:
         """A state to start a rollout from, of N particles in each of B scenes, in D dimensions.
 
@@ -85,6 +86,8 @@ class Pretrained:
             gravity: (D,) or (B, D), in domain length per second squared. Needed where gravity varies; elsewhere it may
                 be left out, and otherwise must be the scene's.
             dtype: Of positions, velocities and gravity; float64 for domains far from the origin.
+            fields: Of `scene.fields`, by name: a number for all particles, (N,) or (B, N); (B,) of those that each
+                scene has one of. One that is left out has its mean over the training data.
 
         Returns:
             The state on the model's device, with velocities and gravity converted to frames.
@@ -94,10 +97,11 @@ class Pretrained:
                 faster than the model was calibrated for, a material is unknown, or gravity is not the model's.
 
         Warns:
-            UserWarning: if the velocities look as if they were per frame.
+            UserWarning: if the velocities look as if they were per frame, or particles start inside an obstacle; naming
+                fields that the model does not have.
         """
         builder = StateBuilder(self.emulator, position, dtype)
-        return builder.build(velocity, material, obstacle, gravity).to(self.emulator.device)
+        return builder.build(velocity, material, obstacle, gravity, fields).to(self.emulator.device)
 
     def example(self, seed: int = 0, count: int = 1000, blocks: int = 1) -> Particles:
         """A state to start from: blocks of particles thrown into the scene's box.
@@ -127,6 +131,19 @@ class Pretrained:
         if precision not in NETWORK_PRECISIONS:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
+
+    def over(self, scene: Scene) -> Pretrained:
+        """The same weights for other scenes, on a grid over their domain with cells of the size of this model's.
+
+        Args:
+            scene: With another domain, bounds or obstacles, or other particles' volume, such as
+                `dataclasses.replace(model.scene, bounds=…, domain=…)`. Materials, gravity, time step and kinds of
+                boundary must be this model's.
+
+        Raises:
+            ConfigError: if one of them is not, or the domain is not a whole number of cells.
+        """
+        return dataclasses.replace(self, emulator=self.emulator.over(scene))
 
     def with_windows(self, windows: Windows | None) -> Pretrained:
         """The same model with other limits for windows around the particles; None: always the whole grid."""
@@ -182,7 +199,11 @@ class Pretrained:
         Returns:
             (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
         """
-        return rollout(self.emulator, state.to(self.emulator.device), frames)
+        return self.predict(state, frames).position
+
+    def predict(self, state: Particles, frames: int) -> Rollout:
+        """As `rollout`, with the evolving fields of the particles, such as a temperature, beside their positions."""
+        return predict_rollout(self.emulator, state.to(self.emulator.device), frames)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
         """Predict with gradients to the state, see `nmpm.emulator.differentiable_rollout`.

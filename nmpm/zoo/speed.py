@@ -46,9 +46,8 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
 
 
 def _repeated(state: Particles, batch: int) -> Particles:
-    return Particles(
-        **{name: value.expand(batch, *value.shape[1:]).contiguous() for name, value in vars(state).items()}
-    )
+    """One scene, batch times."""
+    return state.map(lambda values: values.expand(batch, *values.shape[1:]).contiguous())
 
 
 def _milliseconds(model: Pretrained, state: Particles) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor
 
 from nmpm._support.messages import one_line, suggestion
+from nmpm.emulator.contact import Contact, obstacle_share
+from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.errors import DataError
@@ -45,7 +48,9 @@ class StateBuilder:
         self.position = found.reshape(-1, *found.shape[-2:])
         self.batch, self.count = self.position.shape[:2]
 
-    def build(self, velocity: Any, material: Any, obstacle: Any, gravity: Any) -> Particles:
+    def build(
+        self, velocity: Any, material: Any, obstacle: Any, gravity: Any, fields: Mapping[str, Any] | None = None
+    ) -> Particles:
         """The state, with velocities and gravity converted to frames.
 
         Raises:
@@ -61,10 +66,25 @@ class StateBuilder:
             obstacle=solid.to(self.dtype),
             obstacle_mask=torch.ones(solid.shape[:2], dtype=torch.bool, device=solid.device),
             gravity=(self._gravity(gravity) * dt**2).to(self.dtype),
+            fields=self._fields(fields or {}),
         )
         check_inputs(self.emulator, state)
         self._check_speeds(speed, kind)
+        self._check_obstacles(state)
         return state
+
+    def _fields(self, given: Mapping[str, Any]) -> dict[str, Tensor]:
+        """The fields of the scene, (B, N) or (B, 1)."""
+        warn_of_ignored(self.scene, given)
+        found: dict[str, Tensor] = {}
+        for name in (name for name in self.scene.fields if name in given):
+            count = 1 if name in self.scene.parameters else self.count
+            values = _numbers(name, given[name])
+            if count == 1 and tuple(values.shape) == (self.batch,):
+                values = values.unsqueeze(1)
+            shape = (self.batch, count)
+            found[name] = self._expand(name, values, [(), shape[1:], shape], shape).to(self.dtype)
+        return found
 
     def _velocity(self, given: Any) -> Tensor:
         shape = (self.batch, self.count, self.scene.dim)
@@ -174,6 +194,23 @@ class StateBuilder:
             warnings.warn(
                 f"{particle_is}, is very slow beside {limit}, up to which the model was calibrated. Velocities are in"
                 f" domain length per second; if yours are per frame, divide them by dt = {self.scene.dt:g} s.",
+                stacklevel=4,
+            )
+
+    def _check_obstacles(self, state: Particles) -> None:
+        """Warn of particles that start inside an obstacle, where recorded ones never are."""
+        if not state.obstacle.shape[1]:
+            return
+        with torch.no_grad():
+            own = state.to(self.emulator.device)
+            share = obstacle_share(self.emulator.solid(own), self.emulator.walls)
+            inside = Contact(share, self.emulator.grid).inside(self.emulator.in_cells(own)[0]).cpu()
+        if inside.any():
+            scene, particle = map(int, inside.nonzero()[0])
+            warnings.warn(
+                f"Scene {scene}: {int(inside[scene].sum())} of {self.count} particles start inside an obstacle, the"
+                f" first of them particle {particle} at {_format(self.position[scene, particle])}. The model was not"
+                " trained for that, and they may hold up the rest: move them or the obstacle.",
                 stacklevel=4,
             )
 

@@ -18,7 +18,7 @@ from nmpm.cli import main
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
-from nmpm.zoo import Zoo
+from nmpm.zoo import Zoo, publish
 
 TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']
 SLOW = ("dambreak2d.yaml", "waterdrop3d.yaml", "wbcsph.yaml")
@@ -42,9 +42,12 @@ def elsewhere(home, tmp_path, monkeypatch):
 
 
 def source(config: str, make_dataset) -> list[str]:
-    if yaml.safe_load(find_config(config).read_text())["data"].get("name"):
+    data = yaml.safe_load(find_config(config).read_text())["data"]
+    if data.get("name"):
         return TINY_GOOP
-    return ["--data.path", str(make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),)))]
+    fields = tuple(data.get("fields", ()))
+    made = make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),), statics=2 * len(fields), fields=fields)
+    return ["--data.path", str(made)]
 
 
 @pytest.mark.parametrize(
@@ -298,3 +301,25 @@ def test_a_diverged_run_stops_with_the_reason_and_keeps_the_last_good_checkpoint
         saved = torch.load(path, weights_only=True)
         assert all(value.isfinite().all() for value in saved["state_dict"].values())
         assert str(path) in said
+
+
+def test_a_model_of_a_field_is_tested_on_data_without_it(make_dataset):
+    words = ["--config", "heatedchannel.yaml", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"]
+    data = source("heatedchannel.yaml", make_dataset)
+    tiny = ["--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"]
+    assert main(["fit", *words, *tiny, *data]) == 0
+    report = json.loads(Path("runs/heatedchannel/report.json").read_text())
+    assert {"mse_temperature", "still/mse_temperature"} <= set(report["test"])
+    with pytest.warns(UserWarning, match="The scene has no temperature"):
+        assert main(["test", *words, *data, "--data.fields", "[]", "--ckpt_path", "best"]) == 0
+    assert "mse_temperature" not in json.loads(Path("runs/heatedchannel/report.json").read_text())["test"]
+    assert main(["predict", *words, *data, "--ckpt_path", "best"]) == 0
+    predicted = Split(Path("runs/heatedchannel/predictions.h5"))
+    assert predicted.fields(0)["temperature"].shape == (40, 11)
+    model, test = "runs/heatedchannel", str(Path(data[1]) / "test.h5")
+    assert main(["rollout", model, "--data", test, "--frames", "5", "--out", "out.h5"]) == 0
+    assert Split(Path("out.h5")).fields(0)["temperature"].shape == (7, 11)
+    assert Split(Path("out.h5")).read(0).position.shape == (7, 11, 2)
+    publish.add(Path(model), "hot", root="zoo")
+    entry = Zoo.load("hot", root="zoo")
+    assert entry.predict(entry.example(count=4), 3).fields["temperature"].shape == (1, 3, 4)

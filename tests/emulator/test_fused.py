@@ -63,6 +63,7 @@ def predict_both(emulator, particles):
     decoder=st.sampled_from([Absolute(), Residual(), Flip(), Blend(0.8), Acceleration()]),
     bounds=st.sampled_from(["stop", "reflect"]),
     energy=st.booleans(),
+    cap=st.sampled_from([0.0, 0.3, 2.0]),
     rest=st.sampled_from([0.0, 0.05]),
     speed=st.sampled_from([0.0, 0.002, 0.05]),
     scale=st.sampled_from([0.1, 1.0, 5.0]),
@@ -73,10 +74,10 @@ def predict_both(emulator, particles):
 )
 @settings(max_examples=60, deadline=None)
 def test_a_bundle_is_that_of_tensor_operations(
-    dim, walls, materials, transfer, decoder, bounds, energy, rest, speed, scale, count, batch, slim, seed
+    dim, walls, materials, transfer, decoder, bounds, energy, cap, rest, speed, scale, count, batch, slim, seed
 ):
     scene = scene_of(dim, walls, materials, slim=slim and walls[0])
-    constraints = Constraints(energy=energy, rest_speed=rest, bounds=bounds)
+    constraints = Constraints(energy=energy, rest_speed=rest, bounds=bounds, density_cap=cap)
     emulator = emulator_of(scene, scale=scale, seed=seed, transfer=transfer, decoder=decoder, constraints=constraints)
     particles = cloud(scene, count, batch, speed, seed)
     if batch > 1 and count:
@@ -87,14 +88,55 @@ def test_a_bundle_is_that_of_tensor_operations(
     assert different.float().mean() <= 0.02 if count > 1 else not different.any() or rest or energy
 
 
-@given(seed=st.integers(0, 1000), dim=st.integers(2, 3), speed=st.sampled_from([0.002, 0.03, 0.3]), many=st.booleans())
+@given(
+    seed=st.integers(0, 1000),
+    dim=st.integers(2, 3),
+    speed=st.sampled_from([0.002, 0.03, 0.3]),
+    many=st.booleans(),
+    cap=st.booleans(),
+)
 @settings(max_examples=25, deadline=None)
-def test_contact_is_that_of_tensor_operations(seed, dim, speed, many):
+def test_contact_is_that_of_tensor_operations(seed, dim, speed, many, cap):
     scene = scene_of(dim, [True] * 3, 1, obstacles=True)
-    emulator = emulator_of(scene, seed=seed, constraints=Constraints(energy=many, rest_speed=0.01 * many))
+    constraints = Constraints(energy=many, rest_speed=0.01 * many, density_cap=0.3 * cap)
+    emulator = emulator_of(scene, seed=seed, constraints=constraints)
     fused, tensors = predict_both(emulator, cloud(scene, 300, 2, speed, seed, statics=30 if many else 5))
     different = ((fused - tensors).abs() > LIMIT).any(-1).any(0)
     assert different.float().mean() <= 0.02
+
+
+@given(
+    seed=st.integers(0, 1000),
+    walls=st.lists(st.booleans(), min_size=3, max_size=3),
+    dim=st.integers(2, 3),
+    obstacles=st.booleans(),
+    width=st.sampled_from([0.02, 0.15]),
+)
+@settings(max_examples=20, deadline=None)
+def test_crowds_spread_as_with_tensor_operations(seed, walls, dim, obstacles, width):
+    scene = scene_of(dim, walls, 2, obstacles=obstacles, slim=walls[0])
+    emulator = emulator_of(scene, scale=0.01, seed=seed, constraints=Constraints(density_cap=0.8 if dim == 2 else 0.02))
+    particles = cloud(scene, 600, 2, 0.0, seed, statics=5 if obstacles else 0)
+    middle = torch.tensor([sum(ends) / 2 for ends in scene.bounds])
+    particles.position[0] = middle + width * (particles.position[0] - middle)
+    particles.mask[0, 500:] = False
+    fused, tensors = predict_both(emulator, particles)
+    moved = fused[0] - predict_both(emulator.unconstrained(), particles)[0][0]
+    assert moved[0, :500].abs().max() > 10 * LIMIT
+    different = ((fused - tensors).abs() > LIMIT).any(-1).any(0)
+    assert different.float().mean() <= 0.002
+
+
+@given(seed=st.integers(0, 1000), dim=st.integers(2, 3), wall=st.booleans(), speed=st.sampled_from([0.01, 0.1, 3.0]))
+@settings(max_examples=20, deadline=None)
+def test_particles_far_from_obstacles_need_no_contact_to_the_bit(seed, dim, wall, speed):
+    scene = scene_of(dim, [wall] * 3, 1, obstacles=True)
+    emulator, particles = emulator_of(scene, seed=seed), cloud(scene, 300, 2, speed, seed, statics=3)
+    with torch.no_grad():
+        context = emulator.context(particles)
+        unprepared = dataclasses.replace(context, surroundings=None)
+        assert context.surroundings[0].clearance.max() > 1
+        assert torch.equal(emulator(particles, context).position, emulator(particles, unprepared).position)
 
 
 def test_rollouts_are_those_of_tensor_operations():
@@ -216,13 +258,19 @@ def operator_inputs(emulator, particles):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_operators_are_sound(dim):
     scene = box(dim, ("water", "sand"), obstacles=True)
-    emulator = emulator_of(scene, cells=8).requires_grad_(False)
+    constraints = Constraints(density_cap=0.2)
+    emulator = emulator_of(scene, cells=8, constraints=constraints).requires_grad_(False)
     first, second = operator_inputs(emulator, cloud(scene, 20, 2, statics=3))
     checks = ("test_schema", "test_faketensor")
     text = emulator._plan.to_text()
     torch.library.opcheck(torch.ops.nmpm.rasterise.default, (text, *first), test_utils=checks)
     torch.library.opcheck(torch.ops.nmpm.predict_path.default, (text, *second), test_utils=checks)
-    assert torch.equal(operators.predict_path(emulator._plan, *second), calls.predict_path(emulator._plan, *second))
+    path = operators.predict_path(emulator._plan, *second)
+    assert torch.equal(path, calls.predict_path(emulator._plan, *second))
+    cells, _, *start = second[:5]
+    third = (cells, *start, path, *second[-3:])
+    torch.library.opcheck(torch.ops.nmpm.uncrowd.default, (text, *third), test_utils=checks)
+    assert torch.equal(operators.uncrowd(emulator._plan, *third), calls.uncrowd(emulator._plan, *third))
 
 
 def test_traced_graphs_contain_the_operators():

@@ -7,6 +7,9 @@ import torch
 
 from nmpm.emulator import Emulator, EmulatorRecipe, unroll
 from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.runtimes import Eager
+from nmpm.emulator.windows import Windows
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from tests.scenes import box, cloud
@@ -28,10 +31,10 @@ def count_calls(model: Emulator) -> list[int]:
     return calls
 
 
-def called_each_time(model: Emulator, particles: Particles) -> list[torch.Tensor]:
+def called_each_time(model: Emulator, particles: Particles, bundles: int = BUNDLES) -> list[torch.Tensor]:
     """Positions of the bundles when every one of them is computed."""
     context, positions = model.context(particles), []
-    for _ in range(BUNDLES):
+    for _ in range(bundles):
         bundle = model(particles, context)
         positions.append(bundle.position)
         particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
@@ -55,20 +58,32 @@ def test_what_moves_is_computed():
     assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
 
 
-def test_one_moving_scene_keeps_its_batch_awake():
+def joined(*states: Particles) -> Particles:
+    names = [name for name, values in vars(states[0]).items() if isinstance(values, torch.Tensor)]
+    return Particles(**{name: torch.cat([getattr(state, name) for state in states]) for name in names})
+
+
+def test_only_scenes_that_move_are_computed():
     model = emulator(rest_speed=0.05)
-    resting, moving = cloud(WEIGHTLESS, speed=0.0), cloud(WEIGHTLESS, speed=0.02, seed=1)
-    both = dataclasses.replace(
-        resting,
-        **{
-            name: torch.cat([getattr(resting, name), getattr(moving, name)])
-            for name in ("position", "velocity", "material", "mask", "obstacle", "obstacle_mask", "gravity")
-        },
-    )
-    expected = called_each_time(model, both)
-    found = [bundle.position for bundle in unroll(model, both, BUNDLES)]
-    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+    batch = joined(*(cloud(WEIGHTLESS, speed=speed, seed=seed) for seed, speed in enumerate((0.0, 0.02, 0.0))))
+    expected, sizes = called_each_time(model, batch), []
+    model.processor.register_forward_hook(lambda _, inputs, __: sizes.append(len(inputs[0])))
+    found = [bundle.position for bundle in unroll(model, batch, BUNDLES)]
+    assert sizes[0] == 3
+    assert sizes[-1] == 1
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
+        assert torch.equal(one[::2], other[::2])
     assert not torch.equal(found[-1][1, -1], found[-2][1, -1])
+
+
+def test_a_batch_of_compiled_shapes_sleeps_together():
+    model = emulator(rest_speed=0.05)
+    model.runtime = type("Fixed", (Eager,), {"fixed_shapes": True})()
+    batch, sizes = joined(cloud(WEIGHTLESS, speed=0.0), cloud(WEIGHTLESS, speed=0.02, seed=1)), []
+    model.processor.register_forward_hook(lambda _, inputs, __: sizes.append(len(inputs[0])))
+    list(unroll(model, batch, BUNDLES))
+    assert sizes == [2] * BUNDLES
 
 
 def test_training_computes_every_bundle():
@@ -76,3 +91,60 @@ def test_training_computes_every_bundle():
     calls = count_calls(model)
     list(unroll(model, cloud(WEIGHTLESS, speed=0.0), BUNDLES))
     assert calls == [BUNDLES]
+
+
+def two_piles(wraps: bool) -> tuple[Emulator, Particles]:
+    """A pile at rest, and one that flies to it from afar, in a channel that is much longer than the network sees."""
+    walls = ("periodic", "wall") if wraps else ("wall", "wall")
+    low, high = ((0.1, 3.3), (0.1, 0.9)) if wraps else ((0.08, 3.32), (0.08, 0.92))
+    scene = box(gravity=(0.0, 0.0), boundary=walls)
+    scene = dataclasses.replace(scene, bounds=((0.1, 3.3), (0.1, 0.9)), domain=(low, high))
+    torch.manual_seed(0)
+    constraints = Constraints(rest_speed=0.1)
+    model = EmulatorRecipe(scene, (128, 32), 4, processor=UNet(4, 1), constraints=constraints).build().eval()
+    model.output_scale.mul_(0.01)
+    particles = cloud(scene, 200, speed=0.0)
+    particles.position[0] = 0.3 + 0.3 * torch.rand(200, 2, generator=torch.Generator().manual_seed(1))
+    particles.position[0, 100:, 0] += 2.2
+    particles.velocity[0, 100:, 0] = -0.035
+    return model.requires_grad_(False).with_windows(Windows(least_cells=1)), particles
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("wraps", [False, True])
+def test_the_network_runs_where_it_sees_a_change_and_nothing_that_would_move_is_frozen(wraps, monkeypatch):
+    for name in ("choice", "cover"):
+        monkeypatch.setattr(f"nmpm.emulator.windows.{name}.CALL_CELLS", 100)  # so that windows pay on a small grid
+    model, particles = two_piles(wraps)
+    cells: list[int] = []
+    model.processor.register_forward_hook(lambda _, inputs, __: cells.append(inputs[0][:, 0].numel()))
+
+    def positions(emulator: Emulator) -> torch.Tensor:
+        cells.clear()
+        return torch.stack([bundle.position[:, -1] for bundle in unroll(emulator, particles, 20)])
+
+    expected = positions(model.with_windows(None))
+    assert sum(cells) == 20 * 128 * 32
+    cells.clear()
+    windows = torch.stack([position[:, -1] for position in called_each_time(model, particles, 20)])
+    without_memory = sum(cells)
+    found = positions(model)
+    assert sum(cells) < 0.8 * without_memory
+    for one in (found, windows):
+        assert ((one - expected).abs().max() / model.grid.spacing[0]) < 1e-3
+    assert torch.equal(found[6, 0, :100], found[2, 0, :100])
+    assert (found[-1, 0, :100] - particles.position[0, :100]).abs().max() > 0.01  # woken by what arrived
+
+
+def unroll_states(model: Emulator, particles: Particles, bundles: int):
+    for bundle in unroll(model, particles, bundles):
+        yield particles.with_motion(bundle.position[:, -1], bundle.velocity)
+
+
+def test_the_share_of_particles_at_rest_is_measured():
+    model, particles = two_piles(wraps=False)
+    monitor = Monitor()
+    *_, settled = unroll_states(model, particles, 3)  # the first bundles round positions
+    list(unroll(model, settled, 4, monitor))
+    assert monitor.rest_share == pytest.approx(0.5)
+    assert "50% of all at rest" in monitor.report()

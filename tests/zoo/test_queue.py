@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -191,6 +192,66 @@ def test_a_dataset_that_another_process_has_is_left_to_it(queue, capsys):
         assert script["main"](words(path)) == 0
     assert "nothing is left to take" in capsys.readouterr().out
     assert not Path("runs/small/1").exists()
+
+
+def test_where_no_training_is_left_it_goes_on_from_the_published_entry(queue, tmp_path):
+    assert train(queue(1 / 3600, hours=1 / 3600, gain=-9.0, limit=2.1 / 3600)) == 0
+    first = Zoo.card("small", "zoo")
+    hours = first["training"]["seconds"] / 3600
+    shutil.rmtree("runs")
+    assert train(queue(1 / 3600, hours=1 / 3600, gain=-9.0, limit=hours + 0.5 / 3600)) == 0  # the limit is reached
+    assert not Path("runs/small/1").exists()
+    path = queue(1 / 3600, hours=1 / 3600, gain=-9.0, limit=hours + 1.1 / 3600)
+    assert train(path) == 0
+    words = json.loads(Path("runs/small/1/words.json").read_text())
+    assert words[words.index("--start_from") + 1] == str(Path("runs/small/published"))
+    copy = Path("runs/small/published")
+    assert yaml.safe_load((copy / "card.yaml").read_text()) == first
+    plan = Plan.read(path)
+    history = History(plan.datasets[0], Path("runs/small"), plan.extension, Path("zoo/small"))
+    assert history.curve()[: len(first["curve"])] == first["curve"]
+    assert history.planned_hours(1) == pytest.approx(hours + 1 / 3600)
+    card = Zoo.card("small", "zoo")
+    improved = min(point[2] for point in card["curve"]) < min(point[2] for point in first["curve"])
+    assert (card == first) is not improved
+    if improved:
+        assert card["training"]["steps"] > first["training"]["steps"]
+    assert train(path, "--fresh") == 0  # what has been started goes on as it was
+    assert not Path("runs/small/2").exists()
+
+
+def test_fresh_trainings_ignore_the_published_entry(queue):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    shutil.rmtree("runs")
+    assert train(path, "--fresh") == 0
+    assert "--start_from" not in json.loads(Path("runs/small/1/words.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("seconds", "errors", "hours", "following"),
+    [
+        (1800, [], 1.5, 1),  # what it lacks
+        (7200, [], 1.0, 1),  # an extension
+        (14400, [], None, None),  # its hours are over
+        (1800, [0.1], 1.0, 2),
+        (1800, [0.199], 1.0, None),  # gained too little
+    ],
+)
+def test_hours_of_the_entry_count_and_its_error_is_to_be_improved(tmp_path, seconds, errors, hours, following):
+    entry = tmp_path / "zoo" / "small"
+    entry.mkdir(parents=True)
+    card = {"training": {"seconds": seconds, "steps": 7}, "curve": [[900.0, 5, 0.2]]}
+    (entry / "card.yaml").write_text(yaml.safe_dump(card))
+    folder = tmp_path / "runs" / "small"
+    if errors:
+        folder.mkdir(parents=True)
+        shutil.copytree(entry, folder / "published")
+    finished(folder, *errors)
+    history = History(Dataset("small", "goop.yaml", 2.0), folder, Extension(hours=1.0, gain=0.03, limit=4.0), entry)
+    assert history.next_round() == following
+    if hours is not None:
+        assert history.length(len(errors) + 1) == hours
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from scenes import box
 
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import DataError
+from nmpm.obstacles import Ramp
 from nmpm.processors import Pointwise
 from nmpm.zoo.registry import Pretrained
 
@@ -48,8 +50,8 @@ def test_numpy_torch_lists_and_batches_are_the_same(model):
         model.state(np.stack([POSITIONS] * 3), velocity).scenes(slice(1, 2)),
     )
     for other in others:
-        for field in dataclasses.fields(one):
-            assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
+        for name in {field.name for field in dataclasses.fields(one)} - {"fields"}:
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
 def test_the_arrays_are_copied_and_gradients_kept(model):
@@ -159,3 +161,18 @@ def test_velocities_per_frame_are_suspected(model):
 @pytest.mark.parametrize("speed", [0.0, 1e-6, 0.1, 1.5])
 def test_plausible_velocities_are_not(model, speed):
     model.state(POSITIONS, velocity=(speed, 0.0))
+
+
+def test_particles_that_start_inside_an_obstacle_are_named():
+    model = model_of(box(obstacles=True))
+    bar = Ramp((0.5, 0.5), 0.4, 0.15, 0.3).particles(0.01)
+    inside = np.array([[0.2, 0.2], [0.5, 0.5], [0.2, 0.8]])
+    with pytest.warns(
+        UserWarning, match=r"Scene 0: 1 of 3 particles start inside.*particle 1 at \(0.5, 0.5\)"
+    ) as caught:
+        model.state(inside, obstacle=bar)
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.state(inside[::2], obstacle=bar)
+        model.state(inside)

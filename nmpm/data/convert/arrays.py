@@ -75,6 +75,9 @@ def _check_trajectories(
                 f" outside the domain {scene.domain[axis]} of axis {axis}."
                 " Give the scene a domain that contains all positions."
             )
+        missing = [name for name in scene.fields if name not in {*trajectory.fields, *trajectory.attributes}]
+        if missing:
+            raise DataError(f"{where} has no field {', '.join(missing)}, which the scene has: give Trajectory.fields.")
         lengths.append(len(trajectory.position))
         yield trajectory
 
@@ -127,4 +130,5 @@ def _metadata(scene: Scene) -> Metadata:
         domain=scene.domain,
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,
+        fields=scene.fields,
     )

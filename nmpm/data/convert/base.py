@@ -29,6 +29,7 @@ class Options:
         dt: Time between stored frames, in seconds.
         gravity: Acceleration in length/s² per axis.
         periodic: Whether each axis is periodic.
+        fields: Names of fields that models are told of.
     """
 
     family: str | None = None
@@ -38,6 +39,7 @@ class Options:
     dt: float | None = None
     gravity: tuple[float, ...] | None = None
     periodic: tuple[bool, ...] | None = None
+    fields: tuple[str, ...] | None = None
 
     def apply_to(self, metadata: Metadata) -> Metadata:
         """The metadata with the user's corrections; the family is applied where the type ids are read.
@@ -51,7 +53,9 @@ class Options:
                 raise ConfigError(f"{name} = {value} needs one entry for each of the data's {metadata.dim} axes.")
         if self.dt is not None and not self.dt > 0:
             raise ConfigError(f"dt = {self.dt} must be positive: seconds between stored frames.")
-        changes: dict[str, Any] = {name: getattr(self, name) for name in ("dt", "gravity", "periodic", "static")}
+        changes: dict[str, Any] = {
+            name: getattr(self, name) for name in ("dt", "gravity", "periodic", "static", "fields")
+        }
         changes["static_types"] = changes.pop("static")
         if self.bounds is not None:
             metadata = replace(metadata, domain=None, bounds=self.bounds)

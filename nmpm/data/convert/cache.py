@@ -59,6 +59,8 @@ def _plain(options: Options) -> list[tuple[str, object]]:
     entries = dict(vars(options))
     entries["types"] = sorted((options.types or {}).items())
     entries["static"] = sorted(options.static) if options.static is not None else None
+    if options.fields is None:  # as in caches of versions without fields
+        del entries["fields"]
     return sorted(entries.items())
 
 

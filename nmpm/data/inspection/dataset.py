@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from nmpm.data.format import Metadata, Split
 from nmpm.data.inspection.anomalies import find_anomalies
 from nmpm.data.inspection.facts import Inspection, Range, SplitFacts
+from nmpm.data.inspection.field_survey import FieldSurvey
 from nmpm.data.inspection.survey import Survey
 from nmpm.data.inspection.tolerance import open_splits, tolerant_metadata, with_guessed_family
 from nmpm.data.loading.sources import FolderSource
@@ -49,6 +50,8 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
     family, origin = origin.stated.family, with_guessed_family(origin)
     metadata, wrong = tolerant_metadata(origin, splits)
     findings += wrong
+    if origin.stated.fields is not None:
+        metadata = replace(metadata, fields=tuple(origin.stated.fields))
     scene: Scene | None = None
     try:
         scene = origin.scene
@@ -62,11 +65,14 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
     statistics = MotionStatistics(metadata)
     spacing = _spacing(splits, chosen, metadata)
     fields: dict[str, tuple[int, ...]] = {}
+    field_survey = FieldSurvey(metadata)
     with progress_bar("Inspecting", sum(map(len, chosen.values()))) as advance:
         for where, split, index in _each(splits, chosen):
             try:
                 trajectory = split.read(index)
-                fields = fields or {key: values.shape for key, values in split.fields(index).items()}
+                stored = {key: values.shape for key, values in split.fields(index).items()}
+                fields = fields or stored
+                field_survey.add(split, index, stored)
                 findings += find_anomalies(trajectory, metadata, spacing, where)
                 survey.add(trajectory)
                 if split is splits[first]:
@@ -95,7 +101,7 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
         gravity=scene.gravity if scene else metadata.gravity,
         first_acceleration=tuple(fall.tolist()),
         spacing=spacing,
-        varies=_varies(tally),
+        varies=(*_varies(tally), *field_survey.varying),
         fields=fields,
         grids=survey.grids(),
         recommended=survey.recommended(),
@@ -109,6 +115,7 @@ def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection
             *_conversion_notes(metadata),
         ),
         findings=_truncate(findings),
+        channels=field_survey.channels(scene.materials if scene else list(tally.materials)),
     )
 
 

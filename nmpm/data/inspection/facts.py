@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from nmpm._support.plain_data import to_lists
@@ -80,6 +80,7 @@ class Inspection:
         restless: Trajectories that still move at their end.
         notes: Notes that need no action.
         findings: Anomalies.
+        channels: For each field how it differs, and which channels of a model that makes.
     """
 
     path: str
@@ -104,6 +105,7 @@ class Inspection:
     restless: int
     notes: tuple[str, ...]
     findings: tuple[str, ...]
+    channels: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, strings and numbers."""

@@ -17,7 +17,7 @@ from nmpm.data.metadata import load_json, metadata_from_dict
 from nmpm.errors import DataError
 
 _KEYS = ("bounds", "dt", "write_every", "sequence_length", "particle_types", "static_types", "domain", "gravity",
-         "periodic_boundary_conditions", "particle_volume", "densities")  # fmt: skip
+         "periodic_boundary_conditions", "particle_volume", "densities", "fields")  # fmt: skip
 
 
 def open_splits(folder: Path) -> tuple[dict[str, Split], list[str]]:

@@ -85,10 +85,15 @@ class _BufferContents:
     recordings: Mapping[int, Recording]
     motion: MotionSampler | None
 
-    def gather(self, drawn: Sequence[tuple[int, int]], length: int) -> Window:
+    def size(self, trajectory: int) -> int:
+        """Number of particles of a trajectory."""
+        return self.recordings[trajectory].frames.shape[1]
+
+    def gather(self, drawn: Sequence[tuple[int, int]], length: int, particles: int) -> Window:
+        """The windows, padded to a number of particles."""
         row = {trajectory: row for row, trajectory in enumerate(self.recordings)}
         trajectories, starts = zip(*drawn, strict=True)
-        return self.padded.gather([row[trajectory] for trajectory in trajectories], starts, length)
+        return self.padded.gather([row[trajectory] for trajectory in trajectories], starts, length, particles)
 
 
 class TrajectoryBuffer:
@@ -123,12 +128,27 @@ class TrajectoryBuffer:
         for buffer, indices in groupby(count(start), key=lambda index: plan.locate(index, world)[0]):
             upcoming = run_in_thread(self._load, plan.members(buffer + 1, rank, world), contents)
             try:
+                bucket, dealt = range(0), []
                 for index in indices:
-                    drawn = plan.batch(index, rank, world)
-                    yield contents.gather(self._emphasise(drawn, contents.motion, index, rank, world), plan.length)
+                    if index not in bucket:
+                        bucket = plan.bucket_of(index, world)
+                        dealt = self._deal(bucket, contents, rank, world)
+                    batch = dealt[index - bucket.start]
+                    # The largest of all ranks: noise is drawn for tensors of equal shape on all of them.
+                    most = max(contents.size(trajectory) for trajectory, _ in batch)
+                    first = (rank - plan.drawing_ranks(rank, world).start) * plan.batch_size
+                    yield contents.gather(batch[first : first + plan.batch_size], plan.length, most)
                 contents = upcoming.result()
             finally:
                 upcoming.cancel()
+
+    def _deal(self, bucket: range, contents: _BufferContents, rank: int, world: int) -> list[list[tuple[int, int]]]:
+        """The windows of each of a bucket's batches, of all ranks that share the buffer."""
+        together = len(self.plan.drawing_ranks(rank, world)) == world
+        own = (0, 1) if together else (rank, world)
+        steps = ((index, self.plan.draw(index, rank, world)) for index in bucket)
+        drawn = [window for index, step in steps for window in self._emphasise(step, contents.motion, index, *own)]
+        return self.plan.deal(bucket, drawn, [contents.size(trajectory) for trajectory, _ in drawn])
 
     def _load(self, members: Sequence[int], previous: _BufferContents | None) -> _BufferContents:
         """Loads a buffer's trajectories, reusing those of the previous buffer."""

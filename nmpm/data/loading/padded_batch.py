@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nmpm.data.loading.recording import Recording
+from nmpm.errors import DataError
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
@@ -20,7 +21,7 @@ class PaddedRecordings:
 
     Args:
         frames: (S, T, N, D) positions, in domain length.
-        material, mask, obstacle, obstacle_mask, gravity: as in `Window`, with S in place of B.
+        material, mask, obstacle, obstacle_mask, gravity, fields: as in `Window`, with S in place of B.
         scene: The recordings' scene.
     """
 
@@ -31,16 +32,22 @@ class PaddedRecordings:
     obstacle_mask: Tensor
     gravity: Tensor
     scene: Scene
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
     def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
-        """Copies recordings into padded tensors."""
+        """Copies recordings into padded tensors.
+
+        Raises:
+            DataError: if not all have the same fields, of the same kind.
+        """
         centre = [(low + high) / 2 for low, high in scene.domain]
         frames, mask = _pad_and_stack([recording.frames for recording in recordings], centre)
         obstacle, obstacle_mask = _pad_and_stack([recording.obstacle[None] for recording in recordings], centre)
         material, _ = _pad_and_stack([recording.material[None, :, None] for recording in recordings], [0])
         gravity = torch.stack([recording.gravity for recording in recordings])
-        return cls(frames, material[:, 0, :, 0], mask, obstacle[:, 0], obstacle_mask, gravity, scene)
+        fields = _stack_fields(recordings)
+        return cls(frames, material[:, 0, :, 0], mask, obstacle[:, 0], obstacle_mask, gravity, scene, fields)
 
     def recording(self, row: int, original: Recording) -> Recording:
         """A view of one row without its padding; `original` is the recording that was stacked there."""
@@ -50,6 +57,10 @@ class PaddedRecordings:
             material=self.material[row, :count],
             obstacle=self.obstacle[row, : len(original.obstacle)],
             gravity=self.gravity[row],
+            fields={
+                name: self.fields[name][row, : values.shape[0], : values.shape[1]]
+                for name, values in original.fields.items()
+            },
         )
 
     def to(self, device: torch.device) -> PaddedRecordings:
@@ -62,9 +73,10 @@ class PaddedRecordings:
             obstacle_mask=self.obstacle_mask.to(device),
             gravity=self.gravity.to(device),
             scene=self.scene,
+            fields={name: values.to(device) for name, values in self.fields.items()},
         )
 
-    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int) -> Window:
+    def gather(self, rows: Sequence[int], starts: Sequence[int], length: int, particles: int | None = None) -> Window:
         """Gathers consecutive frames of B recordings.
 
         Args:
@@ -72,19 +84,26 @@ class PaddedRecordings:
             starts: First frame of each. On the scene's periodic axes positions are unwrapped from there on, so that
                 differences between frames are displacements.
             length: Frames of the window; each recording must have as many from its start on.
+            particles: Number to which the windows are padded, at least that of each; the largest recording's if left
+                out.
         """
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)
         frame = first[:, None] + torch.arange(length, device=self.frames.device)
-        frames = self.frames[row[:, None], frame]
+        kept = slice(particles)
+        frames = self.frames[:, :, kept][row[:, None], frame]
         unwrap(frames, self.scene)
         return Window(
             frames=frames,
-            material=self.material[row],
-            mask=self.mask[row],
+            material=self.material[:, kept][row],
+            mask=self.mask[:, kept][row],
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
+            fields={
+                name: values[:, :, kept][row] if values.shape[1] == 1 else values[:, :, kept][row[:, None], frame]
+                for name, values in self.fields.items()
+            },
         )
 
 
@@ -109,6 +128,24 @@ def unwrap(frames: Tensor, scene: Scene) -> None:
             along = frames[..., axis]
             turns = torch.round(along.diff(dim=1) / period).cumsum(dim=1)
             along[:, 1:] -= turns * period
+
+
+def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
+    """By name (S, T, N), (S, 1, N) or (S, 1, 1); zero in padding."""
+    stacked = {}
+    for name in dict.fromkeys(name for recording in recordings for name in recording.fields):
+        own = [
+            (recording.fields[name], len(recording.material)) for recording in recordings if name in recording.fields
+        ]
+        parts = [part for part, _ in own]
+        kinds = {(part.shape[0] == 1, part.shape[1] == 1 < count) for part, count in own}
+        if len(parts) < len(recordings) or len(kinds) > 1:
+            raise DataError(
+                f"The field {name} has another shape in some trajectories than in others, or is missing in some: store"
+                " it in all as (T, N), as (N,), or as one number."
+            )
+        stacked[name] = _pad_and_stack([part.unsqueeze(-1) for part in parts], [0.0])[0].squeeze(-1)
+    return stacked
 
 
 def _index_tensor(values: Sequence[int], device: torch.device) -> Tensor:

@@ -1,18 +1,19 @@
 """Trajectories as tensors, validated against their scene.
 
-A recording holds what a model needs of a trajectory: the moving particles, their materials, the static particles once,
-and gravity in length per frame squared.
+A recording holds what a model needs of a trajectory: the moving particles, their materials and fields, the static
+particles once, and gravity in length per frame squared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.data.fields import read_fields
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.loading.background import raise_if_abandoned
 from nmpm.data.statistics import first_moving_particle
@@ -29,12 +30,14 @@ class Recording:
         material: (N,) int64 index into `Scene.materials`.
         obstacle: (M, D) float32 positions of the static particles.
         gravity: (D,) float32 in length per frame squared, zero where unknown.
+        fields: By name, float32 (T, N), (1, N) if constant in time, or (1, 1) if it is the trajectory's; all finite.
     """
 
     frames: Tensor
     material: Tensor
     obstacle: Tensor
     gravity: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,12 @@ class RecordingReader:
         """Converts a trajectory to tensors.
 
         Args:
-            trajectory: A trajectory of the scene.
+            trajectory: A trajectory of the scene, with its fields as `read_fields` gives them.
             where: File and trajectory, for error messages.
 
         Raises:
-            DataError: if a particle leaves the scene's domain, its material is not in the scene, or a static particle
-                moves.
+            DataError: if a particle leaves the scene's domain, its material is not in the scene, a static particle
+                moves, or a field that the metadata declare is missing or not finite.
         """
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
@@ -73,7 +76,24 @@ class RecordingReader:
             material=torch.from_numpy(self._materials(types[moving], where)),
             obstacle=torch.from_numpy(trajectory.position[0, static]),
             gravity=self._gravity(trajectory, where),
+            fields=dict(self._fields(trajectory.fields, moving, where)),
         )
+
+    def _fields(self, fields: Mapping[str, np.ndarray], moving: np.ndarray, where: str) -> Iterator[tuple[str, Tensor]]:
+        """The fields of the moving particles by name."""
+        missing = [name for name in self.metadata.fields if name not in fields]
+        if missing:
+            raise DataError(f"{where}: it has no field {', '.join(missing)}, which the metadata or data.fields name.")
+        for name, values in fields.items():
+            own = values if values.shape[1] == 1 else values[:, moving]
+            if not np.isfinite(own).all():
+                frame, place = map(int, np.argwhere(~np.isfinite(own))[0])
+                particle = place if values.shape[1] == 1 else int(np.flatnonzero(moving)[place])
+                raise DataError(
+                    f"{where}: {name} of particle {particle} in frame {frame} is {own[frame, place]}; fields of moving"
+                    " particles must be finite. Remove the trajectory, or leave the field out of data.fields."
+                )
+            yield name, torch.from_numpy(np.ascontiguousarray(own))
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)
@@ -147,13 +167,15 @@ class SplitRecordings(Sequence[Recording]):
         Raises:
             DataError: if it cannot be read, leaves the scene's domain or has a material that is not in the scene.
         """
-        return self.reader.recording(self.split.read(index), self.split.where(index))
+        names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
+        fields = read_fields(self.split, index, names) if names else {}
+        return self.reader.recording(replace(self.split.read(index), fields=fields), self.split.where(index))
 
     @property
     def max_bytes(self) -> int:
-        """Size of the positions of the largest trajectory."""
-        split = self.split
-        return max(4 * split.frames(index) * split.particles(index) * split.dim for index in range(len(self)))
+        """Size of the positions and fields of the largest trajectory."""
+        split, numbers = self.split, self.split.dim + len(self.reader.metadata.fields)
+        return max(4 * split.frames(index) * split.particles(index) * numbers for index in range(len(self)))
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
         """Reads several trajectories.

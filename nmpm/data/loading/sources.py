@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ class StatedFacts:
     gravity: Sequence[float] | None = None
     boundary: Sequence[Boundary] | None = None
     bounds: Sequence[Interval] | None = None
+    fields: Sequence[str] | None = None
 
     @property
     def options(self) -> Options:
@@ -38,6 +39,7 @@ class StatedFacts:
             gravity=None if self.gravity is None else tuple(map(float, self.gravity)),
             periodic=None if self.boundary is None else tuple(kind == "periodic" for kind in self.boundary),
             bounds=None if self.bounds is None else tuple((float(low), float(high)) for low, high in self.bounds),
+            fields=None if self.fields is None else tuple(self.fields),
         )
 
 
@@ -111,12 +113,13 @@ class FolderSource(DataSource):
 
     @cached_property
     def metadata(self) -> Metadata:
-        return read_metadata(self.folder, self.stated.family)
+        metadata, fields = read_metadata(self.folder, self.stated.family), self.stated.fields
+        return metadata if fields is None else replace(metadata, fields=tuple(fields))
 
     @cached_property
     def scene(self) -> Scene:
         stated = self.stated
-        return infer_scene(self.folder, stated.family, stated.gravity, stated.boundary, stated.bounds)
+        return infer_scene(self.folder, stated.family, stated.gravity, stated.boundary, stated.bounds, stated.fields)
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,26 @@ drawn. So all windows are equally likely, no two ranks see the same window withi
 pure function of the seed and the data: a resumed training has the same batches as an uninterrupted one. The batches of
 all ranks together equal that of one process with a batch as large; where the batch size or the number of ranks
 changes, training continues in the same sequence of windows (`WindowPlan.resume_after`).
+
+Batches are padded to their largest scene. So that one large scene does not make many small ones pay, the windows of
+several batches in a row, a bucket, may be sorted by their number of particles and dealt to these batches anew. Each
+window is drawn as often as without; only its company changes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 
 from nmpm.errors import ConfigError
 
-_TRAJECTORIES, _WINDOWS, MOTION = 0, 1, 2  # separate the streams of random numbers
+T = TypeVar("T")
+
+_TRAJECTORIES, _WINDOWS, MOTION, _BUCKETS = 0, 1, 2, 3  # separate the streams of random numbers
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,7 @@ class WindowPlan:
         seed: Seed of the order.
         emphasis: Fraction of the windows that is drawn in proportion to the motion in them, in [0, 1].
         start: Where the batches of this size start, if there were batches of another size before.
+        bucket: Batches in a row whose windows are sorted by size; 1 for none.
 
     Raises:
         ConfigError: if a number is out of its range.
@@ -63,9 +71,10 @@ class WindowPlan:
     seed: int
     emphasis: float = 0.0
     start: PlanStart = PlanStart()
+    bucket: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("batch_size", "buffer_size", "passes"):
+        for name in ("batch_size", "buffer_size", "passes", "bucket"):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name} = {getattr(self, name)} must be positive.")
         if self.seed < 0:
@@ -103,13 +112,20 @@ class WindowPlan:
         return self.start.buffer + 1 + buffers, turn * stride
 
     def batch(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
-        """The windows of a batch, each as (trajectory index, first frame)."""
+        """The windows of a batch before buckets are dealt, each as (trajectory index, first frame)."""
+        return self._draw(index, rank, world, self._offset(rank), self.batch_size)
+
+    def draw(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
+        """As `batch`, of all ranks that share a rank's buffer, one after the other."""
+        ranks = self.drawing_ranks(rank, world)
+        return self._draw(index, rank, world, self._offset(ranks.start), self.batch_size * len(ranks))
+
+    def _draw(self, index: int, rank: int, world: int, offset: int, number: int) -> list[tuple[int, int]]:
         buffer, drawn = self.locate(index, world)
         members = self.members(buffer, rank, world)
         ends = np.cumsum([self.windows(trajectory) for trajectory in members])
         total = int(ends[-1])
-        first = drawn + self._offset(rank)
-        places = range(first, first + self.batch_size)
+        places = range(drawn + offset, drawn + offset + number)
         chosen = [int(_shuffle(total, self.seed, _WINDOWS, buffer, p // total)[p % total]) for p in places]
         owners = np.searchsorted(ends, chosen, side="right").tolist()
         return [
@@ -117,8 +133,40 @@ class WindowPlan:
             for owner, window in zip(owners, chosen, strict=True)
         ]
 
+    def bucket_of(self, index: int, world: int) -> range:
+        """Indices of the batches whose windows are sorted together with those of a batch; all of one buffer."""
+        stride, since = self._stride(world), index - self.start.batch
+        left = max(0, self.batches_per_buffer(world) - self.start.drawn // stride)
+        first, count = self.start.batch, left
+        if since >= left:
+            count = self.batches_per_buffer(world)
+            first += left + (since - left) // count * count
+        low = first + (index - first) // self.bucket * self.bucket
+        return range(low, min(low + self.bucket, first + count))
+
+    def deal(self, bucket: range, windows: Sequence[T], sizes: Sequence[int]) -> list[list[T]]:
+        """The windows of a bucket's batches, of all ranks together, dealt to these batches by size.
+
+        Args:
+            bucket: From `bucket_of`.
+            windows: Of its batches, in order.
+            sizes: Number of particles of each.
+        """
+        share = len(windows) // len(bucket)
+        if len(bucket) == 1:
+            return [list(windows)]
+        order = np.argsort(sizes, kind="stable").tolist()
+        batches = [[windows[place] for place in order[n : n + share]] for n in range(0, len(windows), share)]
+        return [batches[turn] for turn in _shuffle(len(bucket), self.seed, _BUCKETS, bucket.start)]
+
+    def drawing_ranks(self, rank: int, world: int) -> range:  # noqa: ARG002
+        """The ranks that share the buffer of a rank, so that their windows are dealt together."""
+        return range(world)
+
     def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
         """The plan that continues after batches of another size, at the first window that none of them used.
+
+        With buckets, the windows of an unfinished one that no batch has used are left out.
 
         Args:
             batches: Batches that each rank has used, since the beginning.
@@ -132,7 +180,7 @@ class WindowPlan:
             return self
         before = replace(self, batch_size=batch_size)
         buffer, drawn = before.locate(
-            batches - 1, earlier
+            before.bucket_of(batches - 1, earlier)[-1], earlier
         )  # the rest of a buffer may be too small for the old batches, but not for the new
         return replace(self, start=PlanStart(batches, buffer, drawn + before._stride(earlier)))
 
@@ -170,6 +218,9 @@ class EndlessWindowPlan(WindowPlan):
         buffer, drawn = replace(self, batch_size=batch_size).locate(batches, earlier)
         started = (buffer + (drawn > 0)) * earlier
         return replace(self, start=PlanStart(batches, -(-started // world)))
+
+    def drawing_ranks(self, rank: int, world: int) -> range:  # noqa: ARG002
+        return range(rank, rank + 1)
 
     def _stride(self, world: int) -> int:  # noqa: ARG002
         return self.batch_size

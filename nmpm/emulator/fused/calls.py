@@ -6,6 +6,7 @@ Shapes as in `nmpm.particles`; tensors are float32 on the CPU and carry no gradi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -15,11 +16,14 @@ from torch import Tensor
 
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.fused.arrays import as_array, check_materials, material_rows, output_rows
-from nmpm.emulator.fused.contact import fill_share
+from nmpm.emulator.fused.crowd import CrowdArrays, spread_scene
 from nmpm.emulator.fused.flight import land
 from nmpm.emulator.fused.path import SceneArrays, check_scene_reads, clear_of_obstacles, fly_scene, rest_scene
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.fused.rasterise import rasterise_scene
+from nmpm.emulator.fused.surroundings import Surroundings, survey, survey_rollout
+
+__all__ = ["predict_path", "rasterise", "survey", "survey_rollout", "to_length", "uncrowd"]
 
 _CHUNK = 2**14
 
@@ -62,8 +66,11 @@ def rasterise(
 def predict_path(
     plan: Plan, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, state: Tensor,
     output: Tensor, scale: Tensor, solid: Tensor, walls: Tensor, budget: Tensor | None, readable: Tensor | None = None,
+    surroundings: Sequence[Surroundings] | None = None,
 ) -> Tensor:  # fmt: skip
     """(B, m, N, D) positions in cells, as `Advection.constrained_path` gives them.
+
+    The surroundings of each scene, from `survey` or `survey_rollout`, are found where they are left out.
 
     Raises:
         UncoveredReadError: if a particle reads the output where it must not, see `Departure`.
@@ -77,8 +84,7 @@ def predict_path(
     rows = as_array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
     factors, flows = as_array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
     predicted, unpack = output_rows(output)
-    share, rooms = np.empty(size if plan.obstacles else 0, np.float32), as_array(walls).reshape(-1)
-    solids = as_array(solid).reshape(batch, -1)
+    known = survey(plan, solid, walls) if surroundings is None else surroundings
     inputs: tuple[Any, ...] = (as_array(cells), as_array(velocity), own, as_array(mask), as_array(gravity)[:, 0], rows)
     for scene in range(batch):
         unpack(predicted[scene], factors, flows)
@@ -87,13 +93,28 @@ def predict_path(
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
         if readable is not None:
             check_scene_reads(start, plan, as_array(readable[scene]).reshape(-1), path[scene], threads)
-        if plan.obstacles:
-            fill_share(solids[scene], rooms, share)
         if plan.obstacles and plan.solids:
-            clear_of_obstacles(start, plan, share, path[scene], threads)
+            clear_of_obstacles(start, plan, known[scene], path[scene], threads)
         if plan.rest_speed:
-            rest_scene(start, plan, share, path[scene], threads)
+            rest_scene(start, plan, known[scene].share, path[scene], threads)
     return torch.from_numpy(path)
+
+
+def uncrowd(
+    plan: Plan, cells: Tensor, gravity: Tensor, material: Tensor, mask: Tensor, path: Tensor, solid: Tensor,
+    walls: Tensor, budget: Tensor | None, surroundings: Sequence[Surroundings] | None = None,
+) -> Tensor:  # fmt: skip
+    """(B, m, N, D) positions with overfull cells spread, as `Advection.uncrowded_path` gives them; in fresh memory.
+
+    From a path (B, m, N, D) of `predict_path`, and by a plan with a density cap.
+    """
+    known = survey(plan, solid, walls) if surroundings is None else surroundings
+    own, threads, spread = material_rows(plan, material), torch.get_num_threads(), np.empty(path.shape, np.float32)
+    inputs: tuple[Any, ...] = (as_array(cells), own, as_array(mask), as_array(gravity)[:, 0], as_array(path))
+    for scene, around in enumerate(known):
+        arrays = CrowdArrays(*(values[scene] for values in inputs))
+        spread_scene(arrays, plan, around, None if budget is None else float(budget[scene]), spread[scene], threads)
+    return torch.from_numpy(spread)
 
 
 def to_length(plan: Plan, path: Tensor) -> Tensor:

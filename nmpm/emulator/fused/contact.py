@@ -17,6 +17,9 @@ from nmpm.transfer.fused.nodes import linear_nodes
 
 SURFACE, PIECE, EVEN = 0.4, 0.5, 1e-5  # as in `nmpm.emulator.contact`
 CLEAR, TOUCHES, STUCK = 0, 1, 2
+FAR = 16
+"""Cells beyond which clearances are not told apart."""
+
 _WAYS_OUT = 4
 _BLOCK = 512
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -65,29 +68,95 @@ def longest_step(cells: Any, path: Any, low: Any, high: Any) -> Any:
 
 
 @jit
-def mark(cells: Any, path: Any, share: Any, grid: Any, pieces: Any, marks: Any, low: Any, high: Any) -> Any:
+def widen(marked: Any, shape: Any, wraps: Any, axis: Any) -> Any:
+    """(size,) bool: whether a cell or one beside it along an axis is marked."""
+    stride, extent = 1, shape[axis]
+    for d in range(axis + 1, len(shape)):
+        stride *= shape[d]
+    wide = np.empty_like(marked)
+    for node in range(len(marked)):
+        row = node // stride % extent
+        below = row > 0 or wraps[axis]
+        above = row < extent - 1 or wraps[axis]
+        lower = node - stride if row > 0 else node + (extent - 1) * stride
+        upper = node + stride if row < extent - 1 else node - (extent - 1) * stride
+        wide[node] = marked[node] or (below and marked[lower]) or (above and marked[upper])
+    return wide
+
+
+@jit
+def fill_clearance(share: Any, grid: Any, clearance: Any) -> Any:
+    """Fill in how far each cell (size,) is from those in which a particle may touch an obstacle: 0 there, at most FAR.
+
+    Along each axis: a particle that moves no further than one cell less along any axis touches nothing.
+    """
+    shape, wraps = grid
+    near = share > np.float32(SURFACE)
+    clearance[:] = np.float32(FAR)
+    for distance in range(-1, FAR):  # a particle's depth is interpolated from the cells beside its own
+        for node in range(len(near)):
+            if near[node] and distance >= 0:
+                clearance[node] = min(clearance[node], np.float32(distance))
+        for axis in range(len(shape)):
+            near = widen(near, shape, wraps, axis)
+
+
+@jit
+def _find_near(cells: Any, path: Any, clearance: Any, grid: Any, begin: Any, end: Any, near: Any) -> Any:
+    """Fill in which particles may touch an obstacle, in order, and return how many: all, without clearances."""
+    shape, wraps = grid
+    if len(clearance) == 0:
+        near[: end - begin] = np.arange(begin, end)
+        return end - begin
+    found, furthest = 0, np.zeros(_BLOCK, np.float32)
+    for frame in range(len(path)):
+        for p in range(begin, end):
+            for d in range(len(shape)):
+                way = abs(path[frame, p, d] - cells[p, d])
+                furthest[p - begin] = furthest[p - begin] if way <= furthest[p - begin] else way  # NaN is far
+    for p in range(begin, end):
+        node = 0
+        for d in range(len(shape)):
+            row = np.int64(np.floor(cells[p, d])) if np.isfinite(cells[p, d]) else 0
+            node = node * shape[d] + (row % shape[d] if wraps[d] else min(max(row, 0), shape[d] - 1))
+        if not furthest[p - begin] <= clearance[node] - ONE:
+            near[found] = p
+            found += 1
+    return found
+
+
+@jit
+def mark(
+    cells: Any, path: Any, share: Any, clearance: Any, grid: Any, pieces: Any, marks: Any, low: Any, high: Any
+) -> Any:
     """Fill in which particles touch an obstacle (`TOUCHES`) or start in one (`STUCK`), and return how many do."""
     dim, found = cells.shape[1], 0
     places, values = np.empty((_BLOCK, dim), np.float32), np.empty(_BLOCK, np.float32)
+    near = np.empty(_BLOCK, np.int64)
+    marks[low:high] = CLEAR
     for begin in range(low, high, _BLOCK):
-        end = min(begin + _BLOCK, high)
-        depths(share, cells[begin:end], grid, values)
-        for p in range(begin, end):
-            marks[p] = STUCK if values[p - begin] > SURFACE else CLEAR
+        count = _find_near(cells, path, clearance, grid, begin, min(begin + _BLOCK, high), near)
+        for k in range(count):
+            for d in range(dim):
+                places[k, d] = cells[near[k], d]
+        depths(share, places[:count], grid, values)
+        for k in range(count):
+            marks[near[k]] = STUCK if values[k] > SURFACE else CLEAR
         for frame in range(len(path)):
             for piece in range(pieces):
                 part = np.float32(piece) / np.float32(pieces)
-                for p in range(begin, end):
+                for k in range(count):
+                    p = near[k]
                     for d in range(dim):
                         here = path[frame, p, d]
                         before = path[frame - 1, p, d] if frame > 0 else cells[p, d]
-                        places[p - begin, d] = here - (here - before) * part
-                depths(share, places[: end - begin], grid, values)
-                for p in range(begin, end):
-                    if values[p - begin] > SURFACE and marks[p] == CLEAR:
-                        marks[p] = TOUCHES
-        for p in range(begin, end):
-            found += marks[p] != CLEAR
+                        places[k, d] = here - (here - before) * part
+                depths(share, places[:count], grid, values)
+                for k in range(count):
+                    if values[k] > SURFACE and marks[near[k]] == CLEAR:
+                        marks[near[k]] = TOUCHES
+        for k in range(count):
+            found += marks[near[k]] != CLEAR
     return found
 
 

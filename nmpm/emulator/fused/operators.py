@@ -6,6 +6,8 @@ torch's dispatcher takes as long as a kernel does on a small scene.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -24,6 +26,11 @@ _LIBRARY.define(
     " Tensor output, Tensor scale, Tensor solid, Tensor walls, Tensor? budget) -> Tensor",
     tags=_TAGS,
 )
+_LIBRARY.define(
+    "uncrowd(str plan, Tensor cells, Tensor gravity, Tensor material, Tensor mask, Tensor path, Tensor solid,"
+    " Tensor walls, Tensor? budget) -> Tensor",
+    tags=_TAGS,
+)
 
 
 def rasterise(plan: Plan, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -38,6 +45,12 @@ def predict_path(plan: Plan, *tensors: Tensor | None) -> Tensor:
     return path
 
 
+def uncrowd(plan: Plan, *tensors: Tensor | None) -> Tensor:
+    """`calls.uncrowd` as an operator."""
+    path: Tensor = torch.ops.nmpm.uncrowd(plan.to_text(), *tensors)
+    return path
+
+
 def to_length(plan: Plan, path: Tensor) -> Tensor:
     """`calls.to_length`, as tensor operations, which compilers fuse by themselves."""
     return path * path.new_tensor(plan.spacing) + path.new_tensor(plan.lower)
@@ -47,8 +60,12 @@ def _rasterise(plan: str, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     return calls.rasterise(read_plan(plan), *tensors)
 
 
-def _predict_path(plan: str, *tensors: Tensor) -> Tensor:
+def _predict_path(plan: str, *tensors: Any) -> Tensor:
     return calls.predict_path(read_plan(plan), *tensors)
+
+
+def _uncrowd(plan: str, *tensors: Any) -> Tensor:
+    return calls.uncrowd(read_plan(plan), *tensors)
 
 
 def _fake_rasterise(plan: str, position: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -63,7 +80,13 @@ def _fake_path(plan: str, cells: Tensor, *tensors: Tensor) -> Tensor:  # noqa: A
     return cells.new_empty(len(cells), tensors[5].shape[1], *cells.shape[1:])
 
 
+def _fake_spread(plan: str, *tensors: Tensor) -> Tensor:  # noqa: ARG001
+    return tensors[4].new_empty(tensors[4].shape)
+
+
 _LIBRARY.impl("rasterise", _rasterise, "CPU")
 _LIBRARY.impl("predict_path", _predict_path, "CPU")
+_LIBRARY.impl("uncrowd", _uncrowd, "CPU")
 torch.library.register_fake("nmpm::rasterise", _fake_rasterise, lib=_LIBRARY)
 torch.library.register_fake("nmpm::predict_path", _fake_path, lib=_LIBRARY)
+torch.library.register_fake("nmpm::uncrowd", _fake_spread, lib=_LIBRARY)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import torch
 
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
@@ -15,14 +14,15 @@ from nmpm.emulator.fused import contact
 from nmpm.emulator.fused.flight import fly, leaves, weigh
 from nmpm.emulator.fused.limit import propose, shorten
 from nmpm.emulator.fused.plan import Array, Plan
-from nmpm.emulator.fused.support import rest, support
-from nmpm.emulator.support import drops
+from nmpm.emulator.fused.support import fill_drops, rest, support
+from nmpm.emulator.fused.surroundings import Surroundings
 from nmpm.emulator.windows.reads import UncoveredReadError
 
 _CHUNK = 2**14  # particles that a thread treats at once; sums do not depend on the number of threads
 _MAX_PIECES = 64
 _TINY = float(np.finfo(np.float32).tiny)
-_ROUNDING = 4 * float(np.finfo(np.float32).eps)
+ROUNDING = 4 * float(np.finfo(np.float32).eps)
+"""Share of an energy by which sums of float32 may exceed it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def fly_scene(start: SceneArrays, plan: Plan, budget: float | None, path: Array,
     )  # fmt: skip
     energies = map_ranges(free, ranges, threads)
     if budget is not None and energies:
-        exceeds = sum(energies) > budget + _ROUNDING * abs(budget)
+        exceeds = sum(energies) > budget + ROUNDING * abs(budget)
         if exceeds.any():
             _limit(start, plan, budget, share, carried, int(exceeds.argmax()), path, threads)
 
@@ -133,7 +133,8 @@ def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, thread
     """
     held, grid = np.empty(len(start.state), np.bool_), (plan.shape, plan.wraps)
     support(start.state, plan.volume_channels, share, start.gravity, grid, plan.floor_rows, held)
-    fall = drops(torch.from_numpy(start.gravity).view(1, 1, -1), len(path))[0, :, 0].numpy()
+    fall = np.empty((len(path), plan.dim), np.float32)
+    fill_drops(start.gravity, fall)
     speed = np.float32(plan.rest_speed)
     still = partial(
         rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE), share, grid, held, fall, plan.limits
@@ -141,20 +142,20 @@ def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, thread
     map_ranges(still, split(len(start.cells), _CHUNK), threads)
 
 
-def clear_of_obstacles(start: SceneArrays, plan: Plan, share: Array, path: Array, threads: int) -> None:
+def clear_of_obstacles(start: SceneArrays, plan: Plan, around: Surroundings, path: Array, threads: int) -> None:
     """Keep a scene's path clear of obstacles, and within the bounds.
 
     Args:
         start: Where the bundle starts.
         plan: Of the emulator.
-        share: (size,) of each cell's room that is obstacle.
+        around: Its obstacles.
         path: (m, N, D), is changed.
         threads: How many work.
     """
-    ranges, grid = split(len(start.cells), _CHUNK), (plan.shape, plan.wraps)
+    ranges, grid, share = split(len(start.cells), _CHUNK), (plan.shape, plan.wraps), around.share
     pieces = _count_pieces(map_ranges(partial(contact.longest_step, start.cells, path), ranges, threads))
     marks = np.empty(len(start.cells), np.int8)
-    find = partial(contact.mark, start.cells, path, share, grid, pieces, marks)
+    find = partial(contact.mark, start.cells, path, share, around.clearance, grid, pieces, marks)
     if not sum(map_ranges(find, ranges, threads)):
         return
     rows = np.flatnonzero(marks)

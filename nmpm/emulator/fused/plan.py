@@ -61,6 +61,7 @@ class Plan:
         obstacles: Whether there can be obstacles.
         solids: Whether particles must keep clear of them.
         floors: As `nmpm.emulator.support.floor_rows`.
+        density_cap: Volume fraction above which cells are overfull; 0 for no cap.
     """
 
     shape: tuple[int, ...]
@@ -80,6 +81,7 @@ class Plan:
     obstacles: bool
     solids: bool
     floors: tuple[tuple[int, int], ...]
+    density_cap: float
 
     def to_text(self) -> str:
         """The plan as JSON."""
@@ -152,6 +154,8 @@ def make_plan(recipe: EmulatorRecipe) -> Plan | None:
     shares = _SHARES.get(type(recipe.decoder))
     if scene.dim == 1 or not nodes or shares is None or constraints.bounds not in ("stop", "reflect"):
         return None
+    if scene.fields:
+        return None
     if not grid.resolves(torch.float32):
         return None
     return Plan(
@@ -172,6 +176,7 @@ def make_plan(recipe: EmulatorRecipe) -> Plan | None:
         obstacles=scene.obstacles,
         solids=constraints.solids,
         floors=floor_rows(scene, grid),
+        density_cap=constraints.density_cap,
     )
 
 

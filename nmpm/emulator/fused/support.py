@@ -11,12 +11,12 @@ import numpy as np
 
 from nmpm._support.jit import jit
 from nmpm.emulator.contact import SURFACE
-from nmpm.emulator.fused.contact import depths
+from nmpm.emulator.fused.contact import depths, widen
 from nmpm.emulator.fused.flight import confine
-from nmpm.emulator.support import ENOUGH, REACH
+from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
 
 ZERO, HALF = np.float32(0), np.float32(0.5)
-_ENOUGH, _SURFACE = np.float32(ENOUGH), np.float32(SURFACE)
+_ENOUGH, _SURFACE, _MAX_DROP = np.float32(ENOUGH), np.float32(SURFACE), np.float32(MAX_DROP)
 
 
 @jit
@@ -48,7 +48,7 @@ def support(state: Any, channels: Any, share: Any, gravity: Any, grid: Any, floo
         bears[node] = filled >= _ENOUGH
     for other in range(len(shape)):
         if other != axis:
-            bears = _widen(bears, shape, wraps, other)
+            bears = widen(bears, shape, wraps, other)
     upwards = gravity[axis] > ZERO
     _sweep(bears, share, shape, axis, upwards, floors[axis, 1 if upwards else 0], held)
 
@@ -60,21 +60,6 @@ def _stride(shape: Any, axis: Any) -> Any:
     for d in range(axis + 1, len(shape)):
         stride *= shape[d]
     return stride
-
-
-@jit
-def _widen(bears: Any, shape: Any, wraps: Any, axis: Any) -> Any:
-    """(size,): whether a cell or one beside it along an axis bears."""
-    stride, extent = _stride(shape, axis), shape[axis]
-    wide = np.empty_like(bears)
-    for node in range(len(bears)):
-        row = node // stride % extent
-        below = row > 0 or wraps[axis]
-        above = row < extent - 1 or wraps[axis]
-        lower = node - stride if row > 0 else node + (extent - 1) * stride
-        upper = node + stride if row < extent - 1 else node - (extent - 1) * stride
-        wide[node] = bears[node] or (below and bears[lower]) or (above and bears[upper])
-    return wide
 
 
 @jit
@@ -94,6 +79,20 @@ def _sweep(bears: Any, share: Any, shape: Any, axis: Any, upwards: Any, floor: A
                 else:
                     empty += 1
                     broken = broken or empty >= REACH
+
+
+@jit
+def fill_drops(gravity: Any, drops: Any) -> Any:
+    """Fill in (m, D) what a particle falls from rest until each frame, as `nmpm.emulator.support.drops`."""
+    frames, square = len(drops), ZERO
+    for d in range(len(gravity)):
+        square += gravity[d] * gravity[d]
+    longest = np.float32(frames * (frames + 1) / 2) * np.sqrt(square)
+    factor = _MAX_DROP / max(longest, _MAX_DROP)
+    for frame in range(frames):
+        part = np.float32((frame + 1) * (frame + 2) / 2)
+        for d in range(len(gravity)):
+            drops[frame, d] = gravity[d] * factor * part
 
 
 @jit
@@ -124,7 +123,7 @@ def rest(
         share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
         grid: The tuple of shape and periodic axes.
         held: (size,) bool, from `support`.
-        drops: (m, D), as `nmpm.emulator.support.drops`.
+        drops: (m, D), from `fill_drops`.
         bounds: As for `flight.fly`.
         low: The first particle.
         high: The one after the last.

@@ -12,7 +12,8 @@ from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
 
 if TYPE_CHECKING:
-    from nmpm.emulator.model import Bundle, Emulator, RolloutContext
+    from nmpm.emulator.bundle import Bundle, RolloutContext
+    from nmpm.emulator.model import Emulator
     from nmpm.particles import Particles
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,7 +21,8 @@ from nmpm.processors import GridProcessor
 from nmpm.transfer.backends import is_chosen
 
 if TYPE_CHECKING:
-    from nmpm.emulator.model import Bundle, Emulator, RolloutContext
+    from nmpm.emulator.bundle import Bundle, RolloutContext
+    from nmpm.emulator.model import Emulator
     from nmpm.particles import Particles
 
 T = TypeVar("T")
@@ -43,6 +44,8 @@ class CudaGraph(Runtime):
             return f"The runtime cuda-graph needs a CUDA GPU; the model is on {emulator.device}."
         if emulator.constraints.bounds == "error":
             return "The runtime cuda-graph cannot stop at a particle out of bounds: use constraints.bounds stop."
+        if emulator.scene.fields:
+            return f"The runtime cuda-graph does not carry fields ({', '.join(emulator.scene.fields)}): use eager."
         return ""
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
@@ -51,14 +54,15 @@ class CudaGraph(Runtime):
     def bundle(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
         if obstacle := self.obstacle(emulator):
             raise ConfigError(obstacle)
-        state = [getattr(particles, field.name) for field in dataclasses.fields(particles)]
-        inputs = [*state, context.solid, *([] if context.budget is None else [context.budget])]
+        state = {name: value for name, value in vars(particles).items() if isinstance(value, Tensor)}
+        inputs = [*state.values(), context.solid, *([] if context.budget is None else [context.budget])]
         refuse_gradients(self, emulator, *inputs)
         if is_chosen() or torch.is_autocast_enabled(emulator.device.type):
             return emulator.predict(particles, context)  # what these choose is not to be recorded
 
         def predict(copies: Sequence[Tensor]) -> Bundle:
-            own = type(particles)(*copies[: len(state)])
+            values: dict[str, Any] = dict(zip(state, copies, strict=False))
+            own = dataclasses.replace(particles, **values)
             budget = None if context.budget is None else copies[-1]
             return emulator.predict(own, dataclasses.replace(context, solid=copies[len(state)], budget=budget))
 

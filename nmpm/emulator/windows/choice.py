@@ -13,7 +13,8 @@ from torch import Tensor
 
 from nmpm.emulator.windows.axis import Axis
 from nmpm.emulator.windows.cover import CALL_CELLS, Window, cover_scene
-from nmpm.emulator.windows.network import mark_readable, predict_windows
+from nmpm.emulator.windows.memory import Memory, erode
+from nmpm.emulator.windows.network import mark_known, mark_readable, predict_windows
 from nmpm.emulator.windows.occupied import WORTHWHILE, Blocks, readable_blocks
 from nmpm.emulator.windows.reads import UncoveredReadError
 from nmpm.errors import ConfigError
@@ -59,16 +60,18 @@ class Coverage:
     """Windows that hold all that a bundle is expected to read.
 
     Args:
-        windows: At least one.
+        windows: At least one, unless the memory holds all.
         axes: Of the grid.
         readable: (B, *S) bool, the cells that particles may be in when they read the output.
         most: Cells to compute at once at most.
+        memory: Has seen the state; holds the output that is known already, and takes the new one. None for none.
     """
 
     windows: list[Window]
     axes: tuple[Axis, ...]
     readable: Tensor
     most: int
+    memory: Memory | None = None
 
     @property
     def cells(self) -> int:
@@ -81,11 +84,20 @@ class Coverage:
         if batch * size <= self.most:
             return None
         everything = np.ones([axis.blocks for axis in self.axes], np.bool_)
-        return _cover([everything] * batch, self.axes, self.most, self.readable.device)
+        return _cover([everything] * batch, self.axes, self.most, self.readable.device, self.memory)
 
     def predict(self, network: GridProcessor, grid: Tensor) -> Tensor:
-        """The network's output, (B, m, C_out, *S), zero where no window holds it; grid (B, C_in, *S)."""
-        return predict_windows(network, grid, self.windows, self.axes, self.most)
+        """The network's output, (B, m, C_out, *S), arbitrary where it must not be read; grid (B, C_in, *S)."""
+        memory = self.memory
+        if memory is None:
+            return predict_windows(network, grid, self.windows, self.axes, self.most)
+        before, known = memory.output, memory.known
+        if before is not None and before.is_inference() and not torch.is_inference_mode_enabled():
+            before = before.clone()  # torch lets nobody change it
+        output = predict_windows(network, grid, self.windows, self.axes, self.most, before)
+        nowhere = torch.zeros(len(grid), *grid.shape[2:], dtype=torch.bool)
+        memory.keep(output, mark_known(self.windows, self.axes, nowhere if known is None else known))
+        return output
 
 
 def find_in_windows(coverage: Coverage | None, find: Callable[[Coverage | None], T]) -> T:
@@ -104,7 +116,11 @@ def find_in_windows(coverage: Coverage | None, find: Callable[[Coverage | None],
 
 
 def choose_windows(
-    options: Windows | None, network: GridProcessor, recipe: EmulatorRecipe, state: Tensor
+    options: Windows | None,
+    network: GridProcessor,
+    recipe: EmulatorRecipe,
+    state: Tensor,
+    memory: Memory | None = None,
 ) -> Coverage | None:
     """The windows for a bundle; None where the whole grid is cheaper, or must be computed.
 
@@ -116,6 +132,7 @@ def choose_windows(
         network: What is to run.
         recipe: Of the emulator that it is part of.
         state: (B, C_in, *S) in grid units.
+        memory: From `usable_memory`.
     """
     grid = recipe.grid
     if options is None or not _is_possible(options, network, grid, recipe.transfer, state):
@@ -127,16 +144,47 @@ def choose_windows(
     batch, most = len(state), options.most_cells or sys.maxsize
     bounded = batch * grid.size > most
     blocks = readable_blocks(state, len(recipe.scene.materials), recipe.frames, axes)
-    if not blocks.any() or (blocks.all() and not bounded):
+    unknown = None if memory is None else memory.see(state, axes)
+    if unknown is not None:
+        blocks = blocks & unknown
+    elif not blocks.any():
         return None
-    coverage = _cover(list(blocks), axes, most, state.device)
+    if blocks.all() and not bounded:
+        return None
+    coverage = _cover(list(blocks), axes, most, state.device, memory)
     cost = coverage.cells + CALL_CELLS * len(coverage.windows)
     return coverage if bounded or cost <= WORTHWHILE * batch * grid.size else None
 
 
-def _cover(blocks: Sequence[Blocks], axes: tuple[Axis, ...], most: int, device: torch.device) -> Coverage:
+def usable_memory(
+    memory: Memory | None, options: Windows | None, network: GridProcessor, recipe: EmulatorRecipe, state: Tensor
+) -> Memory | None:
+    """The memory, if it can be used in a call; else None, and the memory is emptied.
+
+    It is where windows can: on large grids, as on small ones each cell sees most others, in inference on the CPU.
+    Arguments as of `choose_windows`.
+    """
+    if memory is None:
+        return None
+    if (
+        options is not None
+        and state.device.type == "cpu"
+        and _is_possible(options, network, recipe.grid, recipe.transfer, state)
+    ):
+        return memory
+    memory.forget()
+    return None
+
+
+def _cover(
+    blocks: Sequence[Blocks], axes: tuple[Axis, ...], most: int, device: torch.device, memory: Memory | None
+) -> Coverage:
     windows = [window for scene, marked in enumerate(blocks) for window in cover_scene(marked, axes, scene, most)]
-    return Coverage(windows, axes, mark_readable(windows, axes, len(blocks), device), most)
+    if memory is None or memory.known is None:
+        readable = mark_readable(windows, axes, len(blocks), device)
+    else:
+        readable = erode(mark_known(windows, axes, memory.known), axes)
+    return Coverage(windows, axes, readable, most, memory)
 
 
 def _is_possible(options: Windows, network: GridProcessor, grid: Grid, transfer: Transfer, state: Tensor) -> bool:

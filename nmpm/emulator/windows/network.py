@@ -17,18 +17,23 @@ Region = tuple[Any, ...]  # of slices
 
 
 def predict_windows(
-    network: GridProcessor, grid: Tensor, windows: Sequence[Window], axes: Sequence[Axis], most: int
+    network: GridProcessor,
+    grid: Tensor,
+    windows: Sequence[Window],
+    axes: Sequence[Axis],
+    most: int,
+    output: Tensor | None = None,
 ) -> Tensor:
-    """The network's output (B, m, C_out, *S) where windows hold it, zero elsewhere.
+    """The network's output (B, m, C_out, *S) where windows hold it, elsewhere zero or as in an earlier output.
 
     Args:
         network: With a radius.
         grid: (B, C_in, *S).
-        windows: Parts of it, at least one.
+        windows: Parts of it, at least one without an earlier output.
         axes: Of the grid.
         most: Cells that the network computes at once at most; a window may have more.
+        output: The earlier one, which is changed.
     """
-    output: Tensor | None = None
     for batch in _batches(windows, most):
         inputs = torch.cat([_gather(grid, window, axes) for window in batch])
         if grid.dim() == 4:  # the memory layout of the whole grid's network, see `Emulator`
@@ -48,11 +53,22 @@ def predict_windows(
 
 def mark_readable(windows: Sequence[Window], axes: Sequence[Axis], batch: int, device: torch.device) -> Tensor:
     """(B, *S) bool, from which cells particles may read the output of `predict_windows`."""
-    readable = torch.zeros(batch, *(axis.cells for axis in axes), dtype=torch.bool, device=device)
+    return _mark(
+        windows, axes, torch.zeros(batch, *(axis.cells for axis in axes), dtype=torch.bool, device=device), READ
+    )
+
+
+def mark_known(windows: Sequence[Window], axes: Sequence[Axis], known: Tensor) -> Tensor:
+    """(B, *S) bool, in which cells the output of `predict_windows` is right if the earlier one was so where `known`."""
+    return _mark(windows, axes, known.clone(), 0)
+
+
+def _mark(windows: Sequence[Window], axes: Sequence[Axis], cells: Tensor, margin: int) -> Tensor:
+    """Mark what is so many cells within the right output of a window."""
     for window in windows:
-        for there, _ in _regions(window, axes, axes[0].radius + READ):
-            readable[window.scene][there] = True
-    return readable
+        for there, _ in _regions(window, axes, axes[0].radius + margin):
+            cells[window.scene][there] = True
+    return cells
 
 
 def _batches(windows: Sequence[Window], most: int) -> Iterator[list[Window]]:

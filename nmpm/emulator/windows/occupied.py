@@ -57,14 +57,20 @@ def readable_blocks(state: Tensor, materials: int, frames: int, axes: Sequence[A
 
 def count_needed(occupied: Blocks, axes: Sequence[Axis]) -> int:
     """About how many cells the occupied blocks (B, *blocks) and their halos have: windows have no fewer."""
-    for index, axis in enumerate(axes, start=1):
-        reach = min(axis.halo // BLOCK, axis.blocks)
-        pads = [(0, 0)] * occupied.ndim
-        pads[index] = (reach + 1, reach)
-        padded = np.pad(occupied, pads, mode="wrap" if axis.periodic else "constant")
-        sums = np.moveaxis(padded.cumsum(index, dtype=np.int32), index, -1)
-        occupied = np.moveaxis(sums[..., 2 * reach + 1 :] > sums[..., : axis.blocks], -1, index)
+    occupied = dilate(occupied, axes, [axis.halo // BLOCK * BLOCK for axis in axes])
     return int(occupied.sum()) * math.prod(min(BLOCK, axis.cells) for axis in axes)
+
+
+def dilate(blocks: Blocks, axes: Sequence[Axis], cells: Sequence[int]) -> Blocks:
+    """(B, *blocks), True in blocks that have cells up to so many cells from a marked block, along each axis."""
+    for index, (axis, distance) in enumerate(zip(axes, cells, strict=True), start=1):
+        reach = min(-(-distance // BLOCK), axis.blocks)
+        pads = [(0, 0)] * blocks.ndim
+        pads[index] = (reach + 1, reach)
+        padded = np.pad(blocks, pads, mode="wrap" if axis.periodic else "constant")
+        sums = np.moveaxis(padded.cumsum(index, dtype=np.int32), index, -1)
+        blocks = np.moveaxis(sums[..., 2 * reach + 1 :] > sums[..., : axis.blocks], -1, index)
+    return blocks
 
 
 def _extremes(state: Tensor, axes: Sequence[Axis], reduce: Callable[[Tensor, int], Tensor]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -120,10 +121,10 @@ def _inlet(emulator: Emulator, bundles: int) -> Line:
 
 
 def concatenate_particles(one: Particles, other: Particles) -> Particles:
-    """The particles of two states, with the obstacles of the first."""
+    """The particles of two states, with the obstacles of the first, and without fields, which only one may have."""
     names = ("position", "velocity", "material", "mask")
-    both = {name: torch.cat([getattr(one, name), getattr(other, name)], dim=1) for name in names}
-    return dataclasses.replace(one, **both)
+    both: dict[str, Any] = {name: torch.cat([getattr(one, name), getattr(other, name)], dim=1) for name in names}
+    return dataclasses.replace(one, **both, fields={})
 
 
 def bar(scene: Scene, box: tuple[Interval, ...]) -> Tensor:
@@ -143,7 +144,7 @@ def _max_violations(
             for position in made.position[0]:
                 bad = forbidden(position, bundle) | ~position.isfinite().all(-1)
                 most = max(most, int(bad.sum()))
-            state = state.with_motion(made.position[:, -1], made.velocity)
+            state = made.state_after(state)
     return most
 
 

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import BasePredictionWriter
 from nmpm._support.collectives import gather_to_rank0
 from nmpm.data.format import Trajectory, write_split
 from nmpm.data.predictions import predicted_trajectory
+from nmpm.emulator import Rollout
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
@@ -39,8 +40,10 @@ class PredictionWriter(BasePredictionWriter):
     ) -> None:
         scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
         source = f"{trainer.ckpt_path or 'the model'}"
-        for index in range(len(prediction)):
-            self._predicted.append(predicted_trajectory(scene, batch.initial, prediction, source, index))
+        fields = prediction.fields if isinstance(prediction, Rollout) else {}
+        positions = prediction.position if isinstance(prediction, Rollout) else prediction
+        for index in range(len(positions)):
+            self._predicted.append(predicted_trajectory(scene, batch.initial, positions, source, index, fields))
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         by_rank = gather_to_rank0(self._predicted)

@@ -45,6 +45,9 @@ class Part(nn.Module, ABC):
 
     Args:
         emulator: On any device; it is left there.
+
+    Raises:
+        ConfigError: if the emulator has fields beside motion.
     """
 
     inputs: tuple[Value, ...]
@@ -52,6 +55,11 @@ class Part(nn.Module, ABC):
 
     def __init__(self, emulator: Emulator) -> None:
         super().__init__()
+        if emulator.scene.fields:
+            raise ConfigError(
+                f"The model has fields beside motion ({', '.join(emulator.scene.fields)}), which exported files do not"
+                " carry: use the model in Python, or train one without them (data.fields=[])."
+            )
         self.emulator = copy.deepcopy(emulator.with_runtime("eager")).cpu().float().eval().requires_grad_(False)
 
     @property

@@ -14,11 +14,14 @@ from nmpm._support.shipped import find_config
 from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo.queue.plan import Dataset, Extension, continued_training, new_training
+from nmpm.zoo.queue.published import Published
 from nmpm.zoo.runs import BEST
 
 LAST = BEST.with_name("last.ckpt")
 WORDS = "words.json"
 CONFIG = "queued.yaml"
+COPY = "published"
+"""Folder beside the trainings with the entry that the first one started from."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +125,14 @@ class History:
         dataset: What is trained.
         folder: Of the dataset's trainings, called 1, 2, ….
         extension: How the trainings after the first one are made, and when they stop.
+        entry: Folder of the dataset's entry in the zoo, from whose weights the first training goes on, where there is
+            one; None to train from random weights.
     """
 
     dataset: Dataset
     folder: Path
     extension: Extension
+    entry: Path | None = None
 
     @property
     def trainings(self) -> list[Training]:
@@ -135,6 +141,19 @@ class History:
         while (path := self.folder / str(len(found) + 1) / WORDS).is_file():
             found.append(Training(path.parent))
         return found
+
+    @property
+    def before(self) -> Published | None:
+        """The entry that the first training goes on from, or would; None where it starts from random weights."""
+        copy = Published.find(self.folder / COPY)
+        if copy is not None or self.entry is None or self.dataset.start or self.trainings:
+            return copy
+        return Published.find(self.entry)
+
+    @property
+    def parts(self) -> list[Published | Training]:
+        """The entry before the trainings, where there is one, and the trainings."""
+        return [*([] if self.before is None else [self.before]), *self.trainings]
 
     def best(self) -> Training | None:
         """The training of the lowest validation error; None before the first validation."""
@@ -146,32 +165,51 @@ class History:
         trainings = self.trainings
         if trainings and not trainings[-1].finished:
             return len(trainings)
-        return None if trainings and self.stops() else len(trainings) + 1
+        return None if (trainings or self.before) and self.stops() else len(trainings) + 1
 
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
         trainings, extension = self.trainings, self.extension
-        hours = self.dataset.hours + len(trainings) * extension.hours  # with one extension more
-        if hours > extension.limit + 1e-9 or extension.hours <= 0:
+        if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.length(len(trainings) + 1) <= 0:
             return True
-        if len(trainings) < 2:
-            return False
-        before = min(training.error() for training in trainings[:-1])
-        return trainings[-1].error() > (1 - extension.gain) * before
+        errors = [part.error() for part in self.parts]
+        return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
+
+    def length(self, number: int) -> float:
+        """Hours of the training of that number: what the dataset still lacks, else those of an extension."""
+        if number > 1:
+            return self.extension.hours
+        done = 0.0 if self.before is None else self.before.seconds() / 3600
+        return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
+
+    def planned_hours(self, count: int) -> float:
+        """Hours of so many trainings, and of the entry before them."""
+        before = 0.0 if self.before is None else self.before.seconds() / 3600
+        return before + sum(self.length(number) for number in range(1, count + 1))
 
     def open(self, number: int) -> Training:
         """The training of that number, started if it has not been."""
         trainings = self.trainings
         if number <= len(trainings):
             return trainings[number - 1]
-        training, best = Training(self.folder / str(number)), self.best()
-        hours, rate = (self.dataset.hours if number == 1 else self.extension.hours), self.extension.rate
-        if number == 1 and self.dataset.start:
-            best = self._origin().best()
+        training, hours, weights = Training(self.folder / str(number)), self.length(number), self._weights()
         training.start(
-            new_training(self.dataset) if best is None else continued_training(self.dataset, hours, rate, best.best)
+            new_training(self.dataset)
+            if weights is None
+            else continued_training(self.dataset, hours, self.extension.rate, weights)
         )
         return training
+
+    def _weights(self) -> Path | None:
+        """What the next training starts from: the best weights so far; None for random ones."""
+        best, before = self.best(), self.before
+        if before is not None and before.folder != self.folder / COPY:
+            before = before.copy_to(self.folder / COPY)
+        if before is not None and (best is None or before.error() <= best.error()):
+            return before.folder
+        if best is None and self.dataset.start and not self.trainings:
+            best = self._origin().best()
+        return None if best is None else best.best
 
     def waits_for(self) -> str:
         """What must be there before the first training, in words; empty where nothing is missing."""
@@ -187,20 +225,19 @@ class History:
     def hours_left(self) -> tuple[float, float]:
         """Hours of training that are left without further extensions, and with all that the limit allows."""
         trainings, extension = self.trainings, self.extension
-        if not trainings:
-            left, planned = self.dataset.hours, self.dataset.hours
-        else:
-            planned = self.dataset.hours + (len(trainings) - 1) * extension.hours
-            length = self.dataset.hours if len(trainings) == 1 else extension.hours
-            left = 0.0 if trainings[-1].finished else max(length - trainings[-1].seconds() / 3600, 0.0)
+        count = max(len(trainings), 1)
+        finished = trainings[-1].finished if trainings else self.next_round() is None
+        done = trainings[-1].seconds() / 3600 if trainings else 0.0
+        left = 0.0 if finished else max(self.length(count) - done, 0.0)
         if self.next_round() is None or extension.hours <= 0:
             return left, left
-        return left, left + max(extension.limit - planned, 0.0)
+        return left, left + max(extension.limit - self.planned_hours(count), 0.0)
 
     def curve(self) -> list[list[float]]:
         """Seconds, steps and validation MSE over all trainings, one after the other."""
-        points, seconds, steps = [], 0.0, 0
-        for training in self.trainings:
-            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in training.curve()]
-            seconds, steps = seconds + training.seconds(), steps + training.steps()
+        points: list[list[float]] = []
+        seconds, steps = 0.0, 0
+        for part in self.parts:
+            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in part.curve()]
+            seconds, steps = seconds + part.seconds(), steps + part.steps()
         return points

@@ -1,0 +1,131 @@
+"""Fields of a dataset: further numbers by name that each trajectory stores beside its positions.
+
+A field is an HDF5 dataset of the trajectory's group, of shape (T, N), one number for each particle in each frame; or
+(N,), one for each particle; or (), one for the trajectory, which may be an attribute instead. Models are told of those
+that the metadata's `fields` or `data.fields` name and that differ anywhere in the dataset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from nmpm.data.format import Metadata, Split
+from nmpm.data.hdf5 import check_stored_size, open_hdf5
+from nmpm.errors import DataError
+
+Kind = Literal["evolving", "property", "parameter", "constant"]
+
+_SAME = 1e-6
+"""Values that differ by less than this part of the largest one are the same."""
+
+
+@dataclass
+class FieldFacts:
+    """What the trajectories seen so far say about a field.
+
+    Args:
+        shape: Of the first one.
+        low, high: Smallest and largest value of moving particles.
+        evolves: Whether a value changes in time.
+    """
+
+    shape: tuple[int, ...]
+    low: float = np.inf
+    high: float = -np.inf
+    evolves: bool = False
+
+    @property
+    def kind(self) -> Kind:
+        """Evolving, or a property of particles or a parameter of trajectories that is constant in time, or constant."""
+        if not self.high - self.low > _SAME * max(abs(self.low), abs(self.high)):
+            return "constant"
+        if self.evolves:
+            return "evolving"
+        return "parameter" if self.shape == (1, 1) else "property"
+
+    def add(self, values: np.ndarray) -> None:
+        """Add a trajectory's values (T or 1, N or 1) of moving particles."""
+        if values.size:
+            self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
+            change = float(np.ptp(values, axis=0).max())
+            self.evolves |= change > _SAME * float(np.abs(values).max())
+
+
+def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """The fields of a trajectory that it has, (T, N), (1, N) or (1, 1) float32 by name.
+
+    Raises:
+        DataError: if one has another shape, or is no real number.
+    """
+    found: dict[str, np.ndarray] = {}
+    where, sizes = split.where(index), (split.frames(index), split.particles(index))
+    with open_hdf5(split.path) as file:
+        group = file[split.names[index]]
+        for name in names:
+            values = group.get(name)
+            if values is not None and hasattr(values, "dtype"):
+                check_stored_size(values, f"{where}: {name}")
+                found[name] = _arrange(values[()], sizes, f"{where}: {name}")
+            elif name in group.attrs:
+                found[name] = _arrange(group.attrs[name], sizes, f"{where}: {name}")
+    return found
+
+
+def _arrange(values: Any, sizes: tuple[int, int], where: str) -> np.ndarray:
+    """Values as (T, N), (1, N) or (1, 1)."""
+    array = np.asarray(values)
+    if array.dtype.kind in "biuf":
+        if array.size == 1 and array.ndim <= 1:
+            return array.reshape(1, 1).astype(np.float32)
+        if array.shape == sizes:
+            return array.astype(np.float32)
+        if array.shape == sizes[1:]:
+            return array[None].astype(np.float32)
+    raise DataError(
+        f"{where} is {array.dtype} of shape {array.shape}; a field is (T, N) = {sizes} numbers, ({sizes[1]},) or one."
+        " Store each component of a vector as a field of its own."
+    )
+
+
+def survey_fields(
+    split: Split, metadata: Metadata, names: Sequence[str], sample: Iterable[int]
+) -> dict[str, FieldFacts]:
+    """What trajectories say about fields.
+
+    Args:
+        split: Their file.
+        metadata: Says which particles move.
+        names: Of fields; those that a trajectory lacks are left out.
+        sample: Indices of the trajectories to read.
+    """
+    facts: dict[str, FieldFacts] = {}
+    for index in sample if names else ():
+        moving = np.isin(split.particle_type(index), metadata.moving_types)
+        for name, values in read_fields(split, index, names).items():
+            own = values if values.shape[1] == 1 else values[:, moving]
+            facts.setdefault(name, FieldFacts(values.shape)).add(own)
+    return facts
+
+
+def require_fields(split: Split, names: Sequence[str]) -> None:
+    """Make sure that every trajectory has the declared fields.
+
+    Raises:
+        DataError: naming the first that lacks one, and what it has.
+    """
+    if not names:
+        return
+    with open_hdf5(split.path) as file:
+        for index, group_name in enumerate(split.names):
+            group = file[group_name]
+            known = sorted({*group, *group.attrs} - {"position", "particle_type"})
+            missing = [name for name in names if name not in known]
+            if missing:
+                raise DataError(
+                    f"{split.where(index)}: it has no field {', '.join(missing)}, which the metadata's `fields` or"
+                    f" data.fields name (it has: {', '.join(known) or 'none'}). Correct the name, or leave it out."
+                )

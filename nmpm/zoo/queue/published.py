@@ -1,0 +1,57 @@
+"""What an entry of the zoo brings into further trainings of its dataset: its weights, and what they took."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nmpm._support.bounded_files import read_yaml
+
+CARD = "card.yaml"
+
+
+@dataclass(frozen=True)
+class Published:
+    """An entry of the zoo, or a copy of one.
+
+    Args:
+        folder: With its card, configuration and weights.
+    """
+
+    folder: Path
+
+    @classmethod
+    def find(cls, folder: Path) -> Published | None:
+        """The entry in a folder whose card has a curve to go on with; None where there is none."""
+        entry = cls(folder)
+        return entry if (folder / CARD).is_file() and entry.curve() else None
+
+    def copy_to(self, folder: Path) -> Published:
+        """Copy it, so that a later entry in its place does not change what trainings started from."""
+        part = folder.with_name(f"{folder.name}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.copytree(self.folder, part)
+        os.replace(part, folder)
+        return Published(folder)
+
+    def curve(self) -> list[list[float]]:
+        """Seconds of training, steps and MSE of each validation."""
+        return [list(point) for point in self._card().get("curve", [])]
+
+    def error(self) -> float:
+        """The lowest validation MSE."""
+        return min(float(point[2]) for point in self.curve())
+
+    def seconds(self) -> float:
+        """Of training."""
+        return float(self._card().get("training", {}).get("seconds", 0.0))
+
+    def steps(self) -> int:
+        """Of training."""
+        return int(self._card().get("training", {}).get("steps", 0))
+
+    def _card(self) -> dict[str, Any]:
+        return read_yaml(self.folder / CARD)

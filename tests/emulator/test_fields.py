@@ -1,0 +1,266 @@
+"""Fields that particles carry: channels, rates, statistics, and scenes with more or fewer than the model."""
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.decoders import Residual
+from nmpm.emulator import EmulatorRecipe, predict_rollout, rollout, unroll
+from nmpm.emulator.calibration import calibrate
+from nmpm.emulator.rasterise import grid_state
+from nmpm.errors import ConfigError, DataError
+from nmpm.particles import Particles, Window
+from nmpm.processors import UNet
+from nmpm.scene import Scene
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic
+from nmpm.zoo.export.parts import Step
+
+SMALL = UNet(width=4, depth=1, perceptron=(4,))
+ALL = {"evolving": ("temperature",), "properties": ("stiffness",), "parameters": ("friction",)}
+
+
+def small(scene, transfer=Linear(), frames=3):
+    torch.manual_seed(0)
+    return EmulatorRecipe(scene, 16, frames, transfer, SMALL, Residual()).build().eval()
+
+
+def constant_rate(emulator, rate):
+    """The emulator with a network that says zero for velocities and one number for the rates of fields."""
+    for parameter in emulator.processor.parameters():
+        torch.nn.init.zeros_(parameter)
+    flows = emulator.scene.dim * len(emulator.scene.materials)
+
+    def constant(module, inputs, output):
+        output = output.clone()
+        output[:, :, flows:] = rate
+        return output
+
+    emulator.processor.register_forward_hook(constant)
+    return emulator
+
+
+def with_fields(particles, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    batch, count = particles.mask.shape
+    values = {
+        "temperature": 1 + 0.1 * torch.rand(batch, count, generator=generator),
+        "stiffness": torch.rand(batch, count, generator=generator),
+        "friction": torch.rand(batch, 1, generator=generator),
+    }
+    return particles.with_fields(values)
+
+
+def test_the_channels_follow_from_the_fields():
+    scene = box(2, ("water", "sand"), **ALL)
+    assert scene.input_channels[-5:] == (
+        "water.temperature", "water.stiffness", "sand.temperature", "sand.stiffness", "friction",
+    )  # fmt: skip
+    assert scene.output_channels[-2:] == ("water.temperature", "sand.temperature")
+    assert scene.input_channels[:-5] == box(2, ("water", "sand")).input_channels
+    assert Scene.from_dict(scene.to_dict()) == scene
+    assert not {"evolving", "properties", "parameters"} & set(box().to_dict())
+    assert not [name for name in small(box()).state_dict() if "field" in name]
+
+
+@pytest.mark.parametrize("name", ["velocity_x", "gravity_x", "a b", "position", ""])
+def test_names_that_channels_cannot_have_are_refused(name):
+    with pytest.raises(ConfigError, match="field cannot be called"):
+        box(evolving=(name,))
+    with pytest.raises(ConfigError, match="given twice"):
+        box(evolving=("heat",), parameters=("heat",))
+
+
+@pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic(), Affine()])
+def test_a_field_that_is_the_same_everywhere_is_so_on_the_grid_and_stays_so(transfer):
+    scene = box(2, ("water", "sand"), evolving=("temperature",))
+    emulator = constant_rate(small(scene, transfer), 0.0)
+    particles = cloud(scene, speed=0.005)
+    particles = particles.with_fields({"temperature": torch.full(particles.mask.shape, 1.25)})
+    cells, velocity, _ = emulator.in_cells(particles)
+    solid = emulator.solid(particles)
+    state = grid_state(scene, emulator.grid, transfer, particles, cells, velocity, solid, emulator.field_scales)
+    for index, material in enumerate(scene.materials):
+        occupied = state[:, scene.input_channels.index(f"{material}.volume")] > 0
+        channel = state[:, -2 + index]
+        torch.testing.assert_close(channel[occupied], torch.full_like(channel[occupied], 1.25))
+        assert (channel[~occupied] == 0).all()
+    assert (predict_rollout(emulator, particles, 20).fields["temperature"] == 1.25).all()
+
+
+def test_a_field_is_carried_along_by_its_particles_to_the_bit():
+    scene = box(evolving=("temperature",))
+    emulator = constant_rate(small(scene), 0.0)
+    particles = with_fields(cloud(scene, speed=0.01))
+    predicted = predict_rollout(emulator, particles, 10)
+    assert (predicted.position[:, -1] != particles.position).any()
+    expected = particles.fields["temperature"].unsqueeze(1).expand(-1, 10, -1)
+    assert torch.equal(predicted.fields["temperature"], expected)
+
+
+def test_a_uniform_rate_adds_up_over_frames_and_bundles():
+    scene = box(evolving=("temperature",))
+    emulator = constant_rate(small(scene), 0.5)
+    emulator.field_scales.std.fill_(0.1)
+    particles = with_fields(cloud(scene))
+    found = predict_rollout(emulator, particles, 7).fields["temperature"]
+    steps = 0.05 * torch.arange(1, 8).view(1, -1, 1)
+    torch.testing.assert_close(found, particles.fields["temperature"].unsqueeze(1) + steps)
+
+
+def test_each_material_has_its_own_rate():
+    scene = box(2, ("water", "sand"), evolving=("temperature",))
+    emulator = constant_rate(small(scene), torch.tensor([1.0, -2.0]).view(1, 1, 2, 1, 1))
+    particles = with_fields(cloud(scene))
+    found = predict_rollout(emulator, particles, 1).fields["temperature"][:, 0] - particles.fields["temperature"]
+    torch.testing.assert_close(found, torch.where(particles.material == 0, 1.0, -2.0))
+
+
+@pytest.mark.parametrize("transfer", [Linear(), Quadratic()])
+def test_sums_of_fields_and_their_gathering_are_adjoint(transfer):
+    scene = box()
+    particles = cloud(scene, count=40)
+    grid = small(scene).grid
+    cells = grid.to_cells(particles.position).double()
+    values, field = torch.rand(1, 40, 3).double(), torch.rand(1, 3, *grid.shape).double()
+    sums, count = transfer.sums(values, torch.ones(1, 40, 1).double(), cells, grid)
+    left, right = (sums * field).sum(), (values * transfer.g2p(field, cells, grid)).sum()
+    torch.testing.assert_close(left, right)
+    torch.testing.assert_close(sums.sum((0, 2, 3)), values.sum((0, 1)))
+    assert float(count.sum()) == pytest.approx(40)
+
+
+@pytest.mark.parametrize("filler", [0.0, 1e30, float("nan")])
+def test_padded_particles_change_no_field_to_the_bit(filler):
+    scene = box(**ALL)
+    emulator, particles = small(scene), with_fields(cloud(scene, count=20))
+
+    def pad(values, number):
+        return torch.cat([values, values.new_full((1, 7, *values.shape[2:]), number)], dim=1)
+
+    fields = {
+        name: values if values.shape[1] == 1 else pad(values, filler) for name, values in particles.fields.items()
+    }
+    padded = Particles(
+        pad(particles.position, 0.5), pad(particles.velocity, 0.3), pad(particles.material, 0),
+        pad(particles.mask, False), particles.obstacle, particles.obstacle_mask, particles.gravity, fields,
+    )  # fmt: skip
+    one, other = predict_rollout(emulator, particles, 7), predict_rollout(emulator, padded, 7)
+    assert torch.equal(one.position, other.position[:, :, :20])
+    assert torch.equal(one.fields["temperature"], other.fields["temperature"][..., :20])
+
+
+def test_the_order_of_particles_does_not_matter():
+    scene = box(**ALL)
+    emulator, particles = small(scene), with_fields(cloud(scene, count=25))
+    order = torch.randperm(25, generator=torch.Generator().manual_seed(1))
+    fields = {name: v if v.shape[1] == 1 else v[:, order] for name, v in particles.fields.items()}
+    changed = dataclasses.replace(
+        particles.with_motion(particles.position[:, order], particles.velocity[:, order]),
+        material=particles.material[:, order], fields=fields,
+    )  # fmt: skip
+    one, other = predict_rollout(emulator, particles, 6), predict_rollout(emulator, changed, 6)
+    torch.testing.assert_close(one.fields["temperature"][..., order], other.fields["temperature"])
+
+
+def test_a_rollout_goes_on_from_any_bundle_to_the_bit():
+    scene = box(**ALL)
+    emulator, particles = small(scene), with_fields(cloud(scene))
+    whole = predict_rollout(emulator, particles, 6)
+    with torch.no_grad():
+        first = next(unroll(emulator, particles, 1))
+    rest = predict_rollout(emulator, first.state_after(particles), 3)
+    assert torch.equal(whole.fields["temperature"][:, 3:], rest.fields["temperature"])
+    assert torch.equal(whole.position, rollout(emulator, particles, 6))
+
+
+def test_a_field_that_still_changes_keeps_a_scene_at_rest_going():
+    scene = box(gravity=None, evolving=("temperature",))
+    emulator = constant_rate(small(scene), 1.0)
+    particles = with_fields(cloud(scene, speed=0.0))
+    found = predict_rollout(emulator, particles, 12)
+    assert torch.equal(found.position[:, 0], found.position[:, -1])
+    assert (found.fields["temperature"].diff(dim=1) > 0.5).all()
+
+
+def test_a_missing_field_has_its_training_mean_and_is_named():
+    scene = box(**ALL)
+    emulator, particles = small(scene), with_fields(cloud(scene))
+    emulator.field_scales.mean.copy_(torch.tensor([1.05, 0.4, 0.3]))
+    lacking = dataclasses.replace(particles, fields={})
+    means = {
+        "temperature": torch.full(particles.mask.shape, 1.05),
+        "stiffness": torch.full(particles.mask.shape, 0.4),
+        "friction": torch.full((1, 1), 0.3),
+    }
+    with pytest.warns(UserWarning, match="has no stiffness.*training mean, 0.4,"):
+        found = predict_rollout(emulator, lacking, 5)
+    expected = predict_rollout(emulator, particles.with_fields(means), 5)
+    torch.testing.assert_close(found.position, expected.position)
+    torch.testing.assert_close(found.fields["temperature"], expected.fields["temperature"])
+
+
+def test_a_field_that_the_model_does_not_have_changes_nothing():
+    scene = box()
+    emulator, particles = small(scene), cloud(scene)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(rollout(emulator, particles, 4), rollout(emulator, with_fields(particles), 4))
+
+
+def test_one_number_per_scene_is_not_taken_from_particles():
+    scene = box(**ALL)
+    particles = with_fields(cloud(scene)).with_fields({"friction": torch.zeros(1, 30)})
+    with pytest.raises(DataError, match="one friction for each trajectory"):
+        small(scene)(particles)
+
+
+def test_fields_that_are_not_finite_are_refused():
+    scene = box(**ALL)
+    particles = with_fields(cloud(scene))
+    particles.fields["temperature"][0, 4] = float("nan")
+    with pytest.raises(DataError, match="particle 4: its temperature is"):
+        rollout(small(scene), particles, 3)
+
+
+def test_calibration_measures_fields_over_real_particles_and_scenes():
+    scene = box(**ALL)
+    state = cloud(scene, count=8, batch=2)
+    mask = torch.ones(2, 8, dtype=torch.bool)
+    mask[1, 4:] = False
+    rise = torch.arange(6.0).view(1, 6, 1).expand(2, 6, 8)
+    frames = state.position.unsqueeze(1) + 0.001 * rise.unsqueeze(-1)
+    temperature = (1 + 0.01 * rise).clone()
+    temperature[1, :, 4:] = 1e6
+    friction = torch.tensor([1.0, 3.0]).view(2, 1, 1)
+    stiffness = torch.full((2, 1, 8), 7.0)
+    values = {"temperature": temperature, "stiffness": stiffness, "friction": friction}
+    window = Window(frames, state.material, mask, state.obstacle, state.obstacle_mask, state.gravity, values)
+    emulator = small(scene)
+    calibrate(emulator, [window])
+    levels = 1 + 0.01 * torch.arange(6.0)
+    scales = emulator.field_scales
+    torch.testing.assert_close(scales.mean, torch.tensor([float(levels.mean()), 7.0, 2.0]))
+    torch.testing.assert_close(scales.std, torch.tensor([float(levels.std(correction=0)), 1.0, 1.0]))
+    rate = 0.01 / levels.std(correction=0)
+    torch.testing.assert_close(emulator.output_scale[:, -1].flatten(), rate.expand(3))
+
+
+def test_other_scenes_keep_the_models_fields_and_exports_refuse_them():
+    emulator = small(box(**ALL))
+    assert emulator.over(box(bounds=((0.1, 0.9),) * 2)).scene.fields == emulator.scene.fields
+    recipe = EmulatorRecipe.from_dict(emulator.recipe.to_dict())
+    assert recipe.scene == emulator.scene
+    with pytest.raises(ConfigError, match=r"temperature, stiffness, friction.*exported files do not"):
+        Step(emulator)
+
+
+def test_gradients_reach_the_fields():
+    scene = box(**ALL)
+    particles = with_fields(cloud(scene, count=6))
+    heat = particles.fields["temperature"].clone().requires_grad_(True)
+    bundle = small(scene)(particles.with_fields({"temperature": heat}))
+    bundle.fields["temperature"][:, -1].sum().backward()
+    assert (heat.grad.abs() > 0).all()

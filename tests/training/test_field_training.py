@@ -1,0 +1,108 @@
+"""Trainings on data with fields: losses, metrics, resuming, and other data than the model's."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from test_training import module_of, trainer_of
+
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.errors import ConfigError
+from nmpm.metrics import FieldMSE
+from nmpm.particles import Window
+from nmpm.training import EmulatorModule
+from nmpm.training.checkpoints import load_module
+from nmpm.training.losses import FieldError
+from nmpm.zoo.pretrained import Pretrained
+
+
+@pytest.fixture
+def heated(make_dataset):
+    return make_dataset(fields=("temperature",))
+
+
+def data_of(folder, **options):
+    return TrajectoryDataModule(path=str(folder), horizon=4, batch_size=2, **options)
+
+
+def window_of(target, mask):
+    batch, frames, count = target.shape
+    return Window(
+        torch.zeros(batch, frames, count, 2), torch.zeros(batch, count, dtype=torch.int64), mask,
+        torch.zeros(batch, 0, 2), torch.zeros(batch, 0, dtype=torch.bool), torch.zeros(batch, 2), {"heat": target},
+    )  # fmt: skip
+
+
+def test_the_loss_is_the_mean_square_in_units_of_the_spread():
+    target, mask = torch.zeros(2, 6, 3), torch.tensor([[True, True, True], [True, False, False]])
+    predicted = torch.full((2, 4, 3), 0.2)
+    predicted[1, :, 1:] = 1e6
+    error = FieldError(weight=3.0, power=0.5)
+    found = error({"heat": predicted, "other": predicted}, window_of(target, mask), {"heat": torch.tensor(0.1)}, 2)
+    assert float(found) == pytest.approx(3 * (4 + 1e-4) ** 0.5)
+    assert FieldError(weight=0.0)({"heat": predicted}, window_of(target, mask), {}, 2) == 0
+
+
+def test_the_metric_is_a_mean_over_trajectories_beside_nothing_changing():
+    target = torch.arange(4.0).view(1, 4, 1).expand(1, 4, 3)
+    mask = torch.tensor([[True, True, False]])
+    metric = FieldMSE(["heat"])
+    for shift in (1.0, 3.0):
+        metric.update(window_of(target, mask), {"heat": target[:, 2:] + shift})
+    assert {name: float(value) for name, value in metric.compute().items()} == {
+        "mse_heat": 5.0,
+        "still/mse_heat": 2.5,
+    }
+    empty = FieldMSE([])
+    empty.update(window_of(target, mask), {})
+    assert empty.compute() == {}
+
+
+def test_a_resumed_training_with_fields_ends_with_the_same_weights(heated, tmp_path):
+    def made():
+        data = data_of(heated)
+        return module_of(data), data
+
+    whole, resumed = made(), made()
+    assert whole[0].emulator.scene.evolving == ("temperature",)
+    trainer_of(tmp_path / "whole", 6).fit(*whole)
+    trainer_of(tmp_path / "parts", 4).fit(*made())
+    trainer_of(tmp_path / "parts", 6).fit(*resumed, ckpt_path=tmp_path / "parts" / "last.ckpt", weights_only=True)
+    for name, value in whole[0].state_dict().items():
+        assert torch.equal(value, resumed[0].state_dict()[name]), name
+    loaded = load_module(tmp_path / "parts" / "last.ckpt").emulator
+    assert loaded.scene == whole[0].emulator.scene
+    assert torch.equal(loaded.field_scales.mean, whole[0].emulator.field_scales.mean)
+    without = data_of(heated, fields=[])
+    with pytest.raises(ConfigError, match="trained with the fields temperature, the model has none"):
+        trainer_of(tmp_path, 1).test(module_of(without), without, ckpt_path=tmp_path / "parts" / "last.ckpt")
+
+
+def test_models_with_more_and_with_fewer_fields_than_the_data_are_tested(heated, tmp_path):
+    with_heat, without = data_of(heated), data_of(heated, fields=[])
+    more, fewer = module_of(with_heat), module_of(without)
+    [errors] = trainer_of(tmp_path, 1).test(more, with_heat, verbose=False)
+    assert {"test/mse", "test/mse_temperature", "test/still/mse_temperature"} <= set(errors)
+    with pytest.warns(UserWarning, match="The scene has no temperature, which the model was trained with"):
+        [errors] = trainer_of(tmp_path, 1).test(EmulatorModule.of(more.emulator), without, verbose=False)
+    assert "test/mse_temperature" not in errors
+    with pytest.warns(UserWarning, match="trained without temperature and ignores it"):
+        [errors] = trainer_of(tmp_path, 1).test(fewer, with_heat, verbose=False)
+    assert "test/mse" in errors
+
+
+def test_predictions_hold_positions_and_fields(heated, tmp_path):
+    data = data_of(heated)
+    [first, *_] = trainer_of(tmp_path, 1).predict(module_of(data), data)
+    assert first.fields["temperature"].shape == first.position.shape[:-1]
+
+
+def test_states_take_fields_by_name(heated):
+    data = data_of(heated)
+    model = Pretrained(module_of(data).emulator.eval(), {})
+    with pytest.warns(UserWarning, match="trained without mood and ignores it"):
+        state = model.state(np.full((4, 2), 0.5), fields={"temperature": np.arange(4.0), "mood": 1.0})
+    assert state.fields["temperature"].tolist() == [[0.0, 1.0, 2.0, 3.0]]
+    assert model.state(np.full((4, 2), 0.5), fields={"temperature": 2.0}).fields["temperature"].shape == (1, 4)
+    with h5py.File(heated / "test.h5") as file:
+        assert "temperature" in file["00000"]
