@@ -17,7 +17,7 @@ from nmpm.emulator.departure import Departure
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
-from nmpm.transfer.backends import is_chosen
+from nmpm.transfer.backends import kernels_take
 
 if TYPE_CHECKING:
     from nmpm.emulator.bundle import RolloutContext
@@ -137,6 +137,35 @@ class FusedSteps(Steps):
         return positions
 
 
+@dataclass(frozen=True)
+class TrainingSteps(TensorSteps):
+    """The steps of trainings as kernels with gradients; only for what `steps_for` gives them to.
+
+    Args:
+        plan: Of the emulator.
+    """
+
+    plan: Plan
+
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        from nmpm.emulator.fused.training import Rasterise
+
+        own = particles
+        cells, velocity, gravity, state = Rasterise.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
+            self.plan, own.position, own.velocity, own.gravity, own.material, own.mask, solid
+        )
+        return cells, velocity, gravity, state
+
+    def path(self, start: Departure, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
+        from nmpm.emulator.fused.training import FreePath
+
+        path: Tensor = FreePath.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
+            self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
+            start.output, start.scale,
+        )  # fmt: skip
+        return path
+
+
 def _kernels() -> Any:
     """The functions of `calls`; in graphs that are being traced those of `operators`. Imported late, as Numba is."""
     if torch.compiler.is_compiling():
@@ -151,13 +180,22 @@ def _kernels() -> Any:
 def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
-    Kernels run on a CPU, in float32, without gradients, in evaluation mode, for the parts of this package (`make_plan`)
-    and outside of `nmpm.transfer.using`.
+    Kernels run on a CPU, in float32, for the parts of this package (`make_plan`) and outside of `nmpm.transfer.using`:
+    in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation mode those without.
     """
-    tensors = (particles.position, particles.velocity, particles.gravity)
-    plain = all(values.device.type == "cpu" and values.dtype == torch.float32 for values in tensors)
-    if plan is None or emulator.training or not plain or is_chosen() or emulator.precision != torch.float32:
+    own = (particles.position, particles.velocity)
+    fixed = (particles.gravity, solid)
+    if plan is None or emulator.precision != torch.float32 or not kernels_take(*own, particles.gravity):
         return TensorSteps(emulator)
-    if torch.is_grad_enabled() and any(values.requires_grad for values in (*tensors, solid, *emulator.parameters())):
-        return TensorSteps(emulator)
-    return FusedSteps(plan, emulator.walls)
+    if emulator.training:
+        covered = plan.trains and not _needs_gradients(*fixed) and not torch.compiler.is_compiling()
+        return TrainingSteps(emulator, plan) if covered else TensorSteps(emulator)
+    return (
+        TensorSteps(emulator)
+        if _needs_gradients(*own, *fixed, *emulator.parameters())
+        else FusedSteps(plan, emulator.walls)
+    )
+
+
+def _needs_gradients(*tensors: Tensor) -> bool:
+    return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)

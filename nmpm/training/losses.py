@@ -18,6 +18,7 @@ from nmpm.grid import Grid
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
+from nmpm.transfer.backends import kernels_take
 
 _FLOOR = 1e-4
 """Cells², added to errors before they are raised to a power: below a hundredth of a cell errors no longer count."""
@@ -129,6 +130,11 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
         grid: Gives the cells' size.
         frames: m; T is a multiple of it.
     """
+    if _kernels_take(predicted, target, grid):
+        from nmpm.training.kernels import PositionErrors
+
+        errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
+        return errors
     squared = grid.to_cell_displacement(predicted - target).square().mean(-1) * mask.unsqueeze(1)
     bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
     return bundles.mean(-1) / mask.sum(1, keepdim=True)
@@ -162,11 +168,30 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
     Returns:
         A number; NaN if there is no real particle.
     """
+    fraction = scene.particle_volume / grid.cell_volume
+    count = _kernel_counts if _kernels_take(predicted, target, grid) else _counts
+    found, true = (fraction * count(grid.to_cells(frames), window, scene, grid) for frames in (predicted, target))
+    particles = window.mask.sum() * predicted.shape[1]
+    return (found - true).square().sum() / (2 * fraction * particles)
+
+
+def _counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
+    """The number of particles of each material on the nodes by linear weights, (B F, M, *S), at cells (B, F, N, D)."""
     kinds = torch.arange(len(scene.materials), device=window.material.device)
     member = (window.material.unsqueeze(-1) == kinds) & window.mask.unsqueeze(-1)
-    weight = member.to(torch.float32).repeat_interleave(predicted.shape[1], dim=0)
-    fraction = scene.particle_volume / grid.cell_volume
-    found, true = (
-        fraction * Linear().p2g(weight, grid.to_cells(frames.flatten(0, 1)), grid) for frames in (predicted, target)
-    )
-    return (found - true).square().sum() / (2 * fraction * weight.sum())
+    weight = member.to(torch.float32).repeat_interleave(cells.shape[1], dim=0)
+    return Linear().p2g(weight, cells.flatten(0, 1), grid)
+
+
+def _kernel_counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
+    """The same, (B, F, size, M)."""
+    from nmpm.training.kernels import Counts
+
+    counts: Tensor = Counts.apply(cells, window.material, window.mask, grid, len(scene.materials))  # type: ignore[no-untyped-call]
+    return counts
+
+
+def _kernels_take(predicted: Tensor, target: Tensor, grid: Grid) -> bool:
+    """Whether the kernels can compute the error: with gradients with respect to the prediction alone."""
+    fixed = not target.requires_grad and not torch.compiler.is_compiling()
+    return fixed and grid.dim > 1 and kernels_take(predicted, target)

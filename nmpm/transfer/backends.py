@@ -90,6 +90,11 @@ def is_chosen() -> bool:
     return _chosen.get() is not None
 
 
+def kernels_take(*values: Tensor) -> bool:
+    """Whether fused kernels can take these tensors: float32 on a CPU, outside of `using`."""
+    return not is_chosen() and all(each.device.type == "cpu" and each.dtype == torch.float32 for each in values)
+
+
 def add(source: Tensor, index: Tensor, size: int) -> Tensor:
     """Sum values into places.
 

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from nmpm._support.parallel import map_ranges, split
+from nmpm.emulator.fused.arrays import as_array, check_materials, material_rows, output_rows
 from nmpm.emulator.fused.crowd import CrowdArrays, spread_scene
 from nmpm.emulator.fused.flight import land
 from nmpm.emulator.fused.path import SceneArrays, check_scene_reads, clear_of_obstacles, fly_scene, rest_scene
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.fused.rasterise import rasterise_scene
 from nmpm.emulator.fused.surroundings import Surroundings, survey, survey_rollout
-from nmpm.transfer.fused.fields import unpack_bfloat16, unpack_float32
 
 __all__ = ["predict_path", "rasterise", "survey", "survey_rollout", "to_length", "uncrowd"]
 
@@ -39,12 +39,21 @@ def rasterise(
     """
     batch, count, dim = position.shape
     cells, moved = np.empty((2, batch, count, dim), np.float32)
-    pull = _array(gravity) / plan.box[1]
+    pull = as_array(gravity) / plan.box[1]
     channels = len(plan.mass) * (dim + 1) + plan.solid + dim * plan.constants
     state = np.empty((batch, *plan.shape, channels), np.float32)
-    kinds, threads = _materials(plan, material), torch.get_num_threads()
-    solids = _array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
-    inputs: tuple[Any, ...] = (_array(position), _array(velocity), pull, kinds, _array(mask), solids, cells, moved)
+    kinds, threads = material_rows(plan, material), torch.get_num_threads()
+    solids = as_array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
+    inputs: tuple[Any, ...] = (
+        as_array(position),
+        as_array(velocity),
+        pull,
+        kinds,
+        as_array(mask),
+        solids,
+        cells,
+        moved,
+    )
     rows = state.reshape(batch, solids.shape[2], channels)
     for scene in range(batch):
         first, speed, fall, kind, real, wall, here, own = (values[scene] for values in inputs)
@@ -70,21 +79,20 @@ def predict_path(
     batch, count, dim = cells.shape
     frames, size = output.shape[1], math.prod(plan.shape)
     path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
-    own, threads = _materials(plan, material), torch.get_num_threads()
-    if own.size and not (own.min() >= 0 and own.max() < len(plan.mass)):
-        raise IndexError(f"A particle's material is not an index from 0 to {len(plan.mass) - 1}.")
-    rows = _array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
-    factors, flows = _array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
-    predicted, unpack = _rows(output)
+    own, threads = material_rows(plan, material), torch.get_num_threads()
+    check_materials(plan, own)
+    rows = as_array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
+    factors, flows = as_array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
+    predicted, unpack = output_rows(output)
     known = survey(plan, solid, walls) if surroundings is None else surroundings
-    inputs: tuple[Any, ...] = (_array(cells), _array(velocity), own, _array(mask), _array(gravity)[:, 0], rows)
+    inputs: tuple[Any, ...] = (as_array(cells), as_array(velocity), own, as_array(mask), as_array(gravity)[:, 0], rows)
     for scene in range(batch):
         unpack(predicted[scene], factors, flows)
         here, speed, kind, real, fall, grid = (values[scene] for values in inputs)
         start = SceneArrays(here, speed, kind, real, fall, grid, flows)
         fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
         if readable is not None:
-            check_scene_reads(start, plan, _array(readable[scene]).reshape(-1), path[scene], threads)
+            check_scene_reads(start, plan, as_array(readable[scene]).reshape(-1), path[scene], threads)
         if plan.obstacles and plan.solids:
             clear_of_obstacles(start, plan, known[scene], path[scene], threads)
         if plan.rest_speed:
@@ -101,8 +109,8 @@ def uncrowd(
     From a path (B, m, N, D) of `predict_path`, and by a plan with a density cap.
     """
     known = survey(plan, solid, walls) if surroundings is None else surroundings
-    own, threads, spread = _materials(plan, material), torch.get_num_threads(), np.empty(path.shape, np.float32)
-    inputs: tuple[Any, ...] = (_array(cells), own, _array(mask), _array(gravity)[:, 0], _array(path))
+    own, threads, spread = material_rows(plan, material), torch.get_num_threads(), np.empty(path.shape, np.float32)
+    inputs: tuple[Any, ...] = (as_array(cells), own, as_array(mask), as_array(gravity)[:, 0], as_array(path))
     for scene, around in enumerate(known):
         arrays = CrowdArrays(*(values[scene] for values in inputs))
         spread_scene(arrays, plan, around, None if budget is None else float(budget[scene]), spread[scene], threads)
@@ -115,20 +123,3 @@ def to_length(plan: Plan, path: Tensor) -> Tensor:
         convert = partial(land, frames, plan.box)
         map_ranges(convert, split(frames.shape[1], _CHUNK), torch.get_num_threads())
     return path
-
-
-def _array(tensor: Tensor) -> Any:
-    return tensor.detach().contiguous().numpy()
-
-
-def _rows(output: Tensor) -> tuple[Any, Any]:
-    """A network's output as rows (B, size, m C), one per node, and the kernel that unpacks them."""
-    rows = output.detach().movedim((1, 2), (-2, -1)).flatten(-2).flatten(1, -2)
-    if output.dtype == torch.bfloat16:
-        return rows.contiguous().view(torch.uint16).numpy(), unpack_bfloat16
-    return rows.float().contiguous().numpy(), unpack_float32
-
-
-def _materials(plan: Plan, material: Tensor) -> Any:
-    """(B, N) indices, (B, 0) where there is only one material."""
-    return _array(material) if len(plan.mass) > 1 else np.empty((len(material), 0), np.int64)

@@ -92,6 +92,11 @@ class Plan:
         """Number of axes."""
         return len(self.shape)
 
+    @property
+    def trains(self) -> bool:
+        """Whether there are kernels of the gradients, see `nmpm.emulator.fused.training`."""
+        return self.scatter_nodes == self.gather_nodes == 2 and not self.reflects
+
     @cached_property
     def scatter_grid(self) -> tuple[Any, ...]:
         """Shape, periodic axes and nodes as the kernels of p2g take them."""

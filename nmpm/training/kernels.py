@@ -1,0 +1,154 @@
+"""The training error's sums over particles as Numba kernels with gradients, for a CPU.
+
+Each scene is a thread's work, so that results do not depend on how many threads there are. Second derivatives are an
+error.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nmpm._support.jit import jit, jit_sum
+from nmpm._support.parallel import map_ranges, split
+from nmpm.grid import Grid
+from nmpm.transfer.fused.adjoint import scatter_adjoint
+from nmpm.transfer.fused.scatter import scatter
+
+ZERO = np.float32(0)
+_LINEAR = (0, 0)
+_NONE = np.empty((0, 0), np.float32)
+
+
+class PositionErrors(torch.autograd.Function):
+    """`losses.position_errors` with gradients with respect to the predicted positions."""
+
+    @staticmethod
+    def forward(ctx: Any, predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
+        """(B, T / frames) errors; arguments as of `losses.position_errors`, float32."""
+        errors = np.empty((len(predicted), predicted.shape[1] // frames), np.float32)
+        spacing = np.array(grid.spacing, np.float32)
+
+        def measure(b: int) -> None:
+            sum_squares(_array(predicted[b]), _array(target[b]), _array(mask[b]), spacing, frames, errors[b])
+
+        _for_each_scene(measure, len(errors))
+        ctx.save_for_backward(predicted, target, mask)
+        ctx.spacing, ctx.frames = spacing, frames
+        return torch.from_numpy(errors)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        """The gradient with respect to the predicted positions."""
+        predicted, target, mask = ctx.saved_tensors
+        found, pull = np.empty(predicted.shape, np.float32), _array(slope)
+
+        def follow(b: int) -> None:
+            arrays = _array(predicted[b]), _array(target[b]), _array(mask[b])
+            square_slopes(*arrays, ctx.spacing, ctx.frames, pull[b], found[b])
+
+        _for_each_scene(follow, len(found))
+        return torch.from_numpy(found), None, None, None, None
+
+
+class Counts(torch.autograd.Function):
+    """The number of particles of each material on the nodes by linear weights, with gradients to their positions."""
+
+    @staticmethod
+    def forward(ctx: Any, cells: Tensor, material: Tensor, mask: Tensor, grid: Grid, materials: int) -> Tensor:
+        """(B, F, size, M) numbers.
+
+        Args:
+            ctx: Keeps what the backward pass needs.
+            cells: (B, F, N, D) positions in cells at F frames.
+            material: (B, N) indices.
+            mask: (B, N) bool, False for padding.
+            grid: Of 2 or 3 axes.
+            materials: M.
+        """
+        counts = np.zeros((*cells.shape[:2], grid.size, materials), np.float32)
+        none = np.empty((cells.shape[2], 0), np.float32)
+
+        def add(b: int) -> None:
+            kind, real, here = _kinds(material[b], materials), _array(mask[b]), _array(cells[b])
+            for frame in range(len(here)):
+                scatter(none, kind, real, here[frame], grid.shape, grid.periodic, _LINEAR, counts[b, frame])
+
+        _for_each_scene(add, len(cells))
+        ctx.save_for_backward(cells, material, mask)
+        ctx.grid = grid
+        return torch.from_numpy(counts)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        """The gradient with respect to the positions."""
+        cells, material, mask = ctx.saved_tensors
+        grid: Grid = ctx.grid
+        place, pull = np.zeros(cells.shape, np.float32), _array(slope)
+        none = np.empty((cells.shape[2], 0), np.float32)
+
+        def follow(b: int) -> None:
+            kind, real, here = _kinds(material[b], slope.shape[-1]), _array(mask[b]), _array(cells[b])
+            for frame in range(len(here)):
+                scatter_adjoint(
+                    none, kind, real, here[frame], grid.shape, grid.periodic, _NONE, pull[b, frame], place[b, frame],
+                    none,
+                )  # fmt: skip
+
+        _for_each_scene(follow, len(cells))
+        return torch.from_numpy(place), None, None, None, None
+
+
+@jit_sum
+def sum_squares(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, errors: Any) -> Any:
+    """Fill in the errors of the bundles of a scene.
+
+    Args:
+        predicted: (T, N, D) positions.
+        target: (T, N, D), likewise.
+        mask: (N,) bool.
+        spacing: (D,), the cells' widths.
+        frames: To a bundle.
+        errors: (T / frames,), is filled.
+    """
+    axes, scale = predicted.shape[2], 1 / (frames * predicted.shape[2] * np.float64(mask.sum()))
+    for bundle in range(len(errors)):
+        total = 0.0
+        for frame in range(bundle * frames, (bundle + 1) * frames):
+            for d in range(axes):
+                part = ZERO
+                for p in range(len(mask)):
+                    way = (predicted[frame, p, d] - target[frame, p, d]) / spacing[d]
+                    part += way * way if mask[p] else ZERO
+                total += np.float64(part)
+        errors[bundle] = total * scale
+
+
+@jit
+def square_slopes(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, slope: Any, found: Any) -> Any:
+    """Fill in `found` (T, N, D), the gradient with respect to `predicted`, from `slope` (T / frames,); see above."""
+    scale = 2 / (frames * predicted.shape[2] * np.float64(mask.sum()))
+    for frame in range(len(predicted)):
+        for d in range(predicted.shape[2]):
+            factor = np.float32(scale * slope[frame // frames] / (spacing[d] * spacing[d]))
+            for p in range(len(mask)):
+                found[frame, p, d] = factor * (predicted[frame, p, d] - target[frame, p, d]) if mask[p] else ZERO
+
+
+def _for_each_scene(work: Any, scenes: int) -> None:
+    map_ranges(lambda low, _: work(low), split(scenes, 1), torch.get_num_threads())
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.detach().contiguous().numpy()
+
+
+def _kinds(material: Tensor, materials: int) -> Any:
+    """(N,) indices, (0,) where there is only one material."""
+    return _array(material) if materials > 1 else np.empty(0, np.int64)
