@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -29,7 +30,7 @@ from nmpm.processors import UNet
 from nmpm.scene import Scene
 from nmpm.sim import load_preset
 from nmpm.training.losses import position_error
-from nmpm.transfer import Linear, Nearest, Transfer
+from nmpm.transfer import Linear, Nearest, Transfer, using
 
 UNCONSTRAINED = Constraints(solids=False)
 CELLS, FRAMES, DEPTH = 64, 8, 3
@@ -45,6 +46,7 @@ class Setup:
         precision: Of the network.
         paper: Channels first, and walls rasterised for each bundle.
         width_factor: Width of the network over the width that the benchmark asks for.
+        kernels: Whether fused kernels may compute what is around the network.
     """
 
     transfer: Transfer
@@ -53,6 +55,11 @@ class Setup:
     precision: torch.dtype
     paper: bool = False
     width_factor: float = 1.0
+    kernels: bool = True
+
+    def backend(self) -> AbstractContextManager[None]:
+        """Within it what the setup says runs around the network."""
+        return nullcontext() if self.kernels else using("native")
 
 
 SETUPS: Mapping[str, Setup] = MappingProxyType(
@@ -61,6 +68,9 @@ SETUPS: Mapping[str, Setup] = MappingProxyType(
         "ours in float32, the paper's network": Setup(Linear(), Residual(), 3, torch.float32),
         "ours, the paper's network": Setup(Linear(), Residual(), 3, torch.bfloat16),
         "ours": Setup(Linear(), Residual(), 1, torch.bfloat16),
+        "ours, half as wide, tensor operations": Setup(
+            Linear(), Residual(), 1, torch.bfloat16, width_factor=0.5, kernels=False
+        ),
         "ours, half as wide (as shipped)": Setup(Linear(), Residual(), 1, torch.bfloat16, width_factor=0.5),
     }
 )
@@ -111,7 +121,8 @@ def make_scenes(preset: str, count: int, batch: int) -> tuple[Scene, Particles]:
     scene = load_preset(preset).scene
     scene = dataclasses.replace(scene, particle_volume=min(scene.particle_volume, 0.2 * scene.volume / count))
     states = [thrown_blocks(scene, count=count, blocks=2, seed=seed) for seed in range(batch)]
-    joined = {name: torch.cat([getattr(s, name) for s in states]) for name in vars(states[0])}
+    names = [name for name, values in vars(states[0]).items() if isinstance(values, Tensor)]
+    joined = {name: torch.cat([getattr(s, name) for s in states]) for name in names}
     return scene, Particles(**joined)
 
 
@@ -139,7 +150,10 @@ class TrainingStep:
     def __call__(self) -> None:
         """One step."""
         mixed = self.setup.precision != torch.float32
-        with torch.autocast(self.window.frames.device.type, self.setup.precision, enabled=mixed):
+        with (
+            self.setup.backend(),
+            torch.autocast(self.window.frames.device.type, self.setup.precision, enabled=mixed),
+        ):
             loss = position_error(self.predict(), self.window.target, self.window.mask, self.emulator.grid)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.emulator.parameters(), 1.0)
@@ -187,8 +201,9 @@ class RolloutCalls:
     def __call__(self) -> None:
         """All calls."""
         particles, context = self.state, self.context
-        for _ in range(self.calls):
-            if self.setup.paper:
-                context = self.emulator.context(particles)
-            bundle = self.emulator(particles, context)
-            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+        with self.setup.backend():
+            for _ in range(self.calls):
+                if self.setup.paper:
+                    context = self.emulator.context(particles)
+                bundle = self.emulator(particles, context)
+                particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)

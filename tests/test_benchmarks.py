@@ -164,6 +164,20 @@ def test_recomputed_activations_give_the_same_step():
         torch.testing.assert_close(one, other)
 
 
+def test_the_setup_without_kernels_differs_from_the_shipped_one_in_what_runs_alone():
+    import workloads
+
+    names = ("ours, half as wide, tensor operations", "ours, half as wide (as shipped)")
+    plain, fused = (workloads.SETUPS[name] for name in names)
+    assert dataclasses.replace(plain, kernels=True) == fused
+    paths = []
+    for setup in (plain, fused):
+        step = workloads.TrainingStep(setup, **TINY, unroll=1, cells=16)
+        with setup.backend():
+            paths.append(step.predict())
+    torch.testing.assert_close(*paths)
+
+
 def test_repeated_rollout_calls_start_from_the_same_state():
     import workloads
 
