@@ -19,7 +19,8 @@ TINY = UNet(width=4, depth=1, perceptron=(4,))
 
 def fingerprints(batch: Window) -> list[str]:
     """One number for each window of a batch, as text, that tells the windows apart."""
-    return [f"{total:.10g}" for total in batch.frames.double().sum((1, 2, 3)).tolist()]
+    real = batch.frames.double() * batch.mask[:, None, :, None]  # padding is that of the batch
+    return [f"{total:.10g}" for total in real.sum((1, 2, 3)).tolist()]
 
 
 class Record(lightning.Callback):

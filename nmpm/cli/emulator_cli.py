@@ -27,7 +27,7 @@ from nmpm.cli.console import quiet_lightning
 from nmpm.cli.options import check_folder
 from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
@@ -89,8 +89,11 @@ class EmulatorCLI(LightningCLI):
         config = self.config[self.subcommand]
         if self.subcommand == "fit" or not config["ckpt_path"]:
             return scene
-        path = self._run_folder(config).checkpoint(str(config["ckpt_path"]))
-        stored = read_checkpoint(path).get("hyper_parameters", {}).get("scene")
+        try:
+            path = self._run_folder(config).checkpoint(str(config["ckpt_path"]))
+            stored = read_checkpoint(path).get("hyper_parameters", {}).get("scene")
+        except NmpmError:  # is raised again when the checkpoint is loaded; here the parser would wrap it
+            return scene
         return scene.with_fields_of(Scene.from_dict(stored)) if isinstance(stored, dict) else scene
 
     def before_instantiate_classes(self) -> None:

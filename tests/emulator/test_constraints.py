@@ -120,7 +120,7 @@ def test_equal_densities_are_as_none():
 
 def limited_everywhere(monkeypatch):
     """As on a GPU: nothing is decided by reading values back, and no kernel of the CPU runs."""
-    monkeypatch.setattr("nmpm.emulator.steps.is_chosen", lambda: True)
+    monkeypatch.setattr("nmpm.emulator.steps.kernels_take", lambda *_: False)
     for module in ("advection", "contact"):
         monkeypatch.setattr(f"nmpm.emulator.{module}.can_branch", lambda values: False)
 
@@ -167,7 +167,7 @@ def test_chunks_of_particles_share_one_energy(monkeypatch):
     scene = box()
     emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
     emulator.output_scale.mul_(3.0)
-    monkeypatch.setattr("nmpm.emulator.steps.is_chosen", lambda: True)
+    monkeypatch.setattr("nmpm.emulator.steps.kernels_take", lambda *_: False)
     whole = rollout(emulator, particles, 12)
     in_sevens = lambda count, device, values=1: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
     monkeypatch.setattr("nmpm.emulator.advection.chunks", in_sevens)

@@ -22,7 +22,7 @@ from nmpm.optimizers import SOAP
 from nmpm.processors import UNet
 from nmpm.training import EmulatorModule
 from nmpm.training.schedules import Schedule
-from nmpm.transfer import Nearest
+from nmpm.transfer import Nearest, using
 
 TINY = UNet(width=4, depth=1, perceptron=(4,))
 
@@ -280,7 +280,7 @@ def test_a_training_step_runs_on_the_device_alone(make_dataset, statics):
     window = next(iter(data.train_dataloader()))
     module = module_of(data)
     module.log = lambda *_, **__: None
-    with Questions() as questions:
+    with using("native"), Questions() as questions:  # as on a device: the kernels are a CPU's
         module.training_step(window, 0).backward()
     assert questions.asked == []
     with Questions() as questions:
@@ -295,6 +295,7 @@ def test_a_compiled_network_trains_to_the_same_weights_and_a_broken_compiler_is_
     def broken(*_):
         raise RuntimeError("no compiler here")
 
+    torch.compiler.reset()  # after many compilations of other tests it would compile no more
     data, ends = data_of(make_dataset()), []
     plain = torch.nn.Module.compile
     monkeypatch.setattr(

@@ -40,7 +40,7 @@ def test_the_fastest_that_runs_here_is_taken_and_checked(model, caplog):
     state = model.example(count=50)
     torch.testing.assert_close(quick.rollout(state, 8), model.rollout(state, 8), rtol=0, atol=1e-4)
     with pytest.raises(ConfigError, match="openvino has no gradients"):
-        quick.differentiable_rollout(model.example(count=50)._map(needs_gradients), 8)
+        quick.differentiable_rollout(model.example(count=50).map(needs_gradients), 8)
 
 
 def needs_gradients(values):
