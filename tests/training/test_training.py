@@ -296,6 +296,7 @@ def test_a_compiled_network_trains_to_the_same_weights_and_a_broken_compiler_is_
         raise RuntimeError("no compiler here")
 
     torch.compiler.reset()  # after many compilations of other tests it would compile no more
+    monkeypatch.setattr(torch._dynamo.config, "suppress_errors", False)
     data, ends = data_of(make_dataset()), []
     plain = torch.nn.Module.compile
     monkeypatch.setattr(

@@ -94,8 +94,12 @@ class Plan:
 
     @property
     def trains(self) -> bool:
-        """Whether there are kernels of the gradients, see `nmpm.emulator.fused.training`."""
-        return self.scatter_nodes == self.gather_nodes == 2 and not self.reflects
+        """Whether trainings take the kernels with gradients, see `nmpm.emulator.fused.training`.
+
+        Not in three dimensions: beside them torch's strided 3-D convolutions in bfloat16 sometimes got weights'
+        gradients of unset memory (torch 2.13, CPU with AVX-512), which they do not beside tensor operations.
+        """
+        return self.dim == 2 and self.scatter_nodes == self.gather_nodes == 2 and not self.reflects
 
     @cached_property
     def scatter_grid(self) -> tuple[Any, ...]:
