@@ -1,5 +1,5 @@
-"""The adjoints of `gather` and `scatter` with linear weights: how a number that depends on their results changes with
-positions and values. Gradients of a loss, for trainings on a CPU.
+"""The adjoints of `gather` and `scatter` with linear weights in 2-D: how a number that depends on their results changes
+with positions and values. Gradients of a loss, for trainings on a CPU.
 
 A particle's interpolated value changes with its position as the nodes around it differ; beyond the last centres of a
 wall axis, where all weight is the border node's, it does not.
@@ -13,6 +13,12 @@ import numpy as np
 
 from nmpm._support.jit import jit
 from nmpm.transfer.fused.nodes import HALF, ONE, ZERO, linear_nodes
+
+
+@jit
+def _follows(x: Any, count: Any, wraps: Any) -> Any:
+    """1 where the weights of `linear_nodes` change with the position, 0 where they are held at an end of the axis."""
+    return ONE if wraps or (x > HALF and x < np.float32(count) - HALF) else ZERO
 
 
 @jit
@@ -32,48 +38,6 @@ def gather_adjoint(
         place: (N, D) gradient with respect to the positions, is added to.
         nodes: (size, C) gradient with respect to the field, is added to.
     """
-    if len(shape) == 2:
-        _gather_adjoint_2d(field, material, mask, cells, shape, wraps, slope, place, nodes)
-    else:
-        _gather_adjoint_3d(field, material, mask, cells, shape, wraps, slope, place, nodes)
-
-
-@jit
-def scatter_adjoint(
-    values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, mean: Any, slope: Any, place: Any,
-    speed: Any,
-) -> Any:  # fmt: skip
-    """Add what gradients with respect to means and numbers on the nodes mean for positions and values.
-
-    Args:
-        values: (N, V), e.g. velocities; V may be 0.
-        material: (N,) int64; empty where there is only one. Particles of an unknown one count nowhere.
-        mask: (N,) bool, False for padding, which gets no gradient.
-        cells: (N, D) positions.
-        shape: Nodes along each axis, a tuple.
-        wraps: Whether each is periodic, a tuple.
-        mean: (size, M V + ...), first the means of each material's values: their sums over the numbers.
-        slope: (size, M V + M): gradients with respect to the sums at fixed means of each material, then to its numbers
-            at fixed means.
-        place: (N, D) gradient with respect to the positions, is added to.
-        speed: (N, V) gradient with respect to the values, is added to.
-    """
-    if len(shape) == 2:
-        _scatter_adjoint_2d(values, material, mask, cells, shape, wraps, mean, slope, place, speed)
-    else:
-        _scatter_adjoint_3d(values, material, mask, cells, shape, wraps, mean, slope, place, speed)
-
-
-@jit
-def _follows(x: Any, count: Any, wraps: Any) -> Any:
-    """1 where the weights of `linear_nodes` change with the position, 0 where they are held at an end of the axis."""
-    return ONE if wraps or (x > HALF and x < np.float32(count) - HALF) else ZERO
-
-
-@jit
-def _gather_adjoint_2d(
-    field: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, slope: Any, place: Any, nodes: Any
-) -> Any:
     many, walls = len(material) > 0, not (wraps[0] or wraps[1])
     for p in range(len(cells)):
         if not mask[p]:
@@ -101,37 +65,25 @@ def _gather_adjoint_2d(
 
 
 @jit
-def _gather_adjoint_3d(
-    field: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, slope: Any, place: Any, nodes: Any
-) -> Any:
-    for p in range(len(cells)):
-        if not mask[p]:
-            continue
-        first = 3 * material[p] if len(material) else 0
-        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
-        k0, k1, z = linear_nodes(cells[p, 2], shape[2], wraps[2])
-        along_x, along_y, along_z = ZERO, ZERO, ZERO
-        for row, at_x, up_x in ((i0, ONE - x, -ONE), (i1, x, ONE)):
-            for column, at_y, up_y in ((j0, ONE - y, -ONE), (j1, y, ONE)):
-                for layer, at_z, up_z in ((k0, ONE - z, -ONE), (k1, z, ONE)):
-                    node, seen = (row * shape[1] + column) * shape[2] + layer, ZERO
-                    for k in range(3):
-                        seen += slope[p, k] * field[node, first + k]
-                        nodes[node, first + k] += at_x * at_y * at_z * slope[p, k]
-                    along_x += up_x * at_y * at_z * seen
-                    along_y += at_x * up_y * at_z * seen
-                    along_z += at_x * at_y * up_z * seen
-        place[p, 0] += _follows(cells[p, 0], shape[0], wraps[0]) * along_x
-        place[p, 1] += _follows(cells[p, 1], shape[1], wraps[1]) * along_y
-        place[p, 2] += _follows(cells[p, 2], shape[2], wraps[2]) * along_z
-
-
-@jit
-def _scatter_adjoint_2d(
+def scatter_adjoint(
     values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, mean: Any, slope: Any, place: Any,
     speed: Any,
 ) -> Any:  # fmt: skip
+    """Add what gradients with respect to means and numbers on the nodes mean for positions and values.
+
+    Args:
+        values: (N, V), e.g. velocities; V may be 0.
+        material: (N,) int64; empty where there is only one. Particles of an unknown one count nowhere.
+        mask: (N,) bool, False for padding, which gets no gradient.
+        cells: (N, D) positions.
+        shape: Nodes along each axis, a tuple.
+        wraps: Whether each is periodic, a tuple.
+        mean: (size, M V + ...), first the means of each material's values: their sums over the numbers.
+        slope: (size, M V + M): gradients with respect to the sums at fixed means of each material, then to its numbers
+            at fixed means.
+        place: (N, D) gradient with respect to the positions, is added to.
+        speed: (N, V) gradient with respect to the values, is added to.
+    """
     materials = slope.shape[1] // (values.shape[1] + 1)
     for p in range(len(cells)):
         own = material[p] if len(material) else 0
@@ -148,33 +100,6 @@ def _scatter_adjoint_2d(
                 along_y += at_x * up_y * seen
         place[p, 0] += _follows(cells[p, 0], shape[0], wraps[0]) * along_x
         place[p, 1] += _follows(cells[p, 1], shape[1], wraps[1]) * along_y
-
-
-@jit
-def _scatter_adjoint_3d(
-    values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, mean: Any, slope: Any, place: Any,
-    speed: Any,
-) -> Any:  # fmt: skip
-    materials = slope.shape[1] // (values.shape[1] + 1)
-    for p in range(len(cells)):
-        own = material[p] if len(material) else 0
-        if not mask[p] or own < 0 or own >= materials:
-            continue
-        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
-        k0, k1, z = linear_nodes(cells[p, 2], shape[2], wraps[2])
-        along_x, along_y, along_z = ZERO, ZERO, ZERO
-        for row, at_x, up_x in ((i0, ONE - x, -ONE), (i1, x, ONE)):
-            for column, at_y, up_y in ((j0, ONE - y, -ONE), (j1, y, ONE)):
-                for layer, at_z, up_z in ((k0, ONE - z, -ONE), (k1, z, ONE)):
-                    node = (row * shape[1] + column) * shape[2] + layer
-                    seen = _add_corner(values, p, own, materials, mean, slope, node, at_x * at_y * at_z, speed)
-                    along_x += up_x * at_y * at_z * seen
-                    along_y += at_x * up_y * at_z * seen
-                    along_z += at_x * at_y * up_z * seen
-        place[p, 0] += _follows(cells[p, 0], shape[0], wraps[0]) * along_x
-        place[p, 1] += _follows(cells[p, 1], shape[1], wraps[1]) * along_y
-        place[p, 2] += _follows(cells[p, 2], shape[2], wraps[2]) * along_z
 
 
 @jit
