@@ -124,7 +124,7 @@ def measure(name: str, times: int, rounds: int) -> Case:
         with torch.inference_mode():
             for _ in range(FRAMES // emulator.frames):
                 bundle = emulator(particles, context)
-                particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+                particles = bundle.state_after(particles)
 
     actions = {
         "one": lambda: preset.simulate_from(start, 1),

@@ -168,7 +168,7 @@ class TrainingStep:
             if self.setup.paper:
                 context = self.emulator.context(particles)
             bundle = self._predict_bundle(particles, context)
-            particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+            particles = bundle.state_after(particles)
             bundles.append(bundle.position)
         return torch.cat(bundles, dim=1)
 
@@ -206,4 +206,4 @@ class RolloutCalls:
                 if self.setup.paper:
                     context = self.emulator.context(particles)
                 bundle = self.emulator(particles, context)
-                particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
+                particles = bundle.state_after(particles)

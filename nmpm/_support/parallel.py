@@ -14,6 +14,11 @@ def split(count: int, size: int) -> list[tuple[int, int]]:
     return [(low, min(low + size, count)) for low in range(0, count, size)]
 
 
+def for_each(work: Callable[[int], object], count: int, threads: int) -> None:
+    """Call `work` with 0 … count - 1, each the work of one thread; see `map_ranges`."""
+    map_ranges(lambda low, _: work(low), split(count, 1), threads)
+
+
 def map_ranges(function: Callable[[int, int], T], ranges: list[tuple[int, int]], threads: int) -> list[T]:
     """The function's results for each range (low, high), in order.
 

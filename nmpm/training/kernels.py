@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nmpm._support.jit import jit, jit_sum
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.parallel import for_each
+from nmpm.emulator.fused.arrays import as_array, material_rows
 from nmpm.grid import Grid
 from nmpm.transfer.fused.adjoint import scatter_adjoint
 from nmpm.transfer.fused.scatter import scatter
@@ -34,9 +35,9 @@ class PositionErrors(torch.autograd.Function):
         spacing = np.array(grid.spacing, np.float32)
 
         def measure(b: int) -> None:
-            sum_squares(_array(predicted[b]), _array(target[b]), _array(mask[b]), spacing, frames, errors[b])
+            sum_squares(as_array(predicted[b]), as_array(target[b]), as_array(mask[b]), spacing, frames, errors[b])
 
-        _for_each_scene(measure, len(errors))
+        for_each(measure, len(errors), torch.get_num_threads())
         ctx.save_for_backward(predicted, target, mask)
         ctx.spacing, ctx.frames = spacing, frames
         return torch.from_numpy(errors)
@@ -46,13 +47,13 @@ class PositionErrors(torch.autograd.Function):
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """The gradient with respect to the predicted positions."""
         predicted, target, mask = ctx.saved_tensors
-        found, pull = np.empty(predicted.shape, np.float32), _array(slope)
+        found, pull = np.empty(predicted.shape, np.float32), as_array(slope)
 
         def follow(b: int) -> None:
-            arrays = _array(predicted[b]), _array(target[b]), _array(mask[b])
+            arrays = as_array(predicted[b]), as_array(target[b]), as_array(mask[b])
             square_slopes(*arrays, ctx.spacing, ctx.frames, pull[b], found[b])
 
-        _for_each_scene(follow, len(found))
+        for_each(follow, len(found), torch.get_num_threads())
         return torch.from_numpy(found), None, None, None, None
 
 
@@ -68,18 +69,18 @@ class Counts(torch.autograd.Function):
             cells: (B, F, N, D) positions in cells at F frames.
             material: (B, N) indices.
             mask: (B, N) bool, False for padding.
-            grid: Of 2 or 3 axes.
+            grid: Of 2 axes.
             materials: M.
         """
         counts = np.zeros((*cells.shape[:2], grid.size, materials), np.float32)
-        none = np.empty((cells.shape[2], 0), np.float32)
+        none, kinds = np.empty((cells.shape[2], 0), np.float32), material_rows(material, materials)
 
         def add(b: int) -> None:
-            kind, real, here = _kinds(material[b], materials), _array(mask[b]), _array(cells[b])
+            kind, real, here = kinds[b], as_array(mask[b]), as_array(cells[b])
             for frame in range(len(here)):
                 scatter(none, kind, real, here[frame], grid.shape, grid.periodic, _LINEAR, counts[b, frame])
 
-        _for_each_scene(add, len(cells))
+        for_each(add, len(cells), torch.get_num_threads())
         ctx.save_for_backward(cells, material, mask)
         ctx.grid = grid
         return torch.from_numpy(counts)
@@ -90,18 +91,18 @@ class Counts(torch.autograd.Function):
         """The gradient with respect to the positions."""
         cells, material, mask = ctx.saved_tensors
         grid: Grid = ctx.grid
-        place, pull = np.zeros(cells.shape, np.float32), _array(slope)
-        none = np.empty((cells.shape[2], 0), np.float32)
+        place, pull = np.zeros(cells.shape, np.float32), as_array(slope)
+        none, kinds = np.empty((cells.shape[2], 0), np.float32), material_rows(material, slope.shape[-1])
 
         def follow(b: int) -> None:
-            kind, real, here = _kinds(material[b], slope.shape[-1]), _array(mask[b]), _array(cells[b])
+            kind, real, here = kinds[b], as_array(mask[b]), as_array(cells[b])
             for frame in range(len(here)):
                 scatter_adjoint(
                     none, kind, real, here[frame], grid.shape, grid.periodic, _NONE, pull[b, frame], place[b, frame],
                     none,
                 )  # fmt: skip
 
-        _for_each_scene(follow, len(cells))
+        for_each(follow, len(cells), torch.get_num_threads())
         return torch.from_numpy(place), None, None, None, None
 
 
@@ -139,16 +140,3 @@ def square_slopes(predicted: Any, target: Any, mask: Any, spacing: Any, frames: 
             factor = np.float32(scale * slope[frame // frames] / (spacing[d] * spacing[d]))
             for p in range(len(mask)):
                 found[frame, p, d] = factor * (predicted[frame, p, d] - target[frame, p, d]) if mask[p] else ZERO
-
-
-def _for_each_scene(work: Any, scenes: int) -> None:
-    map_ranges(lambda low, _: work(low), split(scenes, 1), torch.get_num_threads())
-
-
-def _array(tensor: Tensor) -> Any:
-    return tensor.detach().contiguous().numpy()
-
-
-def _kinds(material: Tensor, materials: int) -> Any:
-    """(N,) indices, (0,) where there is only one material."""
-    return _array(material) if materials > 1 else np.empty(0, np.int64)

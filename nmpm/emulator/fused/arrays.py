@@ -30,9 +30,9 @@ def output_rows(output: Tensor) -> tuple[Any, Any]:
     return rows.float().contiguous().numpy(), unpack_float32
 
 
-def material_rows(plan: Plan, material: Tensor) -> Any:
+def material_rows(material: Tensor, materials: int) -> Any:
     """(B, N) indices, (B, 0) where there is only one material."""
-    return as_array(material) if len(plan.mass) > 1 else np.empty((len(material), 0), np.int64)
+    return as_array(material) if materials > 1 else np.empty((len(material), 0), np.int64)
 
 
 def check_materials(plan: Plan, material: Any) -> None:

@@ -42,7 +42,7 @@ def rasterise(
     pull = as_array(gravity) / plan.box[1]
     channels = len(plan.mass) * (dim + 1) + plan.solid + dim * plan.constants
     state = np.empty((batch, *plan.shape, channels), np.float32)
-    kinds, threads = material_rows(plan, material), torch.get_num_threads()
+    kinds, threads = material_rows(material, len(plan.mass)), torch.get_num_threads()
     solids = as_array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
     inputs: tuple[Any, ...] = (
         as_array(position),
@@ -79,7 +79,7 @@ def predict_path(
     batch, count, dim = cells.shape
     frames, size = output.shape[1], math.prod(plan.shape)
     path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
-    own, threads = material_rows(plan, material), torch.get_num_threads()
+    own, threads = material_rows(material, len(plan.mass)), torch.get_num_threads()
     check_materials(plan, own)
     rows = as_array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
     factors, flows = as_array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
@@ -109,7 +109,8 @@ def uncrowd(
     From a path (B, m, N, D) of `predict_path`, and by a plan with a density cap.
     """
     known = survey(plan, solid, walls) if surroundings is None else surroundings
-    own, threads, spread = material_rows(plan, material), torch.get_num_threads(), np.empty(path.shape, np.float32)
+    own, threads = material_rows(material, len(plan.mass)), torch.get_num_threads()
+    spread = np.empty(path.shape, np.float32)
     inputs: tuple[Any, ...] = (as_array(cells), own, as_array(mask), as_array(gravity)[:, 0], as_array(path))
     for scene, around in enumerate(known):
         arrays = CrowdArrays(*(values[scene] for values in inputs))

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.parallel import for_each
 from nmpm.emulator.fused import calls
 from nmpm.emulator.fused.adjoint import fly_back, rasterise_back
 from nmpm.emulator.fused.arrays import as_array, as_copy, check_materials, material_rows, output_rows
@@ -46,17 +46,16 @@ class Rasterise(torch.autograd.Function):
         channels = plan.volume_channels[1]
         slope = as_copy(slopes[3][:, :channels].movedim(1, -1)).reshape(len(cells), -1, channels)
         rows = as_array(state.movedim(1, -1)).reshape(*slope.shape[:2], -1)
-        inputs = as_array(moved), material_rows(plan, material), as_array(mask), as_array(cells)
+        inputs = as_array(moved), material_rows(material, len(plan.mass)), as_array(mask), as_array(cells)
         volume = np.float32(plan.particle_volume)
 
-        def scene(low: int, high: int) -> None:
-            for b in range(low, high):
-                speeds, kind, real, here = (values[b] for values in inputs)
-                rasterise_back(
-                    speeds, kind, real, here, plan.scatter_grid, rows[b], volume, plan.box, slope[b], place[b], speed[b]
-                )
+        def follow(b: int) -> None:
+            speeds, kind, real, here = (values[b] for values in inputs)
+            rasterise_back(
+                speeds, kind, real, here, plan.scatter_grid, rows[b], volume, plan.box, slope[b], place[b], speed[b]
+            )
 
-        map_ranges(scene, split(len(cells), 1), torch.get_num_threads())
+        for_each(follow, len(cells), torch.get_num_threads())
         return None, torch.from_numpy(place), torch.from_numpy(speed), *(None,) * 4
 
 
@@ -73,11 +72,10 @@ class FreePath(torch.autograd.Function):
         check_materials(plan, starts.material)
         path = np.empty((len(cells), output.shape[1], *cells.shape[1:]), np.float32)
 
-        def fly(low: int, high: int) -> None:
-            for b in range(low, high):
-                fly_scene(starts[b], plan, None, path[b], 1)
+        def fly(b: int) -> None:
+            fly_scene(starts[b], plan, None, path[b], 1)
 
-        map_ranges(fly, split(len(cells), 1), torch.get_num_threads())
+        for_each(fly, len(cells), torch.get_num_threads())
         found = torch.from_numpy(path)
         ctx.plan = plan
         ctx.save_for_backward(cells, velocity, gravity, material, mask, state, output, scale, found)
@@ -95,15 +93,14 @@ class FreePath(torch.autograd.Function):
         of_state = np.zeros((len(cells), math.prod(plan.shape), state.shape[1]), np.float32)
         of_fields = np.zeros((*output.shape[:2], of_state.shape[1], output.shape[2]), np.float32)
 
-        def follow(low: int, high: int) -> None:
-            for b in range(low, high):
-                own = starts[b]
-                fly_back(
-                    own.cells, own.material, own.mask, plan.gather_grid, own.state, own.fields, plan.shares,
-                    plan.limits, path[b], as_copy(slope[b]), place[b], speed[b], of_state[b], of_fields[b],
-                )  # fmt: skip
+        def follow(b: int) -> None:
+            own = starts[b]
+            fly_back(
+                own.cells, own.material, own.mask, plan.gather_grid, own.state, own.fields, plan.shares, plan.limits,
+                path[b], as_copy(slope[b]), place[b], speed[b], of_state[b], of_fields[b],
+            )  # fmt: skip
 
-        map_ranges(follow, split(len(cells), 1), torch.get_num_threads())
+        for_each(follow, len(cells), torch.get_num_threads())
         grid = torch.from_numpy(of_state).movedim(-1, 1).unflatten(2, plan.shape)
         fields = torch.from_numpy(of_fields).movedim(-1, 2).unflatten(3, plan.shape)
         back = (torch.from_numpy(place), torch.from_numpy(speed), None, None, None, grid)
@@ -115,7 +112,7 @@ class _Starts:
 
     def __init__(self, plan: Plan, *tensors: Tensor) -> None:
         cells, velocity, gravity, material, mask, state, output, scale = tensors
-        self.material = material_rows(plan, material)
+        self.material = material_rows(material, len(plan.mass))
         rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
         self._arrays = as_array(cells), as_array(velocity), self.material, as_array(mask), as_array(gravity)[:, 0], rows
         self._output, self._unpack = output_rows(output)
