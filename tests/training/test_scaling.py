@@ -166,7 +166,8 @@ def test_calibration_of_parts_is_that_of_the_whole(folder, monkeypatch):
 def test_one_process_writes_the_predictions_of_all_in_order(monkeypatch, tmp_path):
     made = [made_up_trajectory(5, particles) for particles in (3, 4, 5)]
     monkeypatch.setattr(
-        "nmpm.training.callbacks.prediction_writer.gather_to_rank0", lambda mine: [made[::2], made[1::2]]
+        "nmpm.training.callbacks.prediction_writer.gather_to_rank0",
+        lambda mine: [{2: made[2], 0: made[0]}, {1: made[1]}],
     )
     trainer = SimpleNamespace(is_global_zero=True, default_root_dir=tmp_path)
     PredictionWriter().on_predict_end(trainer, None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 
@@ -16,6 +16,9 @@ from nmpm.particles import Window
 
 class EvaluationLoader:
     """Whole trajectories in batches of equal length; each trajectory goes to exactly one rank.
+
+    Those of similar numbers of particles share a batch, so that few are padded much. `batches` holds the indices of
+    each batch's trajectories.
 
     Args:
         recordings: The trajectories.
@@ -51,7 +54,7 @@ class EvaluationLoader:
             )
         groups = (list(group) for _, group in itertools.groupby(order[rank::world], key=frames))
         self.batches: tuple[tuple[int, ...], ...] = tuple(
-            tuple(group[first : first + batch_size]) for group in groups for first in range(0, len(group), batch_size)
+            batch for group in groups for batch in _bucket(group, batch_size, recordings.split.particles)
         )
 
     def __len__(self) -> int:
@@ -62,3 +65,9 @@ class EvaluationLoader:
 
     def _read(self, indices: Sequence[int]) -> Window:
         return collate([self.recordings[index] for index in indices], self.recordings.scene)
+
+
+def _bucket(group: Sequence[int], batch_size: int, particles: Callable[[int], int]) -> list[tuple[int, ...]]:
+    """Trajectories in batches of similar numbers of particles; in each, and by their first ones, in order."""
+    by_size = sorted(group, key=particles)
+    return sorted(tuple(sorted(by_size[first : first + batch_size])) for first in range(0, len(by_size), batch_size))

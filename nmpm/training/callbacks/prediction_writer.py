@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import sys
-from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nmpm._support.collectives import gather_to_rank0
 from nmpm.data.format import Trajectory, write_split
+from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.predictions import predicted_trajectory
 from nmpm.emulator import Rollout
 from nmpm.particles import Window
@@ -26,7 +26,7 @@ class PredictionWriter(BasePredictionWriter):
 
     def __init__(self) -> None:
         super().__init__(write_interval="batch")
-        self._predicted: list[Trajectory] = []
+        self._predicted: dict[int, Trajectory] = {}
 
     def write_on_batch_end(
         self,
@@ -35,22 +35,23 @@ class PredictionWriter(BasePredictionWriter):
         prediction: Any,
         batch_indices: Any,  # noqa: ARG002
         batch: Window,
-        batch_idx: int,  # noqa: ARG002
+        batch_idx: int,
         dataloader_idx: int,  # noqa: ARG002
     ) -> None:
         scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
         source = f"{trainer.ckpt_path or 'the model'}"
         fields = prediction.fields if isinstance(prediction, Rollout) else {}
         positions = prediction.position if isinstance(prediction, Rollout) else prediction
-        for index in range(len(positions)):
-            self._predicted.append(predicted_trajectory(scene, batch.initial, positions, source, index, fields))
+        loader = cast(EvaluationLoader, trainer.predict_dataloaders)
+        for row, index in enumerate(loader.batches[batch_idx]):
+            self._predicted[index] = predicted_trajectory(scene, batch.initial, positions, source, row, fields)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         by_rank = gather_to_rank0(self._predicted)
         if trainer.is_global_zero:
-            rounds = zip_longest(*by_rank)  # ranks take trajectories in turn, so the last round may be short
-            ordered = [trajectory for turn in rounds for trajectory in turn if trajectory is not None]
+            found = {index: trajectory for own in by_rank for index, trajectory in own.items()}
+            ordered = [found[index] for index in sorted(found)]
             path = Path(trainer.default_root_dir) / "predictions.h5"
             write_split(path, ordered)
             sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
-        self._predicted = []
+        self._predicted = {}
