@@ -10,9 +10,8 @@ from typing import Any
 import torch
 
 from nmpm.emulator import Emulator
-from nmpm.errors import ConfigError
 from nmpm.evaluation.trade.choice import CPU, Choice, Kind
-from nmpm.evaluation.trade.models import ModelChoice
+from nmpm.evaluation.trade.models import ModelChoice, over_scenes
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.simulators import SimulatorChoice
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
@@ -59,13 +58,10 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
 
 
 def _model(name: str, emulator: Emulator, scenes: Scenes, device: torch.device) -> Candidate:
-    differing = emulator.scene.differences(scenes.scene)
-    try:
-        adapted = emulator.over(scenes.scene) if differing else emulator
-    except ConfigError as error:
-        raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
+    adapted = over_scenes(name, emulator, scenes)
     settings = {"model": name, "cells": "×".join(map(str, adapted.grid.shape))}
-    return Candidate(ModelChoice(name, adapted.to(device), settings, device=device), differing)
+    choice = ModelChoice(name, adapted.to(device), settings, device=device)
+    return Candidate(choice, emulator.scene.differences(scenes.scene))
 
 
 def _simulators(scenes: Scenes) -> list[Choice]:
