@@ -12,6 +12,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scenes import cloud
@@ -30,8 +31,8 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
-    "against_recordings", "calibration", "dam_break", "generalisation", "gns", "kills", "run_time_knob", "simulators",
-    "stable_substeps", "stiffness", "where_emulation_pays",
+    "against_recordings", "beside_simulator", "calibration", "dam_break", "generalisation", "gns", "kills",
+    "run_time_knob", "simulators", "stable_substeps", "stiffness", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -317,7 +318,52 @@ def test_a_cost_is_fitted_to_all_but_the_widest():
     assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})
 
 
+def test_wide_scenes_hold_copies_of_a_narrow_one_side_by_side():
+    import where_emulation_pays as script
+
+    preset = load_preset("waterramps")
+    start = preset.draw(0)
+    wide = script.side_by_side(preset, start, 3)
+    width, count = preset.domain[0][1] - preset.domain[0][0], len(start.position)
+    assert wide.counts == (3 * count,)
+    assert len(wide.obstacles) == 3 * len(start.obstacles)
+    assert np.allclose(wide.position[2 * count :] - start.position, [2 * width, 0])
+    assert np.array_equal(wide.velocity[:count], wide.velocity[count : 2 * count])
+    assert len(preset.widened(3).simulate_from(wide, 1).position) == 2  # the wide box holds them all
+
+
 # ---- time and error beside the simulator
+
+
+def write_trade(path, rows):
+    names = ("dataset", "particles", "kind", "name", "batch", "ms_per_frame", "stable", "error", "value")
+    text = [",".join(names), *(",".join(map(str, ("tiny", 10, *row[:4], row[4], "mse", row[5]))) for row in rows)]
+    path.write_text("\n".join(text) + "\n")
+
+
+def test_models_are_compared_with_the_simulator_at_equal_time_and_at_equal_error(tmp_path):
+    from beside_simulator import read_rivals, table_lines
+
+    rows = [
+        ("simulator", "shipped", 1, 10.0, True, 0.0),
+        ("simulator", "fewer", 1, 6.0, True, 0.010),
+        ("simulator", "coarse", 1, 0.5, True, 0.060),
+        ("simulator", "unstable", 1, 0.6, False, ""),
+        ("model", "worse", 1, 7.0, True, 0.020),
+        ("model", "better", 1, 2.0, True, 0.020),
+        ("model", "together", 8, 1.0, True, 0.020),
+    ]
+    write_trade(tmp_path / "trade.csv", rows)
+    better, worse = read_rivals(tmp_path / "trade.csv")
+    assert (better.model.name, better.as_fast.name, better.as_good.name) == ("better", "coarse", "fewer")
+    assert (better.speed_up, better.gain, better.wins) == pytest.approx((3.0, 3.0, True))
+    assert (worse.gain, worse.wins) == (0.5, False)
+    assert "**better**" in list(table_lines([better, worse]))[2]
+
+
+def test_results_show_the_table_of_the_committed_measurements():
+    results = ROOT.parent / "docs" / "results.md"
+    assert run_script("beside_simulator") in results.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "trade").glob("*.yaml")), ids=lambda path: path.stem)
