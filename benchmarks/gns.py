@@ -50,7 +50,7 @@ def main() -> None:
         state, curve = read_progress(stored)
         trainer.load_state_dict(state)
     checks = {max(chosen.minutes) * (i + 1) / CHECKS for i in range(CHECKS)}
-    due = sorted(minutes for minutes in {*chosen.minutes, *checks} if minutes not in dict(curve))
+    due = sorted(minutes for minutes in {*chosen.minutes, *checks} if 60 * minutes > trainer.spent)
     while not trainer.done:
         trainer.step()
         while due and trainer.spent >= 60 * due[0]:
