@@ -438,16 +438,28 @@ def test_stiffer_materials_need_substeps_as_sound_is_faster(name):
 # ---- beyond a model's own scenes
 
 
+def test_simulators_of_small_particles_have_cells_and_substeps_in_proportion():
+    import generalisation
+
+    preset = load_preset("waterramps")
+    assert generalisation.refine(preset, 1000) == preset
+    fine = generalisation.refine(preset, 10**5)
+    factor = fine.cells / preset.cells
+    spacing = (generalisation.FILLED * preset.scene.volume / 10**5) ** 0.5
+    assert factor == pytest.approx(preset.spacing / spacing, rel=0.01)
+    assert fine.substeps == pytest.approx(factor * preset.substeps, rel=0.01)
+
+
 @pytest.mark.skipif("goop" not in Zoo.list(), reason="the zoo holds no goop model")
 def test_times_are_per_frame_and_drawn_beside_those_of_simulators(tmp_path):
     import generalisation
 
-    rows = {count: generalisation.measure_times({"goop": Zoo.load("goop")}, count, rounds=1) for count in (100, 1000)}
-    assert all(0 < row["goop"].least <= row["goop"].median for row in rows.values())
-    stated = {"particles": [90, 110], "predictors": [{"kind": "simulator", "ms_per_frame": {"median": 2.5}}]}
-    stated["predictors"].append({"kind": "model", "ms_per_frame": {"median": 1.0}})
-    (tmp_path / "compare.json").write_text(json.dumps(stated))
-    simulated = generalisation.simulator_times([tmp_path])
-    assert simulated == {100: 2.5}
-    generalisation.draw_times(tmp_path / "times.png", rows, simulated)
+    preset = load_preset("goop").coarsened(4)
+    rows = generalisation.time_all({"goop": Zoo.load("goop")}, [preset], (100, 1000), rounds=1, device=CPU)
+    for row in rows.values():
+        assert [name.split(",")[0] for name in row] == ["goop", "simulator of goop", "simulator of goop"]
+        assert all(0 < times.least <= times.median for times in row.values())
+    generalisation.draw_times(tmp_path / "times.png", rows)
     assert (tmp_path / "times.png").stat().st_size > 0
+    with pytest.raises(SystemExit, match="dambreak2d: only simulators of the material point method"):
+        generalisation.load_mpm("dambreak2d")

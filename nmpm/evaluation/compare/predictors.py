@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +14,7 @@ from nmpm.evaluation.trade.models import ModelChoice, over_scenes
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.simulators import SimulatorChoice
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
-
-_TWIN = 0.5  # share of the substeps with which the simulator is compared with itself
+from nmpm.sim.twin import twin_of
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,8 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
     """The simulator of the scenes, if it is known, and its twin; the models; the trivial predictors.
 
     A model of other scenes is rebuilt over these, with grid cells of the size it was trained with, see
-    `EmulatorRecipe.over`. The twin is the simulator with half as many substeps: what its own results are uncertain by.
+    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: what its own results are
+    uncertain by.
 
     Args:
         scenes: What is predicted.
@@ -69,12 +68,9 @@ def _simulators(scenes: Scenes) -> list[Choice]:
     if preset is None:
         return []
     shipped = SimulatorChoice(f"simulator, {preset.substeps} substeps", preset, _settings(preset.substeps))
-    substeps = math.ceil(_TWIN * preset.substeps)
-    if substeps == preset.substeps or substeps < preset.stable_substeps:
-        return [shipped]
-    twin = preset.with_substeps(substeps)
-    name = f"twin, {substeps} substeps"
-    return [shipped, SimulatorChoice(name, twin, _settings(substeps), kind=Kind.FLOOR)]
+    twin = twin_of(preset)
+    name = f"twin, {twin.substeps} substeps"
+    return [shipped, SimulatorChoice(name, twin, _settings(twin.substeps), kind=Kind.FLOOR)]
 
 
 def _settings(substeps: int) -> dict[str, Any]:
