@@ -52,7 +52,8 @@ function compile(gl, vertex, fragment, attributes) {
 class Drawing {
   /** @param colours RGB bytes of the particles; @param obstacles 16-bit positions, as those of trajectories. */
   constructor(canvas, colours, obstacles) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
+    // Discs are smooth by their shader, and walls in 2-D lie along pixels; only the slanted lines of 3-D need more.
+    const gl = canvas.getContext("webgl2", { antialias: scene.dim === 3, alpha: false });
     if (!gl) throw new Error("This browser does not offer WebGL 2, which the viewer needs.");
     this.gl = gl;
     this.points = compile(gl, POINTS, DISC, ["position", "previous", "reference", "material", "field"]);
