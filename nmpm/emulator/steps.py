@@ -190,11 +190,9 @@ def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid
     if emulator.training:
         covered = plan.trains and not _needs_gradients(*fixed) and not torch.compiler.is_compiling()
         return TrainingSteps(emulator, plan) if covered else TensorSteps(emulator)
-    return (
-        TensorSteps(emulator)
-        if _needs_gradients(*own, *fixed, *emulator.parameters())
-        else FusedSteps(plan, emulator.walls)
-    )
+    if torch.is_grad_enabled() and _needs_gradients(*own, *fixed, *emulator.parameters()):
+        return TensorSteps(emulator)
+    return FusedSteps(plan, emulator.walls)
 
 
 def _needs_gradients(*tensors: Tensor) -> bool:

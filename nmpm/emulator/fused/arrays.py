@@ -14,7 +14,7 @@ from nmpm.transfer.fused.fields import unpack_bfloat16, unpack_float32
 
 def as_array(tensor: Tensor) -> Any:
     """The tensor's memory; a copy where it is not contiguous."""
-    return tensor.detach().contiguous().numpy()
+    return np.ascontiguousarray(tensor.detach().numpy())
 
 
 def as_copy(tensor: Tensor) -> Any:

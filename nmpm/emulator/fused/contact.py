@@ -22,7 +22,7 @@ FAR = 16
 
 _WAYS_OUT = 4
 _BLOCK = 512
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO, ONE, _INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
 
 
 @jit
@@ -57,13 +57,14 @@ def longest_step(cells: Any, path: Any, low: Any, high: Any) -> Any:
     """Length of the longest step of particles `low` to `high` in a frame; steps that are not finite do not count."""
     longest = ZERO
     for frame in range(len(path)):
-        for p in range(low, high):
+        here = path[frame, low:high]
+        before = path[frame - 1, low:high] if frame > 0 else cells[low:high]
+        for p in range(len(here)):
             square = ZERO
-            for d in range(cells.shape[1]):
-                step = path[frame, p, d] - (path[frame - 1, p, d] if frame > 0 else cells[p, d])
+            for d in range(here.shape[1]):
+                step = here[p, d] - before[p, d]
                 square += step * step
-            if square > longest and np.isfinite(square):
-                longest = square
+            longest = square if square > longest and square < _INFINITE else longest
     return np.sqrt(longest)
 
 
@@ -108,12 +109,13 @@ def _find_near(cells: Any, path: Any, clearance: Any, grid: Any, begin: Any, end
     if len(clearance) == 0:
         near[: end - begin] = np.arange(begin, end)
         return end - begin
-    found, furthest = 0, np.zeros(_BLOCK, np.float32)
+    found, furthest, start = 0, np.zeros(end - begin, np.float32), cells[begin:end]
     for frame in range(len(path)):
-        for p in range(begin, end):
-            for d in range(len(shape)):
-                way = abs(path[frame, p, d] - cells[p, d])
-                furthest[p - begin] = furthest[p - begin] if way <= furthest[p - begin] else way  # NaN is far
+        here = path[frame, begin:end]
+        for d in range(len(shape)):
+            for p in range(len(here)):
+                way = abs(here[p, d] - start[p, d])
+                furthest[p] = furthest[p] if way <= furthest[p] else way  # NaN is far
     for p in range(begin, end):
         node = 0
         for d in range(len(shape)):

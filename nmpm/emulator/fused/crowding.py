@@ -93,11 +93,7 @@ def push(counts: Any, particle: Any, room: Any, faces: Any, inverse: Any, shape:
         for axis in range(len(shape)):
             span, stride = stride, stride // shape[axis]
             _find_flux(pressure, faces[axis], span, stride, flux)
-            for first in range(0, len(flux), span):
-                for node in range(first, first + stride):
-                    left[node] += flux[node + span - stride] - flux[node]
-                for node in range(first + stride, first + span):
-                    left[node] += flux[node - stride] - flux[node]
+            _add_balance(flux, span, stride, left)
         _relax(pressure, inverse, left, ONE)
     stride = len(counts)
     for axis in range(len(shape)):
@@ -122,11 +118,31 @@ def _relax(pressure: Any, inverse: Any, left: Any, kept: Any) -> Any:
 def _find_flux(pressure: Any, face: Any, span: Any, stride: Any, flux: Any) -> Any:
     """Fill in the displacement through the faces from each node to the next along an axis."""
     for first in range(0, len(flux), span):
-        last = first + span - stride
-        for node in range(first, last):
-            flux[node] = face[node] * (pressure[node] - pressure[node + stride])
-        for node in range(last, first + span):
-            flux[node] = face[node] * (pressure[node] - pressure[node - (span - stride)])
+        last, end = first + span - stride, first + span
+        _find_steps(pressure[first:last], pressure[first + stride : end], face[first:last], flux[first:last])
+        _find_steps(pressure[last:end], pressure[first : first + stride], face[last:end], flux[last:end])
+
+
+@jit
+def _find_steps(these: Any, those: Any, face: Any, flux: Any) -> Any:
+    """Fill in the flux from these nodes to those; of slices, as Numba's check for negative indices is slow."""
+    for node in range(len(these)):
+        flux[node] = face[node] * (these[node] - those[node])
+
+
+@jit
+def _add_balance(flux: Any, span: Any, stride: Any, left: Any) -> Any:
+    """Add to each node what flows in from the one before along an axis, less what flows out."""
+    for first in range(0, len(flux), span):
+        last, end, second = first + span - stride, first + span, first + stride
+        _add_difference(flux[last:end], flux[first:second], left[first:second])
+        _add_difference(flux[first:last], flux[second:end], left[second:end])
+
+
+@jit
+def _add_difference(entering: Any, leaving: Any, left: Any) -> Any:
+    for node in range(len(left)):
+        left[node] += entering[node] - leaving[node]
 
 
 @jit
@@ -153,17 +169,21 @@ def drift(
     for begin in range(low, high, _BLOCK):
         end = min(begin + _BLOCK, high)
         gather(flow, only, path[frames - 1, begin:end], shape, wraps, _LINEAR, shift)
-        for p in range(begin, end):
+        for p in range(end - begin):
             for d in range(dim):
-                way = shift[p - begin, d] if mask[p] else ZERO
+                way = shift[p, d] if mask[begin + p] else ZERO
                 way = _FURTHEST if way > _FURTHEST else way
-                shift[p - begin, d] = -_FURTHEST if way < -_FURTHEST else way
+                shift[p, d] = -_FURTHEST if way < -_FURTHEST else way
         for frame in range(frames):
-            part = np.float32(frame + 1) / np.float32(frames)
-            for p in range(begin, end):
-                for d in range(dim):
-                    x = path[frame, p, d] + part * shift[p - begin, d]
-                    spread[frame, p, d] = confine(x, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+            part, here, moved = (
+                np.float32(frame + 1) / np.float32(frames),
+                path[frame, begin:end],
+                spread[frame, begin:end],
+            )
+            for d in range(dim):
+                lowest, highest, reflects = bounds[0, d], bounds[1, d], bounds[2, d] > ZERO
+                for p in range(len(here)):
+                    moved[p, d] = confine(here[p, d] + part * shift[p, d], lowest, highest, reflects)
         if len(share):
             _take_back(path, share, (shape, wraps), shift, begin, end, places, values, spread)
 

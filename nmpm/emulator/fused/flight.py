@@ -174,6 +174,8 @@ def land(path: Any, box: Any, low: Any, high: Any) -> Any:
         high: The one after the last.
     """
     for frame in range(len(path)):
-        for p in range(low, high):
-            for d in range(path.shape[2]):
-                path[frame, p, d] = path[frame, p, d] * box[1, d] + box[0, d]
+        own = path[frame, low:high]  # a slice, as Numba's check for negative indices is slow
+        for d in range(own.shape[1]):
+            lowest, width = box[0, d], box[1, d]
+            for p in range(len(own)):
+                own[p, d] = own[p, d] * width + lowest

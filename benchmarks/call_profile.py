@@ -1,0 +1,94 @@
+"""What a call of a shipped model spends its time on: the network, the kernels around it, and what joins them.
+
+python benchmarks/call_profile.py --threads 1 --models goop waterramps --json call_profile.json
+
+Each part is called by itself, in turn with the others and with the whole call, 20 bundles into a rollout of a scene of
+the model's own; CPU time in µs, median (quartiles) over the rounds. "Rest" is a call without its network and without
+the kernels: Python and torch between them. The kernels' own time contains the conversion of tensors to arrays.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
+
+from nmpm.emulator import Emulator, RolloutContext, unroll
+from nmpm.emulator.departure import Departure
+from nmpm.emulator.steps import steps_for
+from nmpm.evaluation.stress.subject import Subject
+from nmpm.particles import Particles
+from nmpm.sim import load_preset
+from nmpm.zoo import Zoo
+
+CALL = "call"
+NETWORK = "network"
+BUNDLES = 20
+
+
+@torch.no_grad()
+def roll_on(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext]:
+    """A scene of the model's own, `BUNDLES` bundles into its rollout, and what the rollout knows of its start."""
+    particles = Subject(name, emulator, 32, load_preset(name)).starts(1)
+    context = emulator.context(particles)
+    for bundle in unroll(emulator, particles, BUNDLES):
+        particles = bundle.state_after(particles)
+    return particles, context
+
+
+def split_call(emulator: Emulator, particles: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:
+    """The whole call, and each of its parts on the values that the call gives it."""
+    steps = steps_for(emulator, emulator._plan, particles, context.solid)
+    cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
+    normalised = emulator.normalise(state)
+    output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
+    own = (cells, velocity, gravity, particles.material, particles.mask, state, output, emulator.output_scale)
+    start = Departure(*own)
+    path = steps.path(start, context)
+    parts: dict[str, Callable[[], object]] = {
+        CALL: lambda: emulator(particles, context),
+        NETWORK: lambda: emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision),
+        "p2g": lambda: steps.rasterise(particles, context.solid),
+        "normalise": lambda: emulator.normalise(state),
+        "path and constraints": lambda: steps.path(start, context),
+    }
+    if emulator.constraints.density_cap:
+        parts["density cap"] = lambda: steps.uncrowded(start, path, context)
+    return parts | {"to length": lambda: steps.to_length(path.clone(), path.dtype)}
+
+
+def summarise(seconds: Mapping[str, list[float]]) -> dict[str, Any]:
+    """Quartiles of each part in µs, and of what is left of a call in the same round."""
+    rest = [2 * call - sum(values) for call, *values in zip(seconds[CALL], *seconds.values(), strict=True)]
+    around = [call - network for call, network in zip(seconds[CALL], seconds[NETWORK], strict=True)]
+    figures = {**seconds, "rest": rest, "all but the network": around}
+    return {name: [1e6 * value for value in statistics.quantiles(values)] for name, values in figures.items()}
+
+
+def main() -> None:
+    """Measure, print a table, and write JSON if asked to."""
+    parser = make_timing_parser(__doc__)
+    parser.add_argument("--models", nargs="+", default=["goop", "waterramps"])
+    parser.add_argument("--rounds", type=int, default=60)
+    chosen = parser.parse_args()
+    torch.set_num_threads(chosen.threads)
+    sys.stdout.write(f"{describe_machine(chosen.device, chosen.threads)}; µs, median (quartiles)\n")
+    found: dict[str, Any] = {}
+    for name in chosen.models:
+        emulator = Zoo.load(name).emulator.to(chosen.device)
+        state, context = roll_on(emulator, name)
+        with torch.no_grad():
+            parts = split_call(emulator, state, context)
+            found[name] = summarise(time_alternating(parts, chosen.rounds, clock_for(chosen.device)))
+        sys.stdout.write(f"{name}, {state.position.shape[1]} particles\n")
+        for part, (low, middle, high) in found[name].items():
+            sys.stdout.write(f"  {part:<24}{middle:8.0f} ({low:.0f}-{high:.0f})\n")
+    write_json(chosen.json, found)
+
+
+if __name__ == "__main__":
+    main()
