@@ -4,14 +4,14 @@
     nmpm trade goop --config benchmarks/trade/goop.yaml --models goop runs/gns/minutes-*
 
 Minutes are CPU time of one thread, of training alone. The simulator is written at each of them, with its validation
-loss so far, so that `nmpm trade` shows error against training time, and names what has not converged.
+loss so far, so that `nmpm trade` shows error against training time, and names what has not converged. After an
+interruption the same command goes on from the last of them, or from the last validation between them.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 
 import torch
@@ -20,10 +20,19 @@ from nmpm.data.catalog import catalog, ensure
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
-from nmpm.evaluation.gns import GraphRecipe, GraphTraining, TrainedGraph, train, validation_loss, write_graph
+from nmpm.evaluation.gns import (
+    GraphRecipe,
+    GraphTrainer,
+    GraphTraining,
+    TrainedGraph,
+    read_progress,
+    validation_loss,
+    write_graph,
+    write_progress,
+)
 from nmpm.scene import Scene
 
-CHECKS = 8
+CHECKS = 24
 """Validation losses per training, beside those of the written simulators."""
 
 
@@ -31,24 +40,28 @@ def main() -> None:
     """Train and write what the command line asks for."""
     chosen = _parser().parse_args()
     torch.manual_seed(chosen.seed)
-    counts = {"train": chosen.trajectories, "valid": 2, "test": 0}
-    folder = ensure(chosen.dataset, counts)
+    folder = ensure(chosen.dataset, {"train": chosen.trajectories, "valid": 2, "test": 0})
     scene = infer_scene(folder)
     training, validation = (_recordings(folder, scene, split) for split in ("train", "valid"))
     simulator = GraphRecipe(scene, width=chosen.width).build()
     settings = GraphTraining(60 * max(chosen.minutes), chosen.noise, chosen.batch, chosen.rate, seed=chosen.seed)
-    due = sorted({*chosen.minutes, *(max(chosen.minutes) * (i + 1) / CHECKS for i in range(CHECKS))})
-    curve: list[tuple[float, float]] = []
-    start = time.perf_counter()
-    for step, seconds in enumerate(train(simulator, training, settings), 1):
-        while due and seconds >= 60 * due[0]:
+    trainer, curve, stored = GraphTrainer(simulator, training, settings), [], chosen.out / "training.safetensors"
+    if stored.is_file():
+        state, curve = read_progress(stored)
+        trainer.load_state_dict(state)
+    checks = {max(chosen.minutes) * (i + 1) / CHECKS for i in range(CHECKS)}
+    due = sorted(minutes for minutes in {*chosen.minutes, *checks} if 60 * minutes > trainer.spent)
+    while not trainer.done:
+        trainer.step()
+        while due and trainer.spent >= 60 * due[0]:
             minutes = due.pop(0)
             curve.append((minutes, validation_loss(simulator, validation, chosen.noise)))
-            wall = (time.perf_counter() - start) / 60
-            sys.stdout.write(f"{minutes:.3g} min ({wall:.3g} by the wall), {step} steps: loss {curve[-1][1]:.4f}\n")
+            sys.stdout.write(f"{minutes:.3g} min, {trainer.steps} steps: loss {curve[-1][1]:.4f}\n")
             sys.stdout.flush()
             if minutes in chosen.minutes:
-                write_graph(chosen.out / f"minutes-{minutes:g}", TrainedGraph(simulator, minutes, step, tuple(curve)))
+                graph = TrainedGraph(simulator, minutes, trainer.steps, tuple(curve))
+                write_graph(chosen.out / f"minutes-{minutes:g}", graph)
+            write_progress(stored, trainer.state_dict(), curve)
 
 
 def _recordings(folder: Path, scene: Scene, split: str) -> list[Recording]:

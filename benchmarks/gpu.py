@@ -28,6 +28,7 @@ LARGE_GRIDS = ("64x64", "256x256", "1024x1024", "64x64x64", "128x128x128")
 def list_steps(device: str, out: Path) -> dict[str, list[str]]:
     """The command of each step, in order."""
     sizes = ["--particles", "1e3", "1e4", "1e5", "1e6", "1e7", "--grids", *LARGE_GRIDS]
+    compared = ["compare", "goop", "--data", "goop"]
     ablation = ["benchmarks/sweeps/parts.yaml", "--minutes", "3", "--out", str(out / "parts")]
     return {
         "fit": _python("-m", "nmpm", "fit", "--config", "goop.yaml"),
@@ -40,7 +41,7 @@ def list_steps(device: str, out: Path) -> dict[str, list[str]]:
         "call_costs": _benchmark("call_costs", device),
         "constraints": _benchmark("constraints", device),
         "first_frame": _benchmark("first_frame", device),
-        "wider_box": _benchmark("wider_box", device, "--zoo", "goop"),
+        "compare": _python("-m", "nmpm", *compared, "--wider", "2", "--device", device, "--out", str(out / "compare")),
         "streaming": _python("benchmarks/streaming.py"),
         "ablation": _benchmark("ablation", device, *ablation),
         "zoo": _benchmark("zoo_on_device", device),

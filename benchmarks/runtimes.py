@@ -24,7 +24,7 @@ import onnxruntime
 import torch
 from timing import Spread, clock_for, describe_machine, make_parser, time_alternating, write_json
 from torch import Tensor
-from wider_box import simulate_windows
+from workloads import simulate_windows
 
 from nmpm.emulator import Emulator, rollout
 from nmpm.evaluation.comparison import Comparison

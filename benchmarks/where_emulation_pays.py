@@ -3,23 +3,24 @@
 python benchmarks/where_emulation_pays.py                          table, and map.json and map.png in benchmarks/trade
 python benchmarks/where_emulation_pays.py goop dambreak2d --times 1 4 16
 
-Each preset is simulated in domains 1, 4, 16, … times as wide, with as many times as many particles, on one thread; the
-emulator is the zoo's model of it, or an untrained one of its configuration. The cost of both is close to linear in the
-particles, so their ratio is a number of substeps:
+Each preset is simulated in domains several times as wide, in which one of its initial states stands as often side by
+side, on one thread; the emulator is the zoo's model of it, or an untrained one of its configuration. The cost of both
+is close to linear in the particles, so their ratio is a number of substeps:
 
     break-even = (ms per frame of the emulator) / (ms per substep of the simulator)
 
 Emulation pays where the cheapest stable simulation of the same error needs more substeps than that. The cost model of
 the map, ms = a + b × particles, is fitted to all widths but the widest and checked on that. Points: settings of the
-trade's tables (`benchmarks/trade/NAME/trade.csv`), the cheapest simulation that is no less accurate than the model.
+trade's tables (`benchmarks/trade/NAME/trade.csv`, see `beside_simulator.py`), the cheapest simulation that is no less
+accurate than the model.
 """
 
 from __future__ import annotations
 
-import csv
+import dataclasses
 import sys
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from beside_simulator import read_rivals
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -46,12 +48,20 @@ from nmpm.sim import InitialState, Preset, load_preset
 from nmpm.zoo import Zoo
 
 TRADE = Path(__file__).parent / "trade"
-NAMES = ("goop", "waterramps", "waterdrop3d", "dambreak2d", "wbcsph")
-TIMES = (1, 4, 16)
+WIDTHS: Mapping[str, Sequence[int]] = {
+    "goop": (1, 4, 16, 512),
+    "waterramps": (1, 4, 16, 48),
+    "waterdrop3d": (1, 4, 16),
+    "dambreak2d": (1, 4, 20),
+    "wbcsph": (1, 3, 8),
+}
+"""Presets, and how many times as wide their domains become: up to 10⁵ or 10⁶ particles."""
 SEEDS = 16
-"""Initial states of which the one with the most particles is taken: wide domains may be drawn nearly empty."""
-FRAMES, SUBSTEPS = 16, 4
-"""Frames of an emulator and substeps of a simulator in a timed run."""
+"""Initial states of which the one with the most particles is taken."""
+FRAMES = 16
+"""Frames of an emulator in a timed run."""
+MOST, ROUNDS = 10**5, 3
+"""So many particles or more are timed in so many rounds at most, over a frame of the simulator instead of four."""
 RECIPE = ("cells", "frames", "transfer", "processor", "decoder", "constraints")
 
 
@@ -99,6 +109,26 @@ def emulator_of(preset: Preset, window: Window) -> Emulator:
     return emulator.with_network(torch.bfloat16).eval().requires_grad_(False)
 
 
+def side_by_side(preset: Preset, start: InitialState, times: int) -> InitialState:
+    """The state so many times in a row, each copy a width of the preset's own domain further on."""
+    width = preset.domain[0][1] - preset.domain[0][0]
+    shifts = [np.array([width * copy, *[0.0] * (len(preset.domain) - 1)]) for copy in range(times)]
+    ends = np.cumsum(start.counts or (len(start.position),))
+    parts = [slice(first, end) for first, end in zip((0, *ends[:-1]), ends, strict=True)]  # one for each material
+    return dataclasses.replace(
+        start,
+        position=np.concatenate([start.position[part] + shift for part in parts for shift in shifts]),
+        velocity=np.concatenate([start.velocity[part] for part in parts for _ in shifts]),
+        counts=tuple(times * count for count in start.counts),
+        obstacles=tuple(_moved(obstacle, shift) for shift in shifts for obstacle in start.obstacles),
+    )
+
+
+def _moved(obstacle: Any, shift: Any) -> Any:
+    x, y = obstacle.centre
+    return dataclasses.replace(obstacle, centre=(x + shift[0], y + shift[1]))
+
+
 def simulate(preset: Preset, start: InitialState, frames: int) -> Window:
     """A window of so many simulated frames after the first two."""
     run = preset.simulate_from(start, frames + 1)
@@ -111,32 +141,40 @@ def simulate(preset: Preset, start: InitialState, frames: int) -> Window:
 def measure(name: str, times: int, rounds: int) -> Case:
     """Time a preset's simulator and emulator in a domain so many times as wide, taking turns.
 
-    A substep is timed by the difference of two simulations of a frame, so that what precedes the first one is left out.
+    A substep is timed by the difference of two simulations, so that what precedes the first one is left out.
     """
-    preset = load_preset(name) if times == 1 else load_preset(name).widened(times)
-    start = max(map(preset.draw, range(SEEDS)), key=lambda drawn: len(drawn.position))
-    window = simulate(preset, start, FRAMES)
-    emulator, state = emulator_of(preset, window), window.initial
-    context = emulator.context(state)
-
-    def emulate() -> None:
-        particles = state
-        with torch.inference_mode():
-            for _ in range(FRAMES // emulator.frames):
-                bundle = emulator(particles, context)
-                particles = bundle.state_after(particles)
-
+    own = load_preset(name)
+    preset = own if times == 1 else own.widened(times)
+    start = side_by_side(own, max(map(own.draw, range(SEEDS)), key=lambda drawn: len(drawn.position)), times)
+    many = len(start.position) >= MOST
+    frames = 1 if many else 4
+    window = simulate(preset, start, 1 if name in Zoo.list() else FRAMES)
     actions = {
         "one": lambda: preset.simulate_from(start, 1),
-        "more": lambda: preset.simulate_from(start, 1 + SUBSTEPS),
-        "emulator": emulate,
+        "more": lambda: preset.simulate_from(start, 1 + frames),
+        "emulator": emulation(emulator_of(preset, window), window),
     }
-    seconds = time_alternating(actions, rounds, clock_for(torch.device("cpu")))
+    rounds = min(rounds, ROUNDS) if many else rounds
+    seconds = time_alternating(actions, rounds, clock_for(torch.device("cpu")), warm_up=0 if many else 1)
     pairs = zip(seconds["more"], seconds["one"], strict=True)
-    substep = [(more - one) / SUBSTEPS / preset.substeps for more, one in pairs]
+    substep = [(more - one) / frames / preset.substeps for more, one in pairs]
     frame = [value / FRAMES for value in seconds["emulator"]]
     solver = f"{preset.generator}, {len(preset.box)}-D"
     return Case(name, times, len(start.position), solver, preset.substeps, Spread.of(substep), Spread.of(frame))
+
+
+def emulation(emulator: Emulator, window: Window) -> Callable[[], None]:
+    """Roll out `FRAMES` frames from a window's start; compiled already."""
+    context = emulator.context(window.initial)
+
+    def emulate() -> None:
+        particles = window.initial
+        with torch.inference_mode():
+            for _ in range(FRAMES // emulator.frames):
+                particles = emulator(particles, context).state_after(particles)
+
+    emulate()
+    return emulate
 
 
 def fit_cost(cases: Sequence[Case], seconds: Sequence[float]) -> dict[str, float]:
@@ -150,25 +188,18 @@ def fit_cost(cases: Sequence[Case], seconds: Sequence[float]) -> dict[str, float
 
 
 def equal_error(name: str) -> dict[str, Any] | None:
-    """From a trade's table: the fastest model, and the cheapest stable simulation that is no less accurate."""
+    """From a trade's table: the most accurate model, and the cheapest stable simulation that is no less accurate."""
     path = TRADE / name / "trade.csv"
-    if not path.is_file():
+    rivals = read_rivals(path) if path.is_file() else []
+    if not rivals:
         return None
-    with path.open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["error"] == "mse" and row["batch"] == "1"]
-    models = [row for row in rows if row["kind"] == "model" and row["constraints"] == "held" and row["value"]]
-    simulators = [row for row in rows if row["kind"] == "simulator" and row["stable"] == "True" and row["value"]]
-    if not models:
-        return None
-    model = min(models, key=lambda row: float(row["value"]))
-    good = [row for row in simulators if float(row["value"]) <= float(model["value"])]
-    other = min(good, key=lambda row: float(row["ms_per_frame"]))
+    best = min(rivals, key=lambda rival: rival.model.error)
     return {
         "name": name,
-        "particles": int(model["particles"]),
-        "model": model["name"],
-        "simulator": other["name"],
-        "speed_up": float(other["ms_per_frame"]) / float(model["ms_per_frame"]),
+        "particles": best.particles,
+        "model": best.model.name,
+        "simulator": best.as_good.name,
+        "speed_up": best.speed_up,
     }
 
 
@@ -227,13 +258,15 @@ def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
 def main() -> None:
     """Measure, print, and write JSON and a picture."""
     parser = make_parser(__doc__)
-    parser.add_argument("names", nargs="*", default=NAMES, help="presets")
-    parser.add_argument("--times", type=int, nargs="+", default=TIMES, help="widths of the domain")
+    parser.add_argument("names", nargs="*", default=list(WIDTHS), choices=[*WIDTHS], metavar="NAME", help="presets")
+    parser.add_argument("--times", type=int, nargs="+", help="widths of the domain (default: the preset's own list)")
     parser.add_argument("--rounds", type=int, default=7, help="timed runs of each")
     parser.add_argument("--out", type=Path, default=TRADE, help="folder of map.json and map.png")
     chosen: Namespace = parser.parse_args()
     torch.set_num_threads(1)
-    cases = {name: [measure(name, times, chosen.rounds) for times in chosen.times] for name in chosen.names}
+    cases = {
+        name: [measure(name, times, chosen.rounds) for times in chosen.times or WIDTHS[name]] for name in chosen.names
+    }
     found = report(cases)
     write_json(chosen.out / "map.json", found)
     write_map(cases, chosen.out / "map.png")

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -20,7 +21,12 @@ from timing import make_timing_parser
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from nmpm.data.format import Trajectory
+from nmpm.data.generate import derive_seed, preset_metadata
 from nmpm.data.initial_states import thrown_blocks
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.progress import progress_bar
 from nmpm.decoders import Absolute, Decoder, Residual
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.calibration import calibrate
@@ -28,7 +34,7 @@ from nmpm.emulator.constraints import Constraints
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
 from nmpm.scene import Scene
-from nmpm.sim import load_preset
+from nmpm.sim import Preset, load_preset
 from nmpm.training.losses import position_error
 from nmpm.transfer import Linear, Nearest, Transfer, using
 
@@ -207,3 +213,14 @@ class RolloutCalls:
                     context = self.emulator.context(particles)
                 bundle = self.emulator(particles, context)
                 particles = bundle.state_after(particles)
+
+
+def simulate_windows(preset: Preset, seed: int, scenes: int, workers: int) -> Iterator[Window]:
+    """Whole trajectories of a preset, one scene each."""
+    reader = RecordingReader(preset_metadata(preset), preset.scene)
+    seeds = [derive_seed(seed, index) for index in range(scenes)]
+    with ThreadPoolExecutor(workers) as pool, progress_bar(f"{preset.name} box", scenes) as advance:
+        for made in pool.map(preset.simulate, seeds):
+            recording = reader.recording(Trajectory(made.position, made.particle_type), preset.name)
+            yield collate([recording], preset.scene)
+            advance()

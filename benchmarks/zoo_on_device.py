@@ -18,7 +18,7 @@ from functools import partial
 import torch
 from timing import describe_machine, make_timing_parser, time_run, write_json
 from torch import Tensor
-from wider_box import simulate_windows
+from workloads import simulate_windows
 
 from nmpm.emulator import rollout
 from nmpm.evaluation.comparison import Comparison

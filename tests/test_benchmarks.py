@@ -12,6 +12,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scenes import cloud
@@ -30,8 +31,8 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
-    "against_recordings", "calibration", "dam_break", "generalisation", "gns", "kills", "run_time_knob", "simulators",
-    "stable_substeps", "stiffness", "where_emulation_pays",
+    "against_recordings", "beside_simulator", "calibration", "dam_break", "generalisation", "gns", "kills",
+    "run_time_knob", "simulators", "stable_substeps", "stiffness", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -317,7 +318,52 @@ def test_a_cost_is_fitted_to_all_but_the_widest():
     assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})
 
 
+def test_wide_scenes_hold_copies_of_a_narrow_one_side_by_side():
+    import where_emulation_pays as script
+
+    preset = load_preset("waterramps")
+    start = preset.draw(0)
+    wide = script.side_by_side(preset, start, 3)
+    width, count = preset.domain[0][1] - preset.domain[0][0], len(start.position)
+    assert wide.counts == (3 * count,)
+    assert len(wide.obstacles) == 3 * len(start.obstacles)
+    assert np.allclose(wide.position[2 * count :] - start.position, [2 * width, 0])
+    assert np.array_equal(wide.velocity[:count], wide.velocity[count : 2 * count])
+    assert len(preset.widened(3).simulate_from(wide, 1).position) == 2  # the wide box holds them all
+
+
 # ---- time and error beside the simulator
+
+
+def write_trade(path, rows):
+    names = ("dataset", "particles", "kind", "name", "batch", "ms_per_frame", "stable", "error", "value")
+    text = [",".join(names), *(",".join(map(str, ("tiny", 10, *row[:4], row[4], "mse", row[5]))) for row in rows)]
+    path.write_text("\n".join(text) + "\n")
+
+
+def test_models_are_compared_with_the_simulator_at_equal_time_and_at_equal_error(tmp_path):
+    from beside_simulator import read_rivals, table_lines
+
+    rows = [
+        ("simulator", "shipped", 1, 10.0, True, 0.0),
+        ("simulator", "fewer", 1, 6.0, True, 0.010),
+        ("simulator", "coarse", 1, 0.5, True, 0.060),
+        ("simulator", "unstable", 1, 0.6, False, ""),
+        ("model", "worse", 1, 7.0, True, 0.020),
+        ("model", "better", 1, 2.0, True, 0.020),
+        ("model", "together", 8, 1.0, True, 0.020),
+    ]
+    write_trade(tmp_path / "trade.csv", rows)
+    better, worse = read_rivals(tmp_path / "trade.csv")
+    assert (better.model.name, better.as_fast.name, better.as_good.name) == ("better", "coarse", "fewer")
+    assert (better.speed_up, better.gain, better.wins) == pytest.approx((3.0, 3.0, True))
+    assert (worse.gain, worse.wins) == (0.5, False)
+    assert "**better**" in list(table_lines([better, worse]))[2]
+
+
+def test_results_show_the_table_of_the_committed_measurements():
+    results = ROOT.parent / "docs" / "results.md"
+    assert run_script("beside_simulator") in results.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "trade").glob("*.yaml")), ids=lambda path: path.stem)
@@ -335,14 +381,14 @@ def test_a_graph_network_is_trained_and_written_at_the_times_asked_for(tmp_path,
     preset = dataclasses.replace(preset, blocks=dataclasses.replace(preset.blocks, number=(1, 1), particles=(60, 80)))
     generate(preset, tmp_path / "data", {"train": 1, "valid": 1, "test": 0}, workers=1)
     monkeypatch.setattr(catalog, "ensure", lambda *_: tmp_path / "data")
-    text = run_script(
-        "gns", "goop", "--minutes", "0.0005", "0.001", "--trajectories", "1", "--width", "4", "--out", str(tmp_path)
-    )
+    words = ("goop", "--minutes", "0.0005", "0.001", "--trajectories", "1", "--width", "4", "--out", str(tmp_path))
+    text = run_script("gns", *words)
     first, last = (read_graph(tmp_path / f"minutes-{minutes}") for minutes in ("0.0005", "0.001"))
     assert (first.minutes, last.minutes) == (0.0005, 0.001)
     assert first.steps <= last.steps
     assert last.curve[: len(first.curve)] == first.curve
-    assert text.count("loss") == 8
+    assert text.count("loss") == 24
+    assert run_script("gns", *words) == ""  # it goes on from the end
 
 
 def test_a_model_is_its_own_ensemble_and_commits_whole_bundles():
@@ -392,16 +438,28 @@ def test_stiffer_materials_need_substeps_as_sound_is_faster(name):
 # ---- beyond a model's own scenes
 
 
+def test_simulators_of_small_particles_have_cells_and_substeps_in_proportion():
+    import generalisation
+
+    preset = load_preset("waterramps")
+    assert generalisation.refine(preset, 1000) == preset
+    fine = generalisation.refine(preset, 10**5)
+    factor = fine.cells / preset.cells
+    spacing = (generalisation.FILLED * preset.scene.volume / 10**5) ** 0.5
+    assert factor == pytest.approx(preset.spacing / spacing, rel=0.01)
+    assert fine.substeps == pytest.approx(factor * preset.substeps, rel=0.01)
+
+
 @pytest.mark.skipif("goop" not in Zoo.list(), reason="the zoo holds no goop model")
 def test_times_are_per_frame_and_drawn_beside_those_of_simulators(tmp_path):
     import generalisation
 
-    rows = {count: generalisation.measure_times({"goop": Zoo.load("goop")}, count, rounds=1) for count in (100, 1000)}
-    assert all(0 < row["goop"].least <= row["goop"].median for row in rows.values())
-    stated = {"particles": [90, 110], "predictors": [{"kind": "simulator", "ms_per_frame": {"median": 2.5}}]}
-    stated["predictors"].append({"kind": "model", "ms_per_frame": {"median": 1.0}})
-    (tmp_path / "compare.json").write_text(json.dumps(stated))
-    simulated = generalisation.simulator_times([tmp_path])
-    assert simulated == {100: 2.5}
-    generalisation.draw_times(tmp_path / "times.png", rows, simulated)
+    preset = load_preset("goop").coarsened(4)
+    rows = generalisation.time_all({"goop": Zoo.load("goop")}, [preset], (100, 1000), rounds=1, device=CPU)
+    for row in rows.values():
+        assert [name.split(",")[0] for name in row] == ["goop", "simulator of goop", "simulator of goop"]
+        assert all(0 < times.least <= times.median for times in row.values())
+    generalisation.draw_times(tmp_path / "times.png", rows)
     assert (tmp_path / "times.png").stat().st_size > 0
+    with pytest.raises(SystemExit, match="dambreak2d: only simulators of the material point method"):
+        generalisation.load_mpm("dambreak2d")

@@ -65,7 +65,8 @@ def commands_page() -> str:
     """Help of all commands."""
     sections = [f"# Commands\n\n{_block(usage())}"]
     for name, (_, summary) in COMMANDS.items():
-        sections.append(f"## nmpm {name}\n\n{_training(summary) if name in TRAINING else _block(help_of(name))}")
+        short = name in TRAINING and name != "fit"  # as fit
+        sections.append(f"## nmpm {name}\n\n{_training(summary) if short else _block(help_of(name))}")
         if name == "zoo":
             sections += [f"### nmpm zoo {action}\n\n{_block(help_of(name, action))}" for action in ZOO]
     return "\n\n".join(sections)
@@ -88,7 +89,8 @@ def configuration_page() -> str:
         "# Configuration\n\n"
         "What `nmpm fit`, `validate`, `test` and `predict` are told, in files (`--config`) or on the command line"
         " (`--model.frames 4`). `nmpm fit --config goop.yaml --print_config` prints a whole configuration,"
-        " `nmpm fit --help` every option, `nmpm fit --model.processor.help nmpm.processors.UNet` those of a part.\n\n"
+        " `nmpm fit --help_all` every option, `nmpm fit --model.processor.help nmpm.processors.UNet` those of a"
+        " part.\n\n"
         f"Shipped: {names}. This is `tutorial.yaml`:\n\n```yaml\n{explained}```\n"
     )
 
@@ -99,7 +101,7 @@ def room_page(room: str) -> str:
 
 
 def _training(summary: str) -> str:
-    return f"{summary} Its options are those of the [configuration](configuration.md)."
+    return f"{summary} Its options are those of `nmpm fit`, and of the [configuration](configuration.md)."
 
 
 def _block(text: str) -> str:

@@ -48,7 +48,7 @@ first steps:
   nmpm compare waterramps --data waterdrop-xl  does a model hold for other scenes than its own?
   nmpm trade goop                              what accuracy costs in time: model or simulator?
 
-Add --help to any command for its options; fit --print_config prints a whole configuration.
+Add --help to any command for its options; fit --help_all lists every one, fit --print_config a whole configuration.
 A --config that is not a file in the working directory is looked up among the shipped ones: {configs}.
 """
 

@@ -68,13 +68,18 @@ def argument_names(group: str) -> set[str]:
     """Arguments behind --model.… or --data.…, read from the source."""
     names = set()
     for file, name in SIGNATURES[group]:
-        (kind,) = (node for node in _tree(file).body if isinstance(node, ast.ClassDef) and node.name == name)
-        for node in kind.body:
+        for node in class_definition(file, name).body:
             if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
                 names.add(node.target.id)
             if isinstance(node, ast.FunctionDef) and node.name == "__init__":
                 names |= {argument.arg for argument in node.args.args[1:]}
     return names
+
+
+def class_definition(file: str, name: str) -> ast.ClassDef:
+    """A class of the package, as its source has it."""
+    (kind,) = (node for node in _tree(file).body if isinstance(node, ast.ClassDef) and node.name == name)
+    return kind
 
 
 def class_names(module: str) -> set[str]:

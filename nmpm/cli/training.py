@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from nmpm._support.shipped import find_config
+from nmpm.cli import COMMANDS
 from nmpm.cli.early_checks import UsageError, check_command
 
 
@@ -17,7 +18,12 @@ def run(words: list[str]) -> int:
     Raises:
         ConfigError: if a file that an option names does not exist.
     """
-    found = with_shipped_configs(words)
+    if "--help" in words or "-h" in words:
+        from nmpm.cli.training_help import training_help
+
+        sys.stdout.write(training_help(words[0], COMMANDS[words[0]][1]))
+        return 0
+    found = with_shipped_configs(["--help" if word == "--help_all" else word for word in words])
     try:
         check_command(found)
         from nmpm.cli.emulator_cli import run_command

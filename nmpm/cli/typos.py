@@ -62,7 +62,7 @@ def _hint(wrong: str, names: Iterable[str], mark: str) -> str:
         return f"; did you mean {mark}{near[0]}?"
     arguments = dict(_part_arguments())
     near = get_close_matches(wrong.rpartition(".")[2], list(arguments), n=1, cutoff=0.75)
-    return f"; did you mean {mark}{arguments[near[0]]}?" if near else ". See --help for all there are."
+    return f"; did you mean {mark}{arguments[near[0]]}?" if near else ". See --help_all for all there are."
 
 
 def _question(wrong: str, names: Iterable[str], before: str) -> str:

@@ -41,6 +41,9 @@ def run(words: list[str]) -> int | None:
         " twin and floor (the simulator beside itself), stress",
     )
     refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its test scenes")
+    refresh.add_argument(
+        "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
+    )
     push = commands.add_parser("push", help="upload a model to the Hugging Face hub")
     push.add_argument("name")
     push.add_argument("repository", help="owner/repository, created if missing")
@@ -126,13 +129,17 @@ def _verify(chosen: argparse.Namespace) -> int:
 def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ConfigError
-    from nmpm.zoo.index import refresh, write_index
+    from nmpm.zoo.index import refresh, state_failures, write_index
     from nmpm.zoo.registry import Zoo
 
     if chosen.data is not None and chosen.name is None:
         raise ConfigError("--data is the folder of one model's data: give the model's NAME too.")
+    if chosen.failures is not None and chosen.name is None:
+        raise ConfigError("--failures is about one model: give the model's NAME too.")
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
+        if chosen.failures is not None:
+            state_failures(Zoo.folder(name, root), chosen.failures)
         refresh(Zoo.folder(name, root), chosen.measure, chosen.data)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 
+from nmpm.data.fields import read_fields
 from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
@@ -19,6 +20,8 @@ TOLERANCE = 1e-3
 
 def read_labelled(split: Split, index: int = 0, family: str | None = None) -> LabelledTrajectories:
     """Reads a trajectory, labelled "prediction" or "recorded" (or "simulated", where nmpm's simulators made it).
+
+    With the fields of particles that the file's scene or metadata declare, see `nmpm.data.fields`.
 
     Args:
         split: The file.
@@ -33,6 +36,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
     trajectory = split.read(index)
     scene, names, static, label = _describe(split, trajectory, family)
     moving = ~np.isin(trajectory.particle_type, sorted(static))
+    fields = read_fields(split, index, scene.particle_fields)
     return LabelledTrajectories(
         positions={label: trajectory.position[:, moving]},
         material=material_names(trajectory.particle_type[moving], names),
@@ -43,6 +47,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         periodic=scene.periodic,
         gravity=scene.gravity,
         title=f"{split.path.name}, trajectory {index}",
+        fields={name: {label: values[:, moving]} for name, values in fields.items() if values.shape[1] > 1},
     )
 
 
@@ -77,8 +82,16 @@ def combine(
         )
     frames = min(len(first), len(second))
     labels = (first_label, second_label) if first_label != second_label else names
+    fields = {
+        name: {
+            label: next(iter(each.fields[name].values()))[:frames]
+            for label, each in zip(labels, (reference, other), strict=True)
+            if name in each.fields
+        }
+        for name in dict.fromkeys((*reference.fields, *other.fields))
+    }
     return dataclasses.replace(
-        reference, positions={labels[0]: first[:frames], labels[1]: second[:frames]}, title=other.title
+        reference, positions={labels[0]: first[:frames], labels[1]: second[:frames]}, title=other.title, fields=fields
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -30,9 +30,12 @@ class LabelledTrajectories:
         gravity: (D,) external acceleration; in 3-D the axis of its largest component is drawn vertically (default:
             the second axis).
         title: Title of the picture.
+        fields: Further numbers of the particles by name and label, (T, N), or (1, N) if constant in time; a trajectory
+            may lack one. The viewer colours by them.
 
     Raises:
-        DataError: if shapes do not match, or a position is not finite (the message names label, frame and particle).
+        DataError: if shapes do not match, or a position or a field is not finite (the message names label, frame and
+            particle).
     """
 
     positions: Mapping[str, Floats]
@@ -44,10 +47,12 @@ class LabelledTrajectories:
     periodic: tuple[bool, ...] = ()
     gravity: tuple[float, ...] | None = None
     title: str = ""
+    fields: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "material", np.asarray(self.material, dtype=np.str_))
         self._check_positions()
+        self._check_fields()
         self._check_box()
 
     @classmethod
@@ -58,6 +63,7 @@ class LabelledTrajectories:
         material: ArrayLike,
         obstacle: Floats | None = None,
         title: str = "",
+        fields: Mapping[str, Mapping[str, Floats]] | None = None,
     ) -> LabelledTrajectories:
         """Takes box, time step, periodicity, gravity and material names from a scene.
 
@@ -67,6 +73,7 @@ class LabelledTrajectories:
             material: (N,) index into `Scene.materials`.
             obstacle: As in `LabelledTrajectories`.
             title: As in `LabelledTrajectories`.
+            fields: As in `LabelledTrajectories`.
         """
         return cls(
             positions,
@@ -78,6 +85,7 @@ class LabelledTrajectories:
             periodic=scene.periodic,
             gravity=scene.gravity,
             title=title,
+            fields=fields or {},
         )
 
     @property
@@ -156,6 +164,25 @@ class LabelledTrajectories:
             raise DataError(
                 f"Materials have shape {self.material.shape}, expected one name for each of {shape[1]} particles."
             )
+
+    def _check_fields(self) -> None:
+        shape = next(iter(self.positions.values())).shape[:2]
+        for name, by_label in self.fields.items():
+            for label, values in by_label.items():
+                if label not in self.positions:
+                    raise DataError(f"The field {name} is of {label!r}; trajectories are {', '.join(self.positions)}.")
+                if values.shape not in (shape, (1, shape[1])):
+                    raise DataError(
+                        f"The field {name} of {label!r} has shape {values.shape}, expected {shape} (frames, particles)"
+                        f" or (1, {shape[1]})."
+                    )
+                finite = np.isfinite(values)
+                if not finite.all():
+                    frame, particle = (int(index) for index in np.argwhere(~finite)[0])
+                    raise DataError(
+                        f"The field {name} of {label!r} is {values[frame, particle]} for particle {particle} in frame"
+                        f" {frame}: only particles that do not move may lack a value. Correct the data."
+                    )
 
     def _check_box(self) -> None:
         for name, box in {"bounds": self.bounds, "domain": self.outer_bounds}.items():

@@ -65,6 +65,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         *_twin_lines(card),
         *_floor_lines(card),
         *_quality_lines(card),
+        *_failure_lines(card),
         *_speed_lines(card),
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
         f"{training['precision']}; {training['parameters']:,} parameters; one run.",
@@ -112,6 +113,11 @@ def _twin_lines(card: Mapping[str, Any]) -> list[str]:
         f"The simulator with {twin['substeps']} substeps a frame beside itself with {twin['own_substeps']}: {figures}.",
         "",
     ]
+
+
+def _failure_lines(card: Mapping[str, Any]) -> list[str]:
+    """What a person saw to be wrong in the pictures."""
+    return [f"Known failures: {card['failures']}", ""] if card.get("failures") else []
 
 
 def _goal_lines(card: Mapping[str, Any]) -> list[str]:

@@ -39,13 +39,18 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Sequence[float]], card: Mappin
     frames = errors["frame"]
     for kind, label in PREDICTORS.items():
         axes.plot(frames, [1e3 * value for value in errors[kind]], label=label)
+    # Free fall is exact at first, by ten orders of magnitude more than what the curves are about.
+    lowest = min((1e3 * value for value in errors["model"] if value > 0), default=None)
     axes.set(xlabel="frame", ylabel="squared error ×10⁻³", yscale="log", title=f"{card['name']}: test scenes")
+    axes.set_ylim(bottom=lowest and lowest / 2)
     axes.legend(frameon=False, fontsize="small")
 
 
 def _draw_training(axes: Axes, curve: Sequence[Sequence[float]]) -> None:
-    axes.plot([point[0] / 3600 for point in curve], [1e3 * point[2] for point in curve], marker=".")
-    axes.set(xlabel="hours of training", ylabel="validation MSE ×10⁻³", yscale="log", title="full rollouts")
+    values = [1e3 * point[2] for point in curve]
+    axes.plot([point[0] / 3600 for point in curve], values, marker=".")
+    scale = "log" if max(values) > 10 * min(values) else "linear"
+    axes.set(xlabel="hours of training", ylabel="validation MSE ×10⁻³", yscale=scale, title="full rollouts")
 
 
 def _read_errors(path: Path) -> dict[str, list[float]]:

@@ -75,6 +75,22 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
         write_card(folder, card)
 
 
+def state_failures(folder: Path, text: str) -> None:
+    """Write on an entry's card what its pictures show to be wrong in its rollouts.
+
+    New weights make a new card, without it: their pictures have to be looked at again.
+
+    Args:
+        folder: Of the entry.
+        text: In sentences; empty if nothing is known.
+
+    Raises:
+        ZooError: if the card is missing or damaged.
+    """
+    card = {key: value for key, value in read_card(folder).items() if key != "failures"}
+    write_card(folder, card | ({"failures": " ".join(text.split())} if text.strip() else {}))
+
+
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:
     """Write an entry's card, and the chart and README that follow from it."""
     with atomic_write(folder / CARD) as part:

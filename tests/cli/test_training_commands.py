@@ -15,6 +15,7 @@ from PIL import Image
 
 from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
+from nmpm.cli.early_checks import argument_names
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
@@ -283,6 +284,26 @@ def test_help_answers_at_once_and_knows_every_command():
     for command in ("fit", "validate", "test", "predict", "zoo", "rollout", "render"):
         assert f"  {command} " in answer.stdout
     assert not any(f"| {heavy}\n" in answer.stderr for heavy in ("torch", "lightning", "numpy", "jsonargparse"))
+
+
+def test_help_of_training_names_all_that_can_be_set_without_importing_lightning():
+    words = [sys.executable, "-X", "importtime", "-m", "nmpm", "fit", "--config", "goop.yaml", "--help"]
+    answer = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert not any(f"| {heavy}\n" in answer.stderr for heavy in ("torch", "lightning", "numpy", "jsonargparse"))
+    listed = {group: re.findall(r"^  (\w+) +\S", part, flags=re.M) for group, part in help_sections(answer.stdout)}
+    assert set(listed["model"]) == argument_names("model") - {"scene", "recipe"}
+    assert set(listed["data"]) == argument_names("data") - {"horizon"}
+
+
+def help_sections(text: str) -> list[tuple[str, str]]:
+    """Groups of options and their lines."""
+    return re.findall(r"^--(\w+)\.KEY:\n(.*?)\n\n", text, flags=re.M | re.S)
+
+
+def test_help_all_lists_the_options_of_lightning_too(capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "--help_all"])
+    assert "--trainer.max_steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", [[], ["fly"]])

@@ -1,4 +1,5 @@
 import base64
+import dataclasses
 import json
 import re
 import zlib
@@ -74,6 +75,58 @@ def test_a_notebook_shows_the_page_in_a_frame(falling):
     shown = view(falling)._repr_html_()
     assert shown.startswith("<iframe srcdoc=")
     assert 'sandbox="allow-scripts"' in shown
+
+
+def test_fields_are_packed_within_their_colour_scale(falling):
+    frames, count = next(iter(falling.positions.values())).shape[:2]
+    first, second = falling.positions
+    warm = np.linspace(280.0, 320.0, frames * count).reshape(frames, count)
+    own = {"temperature": {first: warm, second: warm + 1}, "stiffness": {second: np.arange(count)[None]}}
+    shown = description(view(dataclasses.replace(falling, fields=own), every=2))["fields"]
+    assert [each["name"] for each in shown] == ["temperature", "stiffness"]
+    low, high = shown[0]["low"], shown[0]["high"]
+    assert 280 < low < 281
+    assert 320 < high < 321
+    steps = unpack(shown[0]["values"][0], warm[::2].shape)
+    assert np.allclose(low + steps * (high - low) / STEPS, warm[::2].clip(low, high), atol=1e-3)
+    assert shown[1]["values"][0] is None
+    constant = unpack(shown[1]["values"][1], warm[::2].shape)
+    assert np.all(constant == constant[0])
+    assert np.all(np.diff(constant[0].astype(int)) >= 0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"heat": {"nobody": np.zeros((1, 1))}}, "heat is of 'nobody'"),
+        ({"heat": {"a": np.zeros((2, 4))}}, r"heat of 'a' has shape \(2, 4\)"),
+        ({"heat": {"a": np.array([[0.0, np.nan, 1.0]])}}, "heat of 'a' is nan for particle 1 in frame 0"),
+    ],
+)
+def test_fields_must_fit_the_particles(fields, message):
+    with pytest.raises(DataError, match=message):
+        LabelledTrajectories(
+            {"a": np.full((2, 3, 2), 0.5)}, np.array(["water"] * 3), bounds=((0, 1), (0, 1)), dt=1.0, fields=fields
+        )
+
+
+def test_declared_fields_of_files_are_shown_beside_those_of_the_truth(tmp_path):
+    metadata = dataclasses.replace(made_up_metadata(), fields=("temperature", "stiffness_of_all", "label"))
+    write_metadata(tmp_path, metadata)
+    truth = made_up_trajectory(6, 5, statics=2)
+    warm = np.linspace(300, 310, 42, dtype=np.float32).reshape(6, 7)
+    warm[:, 5:] = np.nan  # what does not move needs no value
+    fields = {"temperature": warm, "label": np.arange(7), "stiffness_of_all": np.float32(2)}
+    written = dataclasses.replace(truth, fields=fields)
+    for split in ("train", "test"):
+        write_split(tmp_path / f"{split}.h5", [written])
+    write_split(tmp_path / "out.h5", [dataclasses.replace(written, fields=fields | {"temperature": warm + 1})])
+    shown = description(view(tmp_path / "out.h5", truth=tmp_path / "test.h5"))["fields"]
+    assert {each["name"] for each in shown} == {"temperature", "label"}  # a number of the scene colours nothing
+    (warmth,) = (each for each in shown if each["name"] == "temperature")
+    colder, warmer = (unpack(values, (6, 5)).astype(int) for values in warmth["values"])
+    assert np.all(warmer >= colder)
+    assert np.any(warmer > colder)
 
 
 @pytest.fixture

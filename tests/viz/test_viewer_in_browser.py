@@ -1,5 +1,6 @@
 """The viewer's page in headless Chromium: what a person clicks, presses and sees."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -125,6 +126,20 @@ def test_dragging_turns_a_box_of_three_dimensions(open_page):
     page.mouse.up()
     assert page.evaluate("viewer.camera.turn") != 0.5
     assert np.abs(picture(page) - before).sum() > 0
+
+
+def test_particles_have_the_colours_of_their_fields(open_page):
+    cold_to_warm = {"simulated": np.linspace(0.0, 1.0, 40)[:, None]}
+    page = open_page(dataclasses.replace(one_particle(), fields={"temperature": cold_to_warm}))
+    page.select_option("#colour", label="temperature")
+    assert "0.005 or less" in page.locator("#legend").inner_text()
+    scale = page.evaluate("scene.scale")
+    for frame, expected in ((0, scale[0]), (39, scale[-1])):
+        page.evaluate(f"viewer.seek({frame})")
+        left, right = np.split(picture(page)[:, : 2 * (900 // 2)], 2, axis=1)
+        rgb = [int(expected[at : at + 2], 16) for at in (1, 3, 5)]
+        assert np.any(np.abs(left - rgb).sum(axis=2) < 12)
+        assert np.any(np.abs(right - WATER).sum(axis=2) < 40)  # the prediction has no temperature
 
 
 def test_a_single_trajectory_has_no_error_to_show(open_page):

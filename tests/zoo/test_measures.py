@@ -81,3 +81,15 @@ def test_what_cannot_be_measured_is_named(goop, capsys):
 def test_a_card_says_whether_its_goal_is_reached(goop, goal, said):
     card = yaml.safe_load((goop / "card.yaml").read_text())
     assert f"Goal for `mse`: {said}" in readme(card | {"goal": goal, "test": card["test"] | {"mse": 0.5}})
+
+
+def test_known_failures_are_on_the_card_until_they_are_taken_back(goop, capsys):
+    words = ["zoo", "refresh", "goop", "--root", str(goop.parent), "--failures"]
+    assert main([*words, "Splashes become\n dust."]) == 0
+    assert main(words[:-1]) == 0  # a refresh keeps them
+    assert "\nKnown failures: Splashes become dust.\n" in (goop / "README.md").read_text()
+    assert main([*words, ""]) == 0
+    assert "failures" not in yaml.safe_load((goop / "card.yaml").read_text())
+    assert "Known failures" not in (goop / "README.md").read_text()
+    assert main(["zoo", "refresh", "--root", str(goop.parent), "--failures", "Dust."]) == 1
+    assert "give the model's NAME too" in capsys.readouterr().err

@@ -66,12 +66,16 @@ class Outcome:
         return interval(values.tolist())
 
     def to_dict(self) -> dict[str, Any]:
-        """All figures as plain data; lengths in domain length, times in milliseconds; None where there is none."""
+        """All figures as plain data; lengths in domain length, times in milliseconds; None where there is none.
+
+        `weights` is the digest of a model's weights, see `nmpm._support.digests`.
+        """
         low, middle, high = self.milliseconds
         return {
             "name": self.name,
             "kind": self.kind.value,
             "settings": dict(self.candidate.choice.settings),
+            "weights": self.candidate.choice.identity.get("weights"),
             "scenes_differ_in": list(self.candidate.differing),
             "errors": {
                 name: {

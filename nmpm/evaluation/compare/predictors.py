@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,14 +9,12 @@ from typing import Any
 import torch
 
 from nmpm.emulator import Emulator
-from nmpm.errors import ConfigError
 from nmpm.evaluation.trade.choice import CPU, Choice, Kind
-from nmpm.evaluation.trade.models import ModelChoice
+from nmpm.evaluation.trade.models import ModelChoice, over_scenes
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.simulators import SimulatorChoice
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
-
-_TWIN = 0.5  # share of the substeps with which the simulator is compared with itself
+from nmpm.sim.twin import twin_of
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,8 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
     """The simulator of the scenes, if it is known, and its twin; the models; the trivial predictors.
 
     A model of other scenes is rebuilt over these, with grid cells of the size it was trained with, see
-    `EmulatorRecipe.over`. The twin is the simulator with half as many substeps: what its own results are uncertain by.
+    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: what its own results are
+    uncertain by.
 
     Args:
         scenes: What is predicted.
@@ -59,13 +57,10 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
 
 
 def _model(name: str, emulator: Emulator, scenes: Scenes, device: torch.device) -> Candidate:
-    differing = emulator.scene.differences(scenes.scene)
-    try:
-        adapted = emulator.over(scenes.scene) if differing else emulator
-    except ConfigError as error:
-        raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
+    adapted = over_scenes(name, emulator, scenes)
     settings = {"model": name, "cells": "×".join(map(str, adapted.grid.shape))}
-    return Candidate(ModelChoice(name, adapted.to(device), settings, device=device), differing)
+    choice = ModelChoice(name, adapted.to(device), settings, device=device)
+    return Candidate(choice, emulator.scene.differences(scenes.scene))
 
 
 def _simulators(scenes: Scenes) -> list[Choice]:
@@ -73,12 +68,9 @@ def _simulators(scenes: Scenes) -> list[Choice]:
     if preset is None:
         return []
     shipped = SimulatorChoice(f"simulator, {preset.substeps} substeps", preset, _settings(preset.substeps))
-    substeps = math.ceil(_TWIN * preset.substeps)
-    if substeps == preset.substeps or substeps < preset.stable_substeps:
-        return [shipped]
-    twin = preset.with_substeps(substeps)
-    name = f"twin, {substeps} substeps"
-    return [shipped, SimulatorChoice(name, twin, _settings(substeps), kind=Kind.FLOOR)]
+    twin = twin_of(preset)
+    name = f"twin, {twin.substeps} substeps"
+    return [shipped, SimulatorChoice(name, twin, _settings(twin.substeps), kind=Kind.FLOOR)]
 
 
 def _settings(substeps: int) -> dict[str, Any]:

@@ -1,15 +1,16 @@
-"""Trained graph simulators as folders: `gns.json` and `model.safetensors`."""
+"""Trained graph simulators as folders: `gns.json` and `model.safetensors`; the state of a training as one file."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
+from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import read_bounded
@@ -87,6 +88,28 @@ def read_graph(folder: Path) -> TrainedGraph:
         raise DataError(f"{path} describes no graph simulator: {error}") from error
     _load_weights(simulator, Path(folder) / _WEIGHTS)
     return graph
+
+
+def write_progress(path: Path, state: Mapping[str, Tensor], curve: Sequence[tuple[float, float]]) -> None:
+    """Write the state of a training, see `GraphTrainer.state_dict`, and its validation losses by minutes."""
+    tensors = {name: values.contiguous() for name, values in state.items()}
+    with atomic_write(path) as part:
+        part.write_bytes(save(tensors, {"curve": json.dumps([list(point) for point in curve])}))
+
+
+def read_progress(path: Path) -> tuple[dict[str, Tensor], list[tuple[float, float]]]:
+    """What `write_progress` wrote.
+
+    Raises:
+        DataError: naming the file, if it cannot be read.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            facts = file.metadata() or {}
+        return state, [(float(minutes), float(loss)) for minutes, loss in json.loads(facts["curve"])]
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is no state of a training: {error}. Delete it to start over.") from error
 
 
 def _load_weights(simulator: GraphSimulator, path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -122,51 +122,110 @@ def validation_loss(simulator: GraphSimulator, recordings: Sequence[Recording], 
     return sum(float(loss_of(simulator, window.with_noise(noise, generator))) for window in windows) / count
 
 
+class GraphTrainer:
+    """A training of a graph simulator, in place; its statistics are calibrated first.
+
+    Args:
+        simulator: To train.
+        recordings: Of at least 3 frames.
+        settings: Length, noise, rates.
+        clock: Measures `settings.seconds`: the process' CPU time when left out.
+
+    Attributes:
+        spent: Seconds so far, of training alone.
+        steps: Taken so far.
+
+    Raises:
+        DataError: if there are no recordings.
+    """
+
+    def __init__(
+        self,
+        simulator: GraphSimulator,
+        recordings: Sequence[Recording],
+        settings: GraphTraining,
+        clock: Callable[[], float] = time.process_time,
+    ) -> None:
+        if not recordings:
+            raise DataError("A graph simulator needs at least one recording to train on.")
+        calibrate(simulator, recordings, settings.noise, settings.seed)
+        self.simulator, self.settings = simulator, settings
+        self._recordings, self._clock = recordings, clock
+        self._optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.rate)
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        self.spent, self.steps = 0.0, 0
+
+    @property
+    def done(self) -> bool:
+        """Whether the schedule is over."""
+        return self.spent >= self.settings.seconds
+
+    def step(self) -> None:
+        """Take one step.
+
+        Raises:
+            DataError: if the loss becomes non-finite.
+        """
+        start, settings, self.steps = self._clock(), self.settings, self.steps + 1
+        fallen = settings.decay ** (self.spent / settings.seconds)
+        for group in self._optimizer.param_groups:
+            group["lr"] = settings.rate * fallen * min(1.0, self.steps / max(settings.warmup, 1))
+        self._descend()
+        self.spent += self._clock() - start
+
+    def _descend(self) -> None:
+        batch, noise = self.settings.batch, self.settings.noise
+        self._optimizer.zero_grad()
+        for _ in range(batch):
+            window = draw_window(self._recordings, self.simulator.recipe.history, self._generator)
+            loss = loss_of(self.simulator, window.with_noise(noise, self._generator)) / batch
+            if not bool(loss.isfinite()):
+                raise DataError("The loss of a graph simulator is not finite: lower the learning rate.")
+            loss.backward()
+        self._optimizer.step()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that a training goes on from, as tensors: weights, optimizer, random state, time and steps."""
+        state = {f"simulator.{name}": values for name, values in self.simulator.state_dict().items()}
+        for index, entries in self._optimizer.state_dict()["state"].items():
+            state |= {f"optimizer.{index}.{name}": values for name, values in entries.items()}
+        state["generator"] = self._generator.get_state()
+        state["spent"] = torch.tensor(self.spent, dtype=torch.float64)
+        state["steps"] = torch.tensor(self.steps)
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a state of `state_dict`.
+
+        Raises:
+            DataError: if it is that of another simulator.
+        """
+        moments: dict[int, dict[str, Tensor]] = {}
+        try:
+            for name, values in _part(state, "optimizer").items():
+                index, _, entry = name.partition(".")
+                moments.setdefault(int(index), {})[entry] = values
+            self.simulator.load_state_dict(_part(state, "simulator"))
+            groups = self._optimizer.state_dict()["param_groups"]
+            self._optimizer.load_state_dict({"state": moments, "param_groups": groups})
+            self._generator.set_state(state["generator"])
+            self.spent, self.steps = float(state["spent"]), int(state["steps"])
+        except (KeyError, ValueError, RuntimeError) as error:
+            raise DataError(f"The stored state is not of this training of a graph simulator: {error}") from error
+
+
+def _part(state: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
+    return {key.removeprefix(f"{name}."): values for key, values in state.items() if key.startswith(f"{name}.")}
+
+
 def train(
     simulator: GraphSimulator,
     recordings: Sequence[Recording],
     settings: GraphTraining,
     clock: Callable[[], float] = time.process_time,
 ) -> Iterator[float]:
-    """Train in place; yields after each step the seconds spent, of training alone.
-
-    Args:
-        simulator: To train; its statistics are calibrated first.
-        recordings: Of at least 3 frames.
-        settings: Length, noise, rates.
-        clock: Measures `settings.seconds`: the process' CPU time when left out.
-
-    Raises:
-        DataError: if there are no recordings, or the loss becomes non-finite.
-    """
-    if not recordings:
-        raise DataError("A graph simulator needs at least one recording to train on.")
-    calibrate(simulator, recordings, settings.noise, settings.seed)
-    optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.rate)
-    generator = torch.Generator().manual_seed(settings.seed)
-    spent, step = 0.0, 0
-    while spent < settings.seconds:
-        start, step = clock(), step + 1
-        rate = settings.rate * settings.decay ** (spent / settings.seconds) * min(1.0, step / max(settings.warmup, 1))
-        for group in optimizer.param_groups:
-            group["lr"] = rate
-        _step(simulator, recordings, settings, optimizer, generator)
-        spent += clock() - start
-        yield spent
-
-
-def _step(
-    simulator: GraphSimulator,
-    recordings: Sequence[Recording],
-    settings: GraphTraining,
-    optimizer: torch.optim.Optimizer,
-    generator: torch.Generator,
-) -> None:
-    optimizer.zero_grad()
-    for _ in range(settings.batch):
-        window = draw_window(recordings, simulator.recipe.history, generator).with_noise(settings.noise, generator)
-        loss = loss_of(simulator, window) / settings.batch
-        if not bool(loss.isfinite()):
-            raise DataError("The loss of a graph simulator is not finite: lower the learning rate.")
-        loss.backward()
-    optimizer.step()
+    """Train in place, see `GraphTrainer`; yields after each step the seconds spent."""
+    trainer = GraphTrainer(simulator, recordings, settings, clock)
+    while not trainer.done:
+        trainer.step()
+        yield trainer.spent

@@ -58,17 +58,18 @@ class ModelChoice(Choice):
         return lambda frames: rollout(self.emulator, state, frames)
 
 
-def check_scene(name: str, emulator: Emulator, scenes: Scenes) -> None:
-    """Make sure that a model knows the scenes.
+def over_scenes(name: str, emulator: Emulator, scenes: Scenes) -> Emulator:
+    """The emulator itself, or rebuilt for these scenes if it was trained on others, see `EmulatorRecipe.over`.
 
     Raises:
-        ConfigError: naming the facts that differ.
+        ConfigError: if it cannot take the scenes, naming it and the reason.
     """
-    differing = emulator.scene.differences(scenes.scene)
-    if differing:
-        raise ConfigError(
-            f"The model {name} was trained for other scenes than those of {scenes.name}: {', '.join(differing)} differ."
-        )
+    if not emulator.scene.differences(scenes.scene):
+        return emulator
+    try:
+        return emulator.over(scenes.scene)
+    except ConfigError as error:
+        raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
 
 
 def with_precision(emulator: Emulator, name: str) -> Emulator:

@@ -21,7 +21,7 @@ from nmpm.evaluation.trade.errors import Measures
 from nmpm.evaluation.trade.graphs import graph_choices
 from nmpm.evaluation.trade.models import (
     ModelChoice,
-    check_scene,
+    over_scenes,
     with_cells,
     with_constraints,
     with_precision,
@@ -174,20 +174,21 @@ def make_choices(
     Args:
         sweep: Settings.
         scenes: What is predicted; without simulator there are no choices of it, and no floors.
-        models: Trained emulators on the CPU, by name.
+        models: Trained emulators on the CPU, by name; those of other scenes are rebuilt for these.
         device: Where they compute.
         graphs: Trained graph simulators, by name.
 
     Raises:
-        ConfigError: if a model was trained for other scenes, or there is no such setting.
+        ConfigError: if a model cannot take the scenes, or there is no such setting.
     """
     choices: list[Choice] = []
     if scenes.preset is not None:
         choices += _simulators(sweep.simulator, scenes.preset)
         choices += _floors(sweep.floors, scenes.preset)
     for name, emulator in models.items():
-        check_scene(name, emulator, scenes)
-        choices += _without_repetitions(_models(sweep.models, name, emulator, device))
+        over = over_scenes(name, emulator, scenes)
+        shown = name if over is emulator else f"{name} (of other scenes)"
+        choices += _without_repetitions(_models(sweep.models, shown, over, device))
     choices += graph_choices(graphs, scenes)
     choices += [TrivialChoice(name) for name in sweep.trivial]
     return choices

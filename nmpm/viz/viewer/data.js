@@ -24,6 +24,11 @@ async function readTrajectory(trajectory) {
   return undoDifferences(await inflate(trajectory.positions), scene.frames);
 }
 
+/** A field's values of one trajectory, frames × particles, in 65535ths of its colour scale; null where it has none. */
+async function readField(packed) {
+  return packed && undoDifferences(await inflate(packed), scene.frames);
+}
+
 /** #rrggbb as three numbers in [0, 1]. */
 function readColour(hex) {
   return [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);

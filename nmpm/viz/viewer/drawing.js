@@ -2,8 +2,9 @@
 
 const POINTS = `#version 300 es
 in vec3 position, previous, reference, material;
+in float field;
 uniform mat4 view; uniform vec3 low, extent, period; uniform vec4 plain;
-uniform float diameter, top; uniform int mode;   // mode 0: material, 1: speed, 2: error, 3: the colour \`plain\`
+uniform float diameter, top; uniform int mode;   // see MODES below; 3 is the colour \`plain\`
 uniform highp sampler2D scale;
 out vec4 colour;
 vec3 nearest(vec3 d) { return d - period * round(d / mix(vec3(1.0), period, step(1e-20, period))); }
@@ -11,7 +12,8 @@ void main() {
   vec3 x = low + extent * position;
   gl_Position = view * vec4(x, 1.0);
   gl_PointSize = max(diameter / gl_Position.w, 1.5);
-  float value = length(nearest(extent * (mode == 1 ? position - previous : position - reference))) / top;
+  float value = mode == 4 ? field
+    : length(nearest(extent * (mode == 1 ? position - previous : position - reference))) / top;
   colour = mode == 0 ? vec4(material, 1.0) : mode == 3 ? plain
     : vec4(texture(scale, vec2(clamp(value, 0.002, 0.998), 0.5)).rgb, 1.0);
 }`;
@@ -29,7 +31,7 @@ const LINES = `#version 300 es
 in vec3 position; uniform mat4 view; void main() { gl_Position = view * vec4(position, 1.0); }`;
 const FLAT = `#version 300 es
 precision highp float; uniform vec4 plain; out vec4 pixel; void main() { pixel = plain; }`;
-const MODES = { material: 0, speed: 1, error: 2, plain: 3 };
+const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
 
 function compile(gl, vertex, fragment, attributes) {
   const program = gl.createProgram();
@@ -50,14 +52,16 @@ function compile(gl, vertex, fragment, attributes) {
 class Drawing {
   /** @param colours RGB bytes of the particles; @param obstacles 16-bit positions, as those of trajectories. */
   constructor(canvas, colours, obstacles) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
+    // Discs are smooth by their shader, and walls in 2-D lie along pixels; only the slanted lines of 3-D need more.
+    const gl = canvas.getContext("webgl2", { antialias: scene.dim === 3, alpha: false });
     if (!gl) throw new Error("This browser does not offer WebGL 2, which the viewer needs.");
     this.gl = gl;
-    this.points = compile(gl, POINTS, DISC, ["position", "previous", "reference", "material"]);
+    this.points = compile(gl, POINTS, DISC, ["position", "previous", "reference", "material", "field"]);
     this.lines = compile(gl, LINES, FLAT, ["position"]);
     this.colours = this.upload(colours);
     this.obstacles = { buffer: this.upload(obstacles), count: obstacles.length / scene.dim };
     this.frames = [gl.createBuffer(), gl.createBuffer(), gl.createBuffer()];
+    this.values = gl.createBuffer();
     this.corners = gl.createBuffer();
     this.uploadScale(scene.scale.flatMap((hex) => readColour(hex).map((value) => Math.round(255 * value))));
     gl.enable(gl.BLEND);
@@ -91,7 +95,7 @@ class Drawing {
     gl.disable(gl.DEPTH_TEST);
     gl.useProgram(this.lines.program);
     gl.uniformMatrix4fv(this.lines.at("view"), false, view);
-    for (let i = 0; i < 4; i++) gl.disableVertexAttribArray(i);
+    for (let i = 0; i < 5; i++) gl.disableVertexAttribArray(i);
     if (scene.dim === 2) {
       this.drawCorners(rectangle(scene.domain), gl.TRIANGLE_STRIP, theme.wall);
       this.drawCorners(rectangle(scene.bounds), gl.TRIANGLE_STRIP, theme.inside);
@@ -110,7 +114,10 @@ class Drawing {
     gl.drawArrays(primitive, 0, corners.length);
   }
 
-  /** Draws particles at a frame. @param look {mode, top, plain, diameter}: see the shader; top in domain lengths. */
+  /**
+   * Draws particles at a frame.
+   * @param look {mode, top, plain, diameter, field}: see the shader; top in domain lengths, field of all frames.
+   */
   drawFrame(trajectory, reference, frame, view, look) {
     const gl = this.gl, size = trajectory.length / scene.frames;
     const part = (positions, at) => positions.subarray(at * size, (at + 1) * size);
@@ -120,6 +127,11 @@ class Drawing {
       gl.bindBuffer(gl.ARRAY_BUFFER, this.frames[location]);
       gl.bufferData(gl.ARRAY_BUFFER, values, gl.STREAM_DRAW);
     });
+    if (look.mode === MODES.field) {
+      const count = size / scene.dim;
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.values);
+      gl.bufferData(gl.ARRAY_BUFFER, look.field.subarray(frame * count, (frame + 1) * count), gl.STREAM_DRAW);
+    }
     this.drawPoints(this.frames, size / scene.dim, view, look);
   }
 
@@ -142,6 +154,13 @@ class Drawing {
       gl.vertexAttribPointer(3, 3, gl.UNSIGNED_BYTE, true, 0, 0);
     } else {
       gl.disableVertexAttribArray(3);
+    }
+    if (look.mode === MODES.field) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.values);
+      gl.enableVertexAttribArray(4);
+      gl.vertexAttribPointer(4, 1, gl.UNSIGNED_SHORT, true, 0, 0);
+    } else {
+      gl.disableVertexAttribArray(4);
     }
     gl[dim === 3 ? "enable" : "disable"](gl.DEPTH_TEST);
     gl.uniformMatrix4fv(at("view"), false, view);

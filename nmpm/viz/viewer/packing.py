@@ -20,7 +20,7 @@ def quantize(position: Floats, low: NDArray[np.float64], high: NDArray[np.float6
 
 
 def pack_positions(steps: NDArray[np.uint16]) -> str:
-    """Packs quantised positions, (T, N, D) with particles drawn in this order.
+    """Packs quantised positions (T, N, D), or other numbers (T, N), with particles drawn in this order.
 
     All low bytes precede all high bytes, which are mostly the same and so take next to no room.
     """

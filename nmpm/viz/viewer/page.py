@@ -23,6 +23,8 @@ SCRIPTS = ("data.js", "matrices.js", "drawing.js", "layout.js", "curve.js", "vie
 COLOUR_SCALE = "viridis"
 TOP_PERCENTILE = 99.5
 """Of speeds and errors: what the upper end of the colour scale stands for."""
+FIELD_PERCENTILES = (0.5, 99.5)
+"""Of a field's values: what the ends of the colour scale stand for."""
 SAMPLED_FRAMES = 50
 
 
@@ -81,6 +83,7 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         **_describe_box(trajectories),
         **_describe_looks(trajectories, list(positions.values())),
         **_describe_motion(trajectories, positions, every),
+        "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
     }
 
 
@@ -130,6 +133,27 @@ def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Fl
             }
             for label, position in positions.items()
         ],
+    }
+
+
+def _describe_field(trajectories: LabelledTrajectories, name: str, every: int) -> dict[str, Any]:
+    """Values as 65535ths of the colour scale, packed like positions; null for a trajectory without the field."""
+    by_label = trajectories.fields[name]
+    values = np.concatenate([each.ravel() for each in by_label.values()]).astype(np.float64)
+    low, high = np.percentile(values, FIELD_PERCENTILES)
+    ends = np.array(low), np.array(high if high > low else low + 1.0)
+
+    def pack(label: str) -> str | None:
+        if label not in by_label:
+            return None
+        shown = np.broadcast_to(by_label[label], (trajectories.frame_count, len(trajectories.material)))[::every]
+        return pack_positions(quantize(shown.clip(*ends), *ends))
+
+    return {
+        "name": name,
+        "low": float(ends[0]),
+        "high": float(ends[1]),
+        "values": [pack(label) for label in trajectories.positions],
     }
 
 

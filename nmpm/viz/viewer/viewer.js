@@ -5,8 +5,9 @@ const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost
 const element = (id) => document.getElementById(id);
 
 class Viewer {
-  constructor(drawing, trajectories) {
-    Object.assign(this, { drawing, trajectories, frame: 0, playing: false, drawn: 0, camera: new Camera() });
+  /** @param fields For each field of the scene, values of each trajectory or null. */
+  constructor(drawing, trajectories, fields) {
+    Object.assign(this, { drawing, trajectories, fields, frame: 0, playing: false, drawn: 0, camera: new Camera() });
     this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
     this.fillChoices();
     this.listen();
@@ -17,14 +18,17 @@ class Viewer {
 
   get frames() { return scene.frames; }
   get colour() { return element("colour").value; }
+  get fieldIndex() { return Number(this.colour.replace("field ", "")); }
+  get mode() { return this.colour.startsWith("field ") ? MODES.field : MODES[this.colour]; }
   get layout() { return element("layout").value; }
   get rate() { return Number(element("rate").value); }
 
   fillChoices() {
     const many = scene.trajectories.length > 1;
     const names = ["material", "speed", ...(many ? ["error"] : [])];
+    const own = scene.fields.map(({ name }, index) => new Option(name, `field ${index}`));
     element("title").textContent = document.title = scene.title;
-    element("colour").replaceChildren(...names.map((name) => new Option(name, name)));
+    element("colour").replaceChildren(...names.map((name) => new Option(name, name)), ...own);
     element("rate").replaceChildren(...RATES.map((rate) =>
       new Option(`${rate} frames/s (${Number((rate * scene.dt).toPrecision(2))} × real time)`, rate, rate === 60, rate === 60)));
     element("layout-choice").hidden = !many;
@@ -165,13 +169,21 @@ class Viewer {
   drawPanel({ indices, x, y, width, height }, canvasHeight, ratio) {
     const pixels = [x, canvasHeight / ratio - y - height, width, height].map((value) => Math.round(value * ratio));
     const { matrix, unit } = this.camera.view(width, height);
-    const look = { mode: MODES[this.colour], top: this.top(), plain: [0, 0, 0, 1], diameter: 1.1 * scene.spacing * unit * ratio };
+    const look = { mode: this.mode, top: this.top(), plain: [0, 0, 0, 1], diameter: 1.1 * scene.spacing * unit * ratio };
     this.drawing.startPanel(pixels, matrix, this.theme);
     this.drawing.drawObstacles(matrix, { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 1] });
     for (const index of indices) {
       const chosen = index === 0 ? this.referenceLook(look, indices.length > 1) : look;
-      this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, matrix, chosen);
+      this.drawing.drawFrame(
+        this.trajectories[index], this.trajectories[0], this.frame, matrix, this.fieldLook(chosen, index));
     }
+  }
+
+  /** With a trajectory's values of the chosen field; one without the field has the colours of its materials. */
+  fieldLook(look, index) {
+    if (look.mode !== MODES.field) return look;
+    const field = this.fields[this.fieldIndex][index];
+    return field ? { ...look, field } : { ...look, mode: MODES.material };
   }
 
   /** How the first trajectory is drawn: grey under another; without error, of which it has none. */
@@ -222,6 +234,11 @@ class Viewer {
       context.fillStyle = colour;
       context.fillRect(at, 0, 1, 1);
     });
+    if (this.mode === MODES.field) {
+      const { low, high } = scene.fields[this.fieldIndex];
+      legend.replaceChildren(`${Number(low.toPrecision(4))} or less`, bar, `${Number(high.toPrecision(4))} or more`);
+      return;
+    }
     const unit = this.colour === "speed" ? "length per second" : "length";
     const end = this.colour === "speed" ? scene.fastest / scene.dt : scene.worst;
     legend.replaceChildren("0", bar, `${Number(end.toPrecision(2))} ${unit} or more`);
@@ -254,7 +271,8 @@ async function start() {
   const trajectories = await Promise.all(scene.trajectories.map(readTrajectory));
   const obstacles = undoDifferences(await inflate(scene.obstacles), 1);
   const drawing = new Drawing(element("scene"), await inflate(scene.colours), obstacles);
-  window.viewer = new Viewer(drawing, trajectories);
+  const fields = await Promise.all(scene.fields.map(({ values }) => Promise.all(values.map(readField))));
+  window.viewer = new Viewer(drawing, trajectories, fields);
   element("message").hidden = true;
 }
 

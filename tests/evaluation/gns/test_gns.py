@@ -11,13 +11,16 @@ from nmpm.data.loading.recording import Recording
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.gns import (
     GraphRecipe,
+    GraphTrainer,
     GraphTraining,
     TrainedGraph,
     is_graph_folder,
     radius_graph,
     read_graph,
+    read_progress,
     train,
     write_graph,
+    write_progress,
 )
 from nmpm.evaluation.gns.simulator import Surroundings, extend_back
 from nmpm.evaluation.gns.training import loss_of, window_at
@@ -187,3 +190,36 @@ def test_wrong_settings_are_named():
         GraphRecipe(dataclasses.replace(SCENE, evolving=("heat",)))
     with pytest.raises(ConfigError, match="seconds = 0"):
         GraphTraining(0)
+
+
+def counting_trainer():
+    torch.manual_seed(0)
+    steps = iter(range(10**6))
+    settings = GraphTraining(seconds=8, noise=1e-3, batch=2)
+    return GraphTrainer(GraphRecipe(SCENE, width=4, steps=1).build(), [falling()], settings, lambda: next(steps))
+
+
+def test_a_training_that_was_stored_ends_with_the_weights_of_an_uninterrupted_one(tmp_path):
+    whole, first, second = counting_trainer(), counting_trainer(), counting_trainer()
+    while not whole.done:
+        whole.step()
+    for _ in range(3):
+        first.step()
+    write_progress(tmp_path / "training.safetensors", first.state_dict(), [(1.0, 0.5)])
+    state, curve = read_progress(tmp_path / "training.safetensors")
+    assert curve == [(1.0, 0.5)]
+    second.load_state_dict(state)
+    while not second.done:
+        second.step()
+    assert (second.steps, second.spent) == (whole.steps, whole.spent) == (8, 8.0)
+    for name, values in whole.simulator.state_dict().items():
+        assert torch.equal(second.simulator.state_dict()[name], values), name
+
+
+def test_stored_trainings_of_others_are_refused(tmp_path):
+    path = tmp_path / "training.safetensors"
+    path.write_bytes(b"nothing")
+    with pytest.raises(DataError, match="is no state of a training"):
+        read_progress(path)
+    with pytest.raises(DataError, match="not of this training"):
+        counting_trainer().load_state_dict({"simulator.network": torch.zeros(1)})

@@ -218,10 +218,17 @@ def test_a_graph_network_of_other_scenes_is_rejected(scenes):
         make_choices(tiny_sweep(), scenes, {}, graphs={"other": other})
 
 
-def test_a_model_of_other_scenes_is_rejected(scenes):
+def test_a_model_that_cannot_take_the_scenes_is_rejected(scenes):
     other = dataclasses.replace(scenes.scene, dt=2 * scenes.scene.dt)
-    with pytest.raises(ConfigError, match=r"model other was trained for other scenes .*: dt differ"):
+    with pytest.raises(ConfigError, match=r"model other cannot predict the scenes of .* made for dt"):
         make_choices(tiny_sweep(), scenes, {"other": tiny_emulator(other)})
+
+
+def test_a_model_of_other_scenes_is_rebuilt_for_these_and_named_so(scenes):
+    finer = dataclasses.replace(scenes.scene, particle_volume=scenes.scene.particle_volume / 2)
+    found = [c for c in make_choices(tiny_sweep(), scenes, {"one": tiny_emulator(finer)}) if c.kind is Kind.MODEL]
+    assert {choice.settings["model"] for choice in found} == {"one (of other scenes)"}
+    assert all(choice.emulator.scene == scenes.scene for choice in found)
 
 
 def test_settings_that_a_simulator_refuses_are_left_out(scenes):

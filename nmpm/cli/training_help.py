@@ -1,0 +1,96 @@
+"""Help of the training commands on one screen or two, read from the source: importing Lightning takes seconds.
+
+`--help_all` lists every option with type and default, also those of Lightning's Trainer, and takes those seconds.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import textwrap
+from collections.abc import Iterator
+
+from nmpm.cli.early_checks import SIGNATURES, argument_names, class_definition
+
+LINKED = {"model": {"scene", "recipe"}, "data": {"horizon"}}
+"""Arguments that the command line takes from elsewhere."""
+INDENT, WIDTH = 30, 118
+
+_TEXT = """\
+usage: nmpm {command} --config FILE [--SECTION.KEY VALUE ...]
+
+{summary}
+Options replace what the configuration says, and later --config files what earlier ones say.
+
+options:
+{options}
+
+--model.KEY:
+{model}
+
+--data.KEY:
+{data}
+
+--trainer.KEY, of Lightning's Trainer, such as:
+{trainer}
+
+--checkpoint.KEY and --resume.KEY are of Lightning's ModelCheckpoint: which checkpoint is the best, and how often the
+one to resume from is written.
+
+more:
+  nmpm {command} --help_all     every option with type and default; takes seconds
+  nmpm {command} --config goop.yaml --print_config     the whole configuration
+  nmpm {command} --model.processor.help nmpm.processors.UNet     options of a part
+"""
+_OPTIONS = {
+    "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
+    "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, other commands judge it",
+    "--start_from MODEL": "fit only: start with the weights of a zoo model, a run or a checkpoint of the same parts",
+    "--seed_everything N": "seed of all random numbers (default: 0)",
+    "--print_config": "print the configuration that results, and stop",
+}
+_TRAINER = {
+    "default_root_dir": "folder of the run's files",
+    "max_steps, max_time": "end of the training: steps, or DD:HH:MM:SS, whichever is first",
+    "accelerator, devices": "where to compute: auto, cpu, gpu; how many devices, see docs/scaling.md",
+    "precision": "of the network, such as 32-true or bf16-mixed",
+    "val_check_interval": "steps from validation to validation",
+    "enable_progress_bar": "false for none",
+}
+
+
+def training_help(command: str, summary: str) -> str:
+    """The help of a training command.
+
+    Args:
+        command: fit, validate, test or predict.
+        summary: What it does, in one sentence.
+    """
+    own = {group: "\n".join(_entries(dict(_described(group)))) for group in SIGNATURES}
+    options = "\n".join(_entries(_OPTIONS))
+    return _TEXT.format(command=command, summary=summary, options=options, trainer="\n".join(_entries(_TRAINER)), **own)
+
+
+def _described(group: str) -> Iterator[tuple[str, str]]:
+    """Arguments of --model.… or --data.…, in their order, and the first sentence about each."""
+    known = argument_names(group) - LINKED[group]
+    for file, name in SIGNATURES[group]:
+        for key, text in _argument_texts(ast.get_docstring(class_definition(file, name)) or ""):
+            if key in known:
+                yield key, re.split(r"\. (?=[A-Z])|\.$", text)[0]
+
+
+def _argument_texts(docstring: str) -> Iterator[tuple[str, str]]:
+    """Names and texts of the section "Args:" of a docstring."""
+    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", docstring, flags=re.DOTALL | re.MULTILINE)
+    for entry in re.split(r"\n(?=    \w)", section[1].rstrip() if section else ""):
+        key, _, text = entry.strip().partition(": ")
+        yield key, " ".join(text.split())
+
+
+def _entries(described: dict[str, str]) -> Iterator[str]:
+    for key, text in described.items():
+        first, *others = textwrap.wrap(text, WIDTH - INDENT)
+        start = f"  {key}".ljust(INDENT)
+        yield start + first if len(start) == INDENT else f"{start}\n{' ' * INDENT}{first}"
+        yield from (" " * INDENT + other for other in others)
