@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from nmpm.data.format import Split
+
 COMMON = [
     *("--config", "waterdrop.yaml", "--model.unroll", "1", "--model.processor.width", "4"),
     *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--trainer.precision", "32-true"),
@@ -38,9 +40,14 @@ def test_two_processes_measure_what_one_measures(make_dataset, tmp_path):
     nmpm("test", *data, "--ckpt_path", best, "--trainer.default_root_dir", str(tmp_path / "one"), devices=1)
     alone = json.loads((tmp_path / "one" / "report.json").read_text())
     assert alone["test"] == pytest.approx(report["test"], rel=1e-5)
-    counted = sorted(row["mse"] for row in report["per_trajectory"]["model"])
-    assert counted == pytest.approx(sorted(row["mse"] for row in alone["per_trajectory"]["model"]), rel=1e-5)
+    counted, rows = ([row["mse"] for row in found["per_trajectory"]["model"]] for found in (report, alone))
+    assert counted == pytest.approx(rows, rel=1e-5)
+    reach_32 = [["mse@32" in row for row in found["per_trajectory"]["model"]] for found in (report, alone)]
+    assert reach_32 == [[False, True, False]] * 2  # in the order of the split, of which batches take equal lengths
     assert Path(root / "rollout.png").is_file()
+    nmpm("predict", *data, "--ckpt_path", best, "--trainer.default_root_dir", str(root), devices=2)
+    predicted = Split(root / "predictions.h5")
+    assert [predicted.particles(index) for index in range(len(predicted))] == [9, 7, 8]
 
 
 TRAIN_TO = """

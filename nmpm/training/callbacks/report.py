@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,10 @@ from rich.table import Table
 from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.collectives import all_gather
 from nmpm._support.devices import device_name
 from nmpm._support.version import __version__
+from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
 from nmpm.metrics import MSE
 from nmpm.particles import Window
@@ -94,7 +96,8 @@ class ReportWriter(Callback):
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not isinstance(pl_module, EmulatorModule):
             return
-        errors = {kind: _gather_ranks(metric) for kind, metric in pl_module.test_errors.errors.items()}
+        order = _tested(trainer)
+        errors = {kind: _gather_ranks(metric, order) for kind, metric in pl_module.test_errors.errors.items()}
         if not trainer.is_global_zero:
             return
         folder = Path(trainer.default_root_dir)
@@ -160,10 +163,19 @@ def _simulation(datamodule: Any) -> dict[str, Any]:
     return {"simulation": stated} if isinstance(stated, dict) else {}
 
 
-def _gather_ranks(metric: MSE) -> tuple[list[dict[str, float]], list[Tensor]]:
-    """MSE per trajectory and curves, from all processes."""
+def _tested(trainer: Trainer) -> list[int]:
+    """Indices of the tested trajectories of all processes, in the order in which metrics join them."""
+    loader = trainer.test_dataloaders
+    batches = loader.batches[: int(trainer.num_test_batches[0])] if isinstance(loader, EvaluationLoader) else ()
+    return [index for own in all_gather([index for batch in batches for index in batch]) for index in own]
+
+
+def _gather_ranks(metric: MSE, order: Sequence[int]) -> tuple[list[dict[str, float]], list[Tensor]]:
+    """MSE per trajectory and curves, from all processes, in the order of the split."""
     with metric.sync_context():
-        return metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]
+        rows, curves = metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]
+    places = sorted(range(len(rows)), key=order.__getitem__) if order else range(len(rows))
+    return [rows[place] for place in places], [curves[place] for place in places]
 
 
 def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
