@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lightning.pytorch import Trainer
+from torch.utils.data import DataLoader
 from trainings import data_of, fingerprints, train
 
 from nmpm.data.format import Split, write_metadata, write_split
@@ -173,3 +175,16 @@ def test_one_process_writes_the_predictions_of_all_in_order(monkeypatch, tmp_pat
     PredictionWriter().on_predict_end(trainer, None)
     written = Split(tmp_path / "predictions.h5")
     assert [written.read(index).position.shape[1] for index in range(len(written))] == [3, 4, 5]
+
+
+def test_predictions_of_another_loader_have_its_order(folder, tmp_path):
+    data = data_of(folder)
+    windows = list(data.test_dataloader())
+    module = EmulatorModule(data.scene, cells=8, frames=2)
+    calibrate(module.emulator, list(islice(data.train_dataloader(), 1)))
+    options = {"logger": False, "enable_progress_bar": False, "accelerator": "cpu"}
+    trainer = Trainer(default_root_dir=tmp_path, callbacks=[PredictionWriter()], **options)
+    trainer.predict(module, DataLoader(windows[::-1], batch_size=None))
+    written = Split(tmp_path / "predictions.h5")
+    wanted = [int(real.sum()) for window in windows[::-1] for real in window.mask]
+    assert [written.particles(index) for index in range(len(written))] == wanted

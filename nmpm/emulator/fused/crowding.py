@@ -175,11 +175,8 @@ def drift(
                 way = _FURTHEST if way > _FURTHEST else way
                 shift[p, d] = -_FURTHEST if way < -_FURTHEST else way
         for frame in range(frames):
-            part, here, moved = (
-                np.float32(frame + 1) / np.float32(frames),
-                path[frame, begin:end],
-                spread[frame, begin:end],
-            )
+            part = np.float32(frame + 1) / np.float32(frames)
+            here, moved = path[frame, begin:end], spread[frame, begin:end]
             for d in range(dim):
                 lowest, highest, reflects = bounds[0, d], bounds[1, d], bounds[2, d] > ZERO
                 for p in range(len(here)):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
-from nmpm._support.collectives import gather_to_rank0
+from nmpm._support.collectives import gather_to_rank0, rank_and_world_size
 from nmpm.data.format import Trajectory, write_split
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.predictions import predicted_trajectory
@@ -42,9 +43,16 @@ class PredictionWriter(BasePredictionWriter):
         source = f"{trainer.ckpt_path or 'the model'}"
         fields = prediction.fields if isinstance(prediction, Rollout) else {}
         positions = prediction.position if isinstance(prediction, Rollout) else prediction
-        loader = cast(EvaluationLoader, trainer.predict_dataloaders)
-        for row, index in enumerate(loader.batches[batch_idx]):
+        for row, index in enumerate(self._places(trainer.predict_dataloaders, batch_idx, len(positions))):
             self._predicted[index] = predicted_trajectory(scene, batch.initial, positions, source, row, fields)
+
+    def _places(self, loader: object, batch_idx: int, count: int) -> Sequence[int]:
+        """Where the trajectories of a batch belong in the file."""
+        if isinstance(loader, EvaluationLoader):
+            return loader.batches[batch_idx]
+        rank, world = rank_and_world_size()  # of another loader: in the order of arrival, ranks in turn
+        first = rank + world * len(self._predicted)
+        return range(first, first + world * count, world)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         by_rank = gather_to_rank0(self._predicted)
