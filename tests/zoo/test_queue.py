@@ -276,6 +276,6 @@ def test_a_killed_queue_goes_on_within_its_time_and_the_rate_comes_down_once(que
             rates.append([float(row["lr-SOAP"]) for row in csv.DictReader(file) if row.get("lr-SOAP")])
     assert len(rates) == 2
     # How far it comes down depends on how long the last step takes: the rate is that of the time at the step's start.
-    assert rates[1][-1] < max(rates[0])
+    assert rates[1][-1] < 0.2 * max(rates[0])
     assert rates[1] == sorted(rates[1], reverse=True)
     assert max(rates[1]) <= max(rates[0])
