@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.generate import preset_metadata
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.seeds import derive_seed
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset

@@ -1,0 +1,54 @@
+"""Seeds of simulated trajectories, and the ones that take the place of seeds whose simulations become unstable."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from nmpm.errors import UnstableError
+from nmpm.sim import Preset
+from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+
+DRAWS = 5
+"""Seeds tried for one trajectory; a preset that is unstable as often in a row is at fault, not the seed."""
+
+_log = logging.getLogger(__name__)
+
+
+def derive_seed(*entropy: int) -> int:
+    """A seed that depends on all the numbers."""
+    return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def seed_of_draw(place: tuple[int, ...], draw: int) -> int:
+    """The seed of a trajectory after `draw` others turned out unstable.
+
+    Args:
+        place: The dataset's seed and what tells the trajectory from the dataset's others.
+        draw: 0 for the first seed.
+    """
+    return derive_seed(*place, draw) if draw else derive_seed(*place)
+
+
+def simulate_first_stable(
+    preset: Preset, place: tuple[int, ...], progress: Progress | None = None
+) -> SimulatedTrajectory:
+    """Simulate a trajectory from the first of its seeds that stays stable; a warning names each that does not.
+
+    Args:
+        preset: The family of scenes.
+        place: As for `seed_of_draw`.
+        progress: Called after each frame.
+
+    Raises:
+        UnstableError: if none of `DRAWS` seeds stays stable.
+        ConfigError: if no initial state fits into the box.
+    """
+    for draw in range(DRAWS):
+        try:
+            return preset.simulate(seed_of_draw(place, draw), progress)
+        except UnstableError as error:
+            _log.warning("Another seed takes the place of one that is unstable. %s", error)
+            last = error
+    raise UnstableError(f"{DRAWS} seeds in a row are unstable; the last: {last}") from last
