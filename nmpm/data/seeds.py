@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +16,8 @@ DRAWS = 5
 """Seeds tried for one trajectory; a preset that is unstable as often in a row is at fault, not the seed."""
 
 _log = logging.getLogger(__name__)
+
+Simulated = TypeVar("Simulated")
 
 
 def derive_seed(*entropy: int) -> int:
@@ -31,24 +35,33 @@ def seed_of_draw(place: tuple[int, ...], draw: int) -> int:
     return derive_seed(*place, draw) if draw else derive_seed(*place)
 
 
-def simulate_first_stable(
-    preset: Preset, place: tuple[int, ...], progress: Progress | None = None
-) -> SimulatedTrajectory:
-    """Simulate a trajectory from the first of its seeds that stays stable; a warning names each that does not.
+def try_seeds(place: tuple[int, ...], simulate: Callable[[int], Simulated]) -> Simulated:
+    """What is simulated from the first of a trajectory's seeds that stays stable; a warning names each that does not.
 
     Args:
-        preset: The family of scenes.
         place: As for `seed_of_draw`.
-        progress: Called after each frame.
+        simulate: Simulates from a seed.
 
     Raises:
         UnstableError: if none of `DRAWS` seeds stays stable.
-        ConfigError: if no initial state fits into the box.
     """
     for draw in range(DRAWS):
+        seed = seed_of_draw(place, draw)
         try:
-            return preset.simulate(seed_of_draw(place, draw), progress)
+            return simulate(seed)
         except UnstableError as error:
-            _log.warning("Another seed takes the place of one that is unstable. %s", error)
+            _log.warning("Another seed takes the place of %d, which is unstable. %s", seed, error)
             last = error
     raise UnstableError(f"{DRAWS} seeds in a row are unstable; the last: {last}") from last
+
+
+def simulate_first_stable(
+    preset: Preset, place: tuple[int, ...], progress: Progress | None = None
+) -> SimulatedTrajectory:
+    """A preset's trajectory, see `try_seeds`; `progress` is called after each frame.
+
+    Raises:
+        UnstableError: if no seed stays stable.
+        ConfigError: if no initial state fits into the box.
+    """
+    return try_seeds(place, lambda seed: preset.simulate(seed, progress))
