@@ -44,10 +44,10 @@ def main() -> None:
     }
     sys.stdout.write(f"{chosen.model}, {chosen.ramps} ramps\n{'':<26}{'field':>8}{'slope':>8}{'whole: field':>14}\n")
     ramps, whole = (draw_ramps(emulator, chosen.ramps, sides) for sides in (False, True))
-    exact = partial(sampled, emulator, FINE, 1 / FINE)
+    exact, exact_whole = (with_slopes(partial(sampled, emulator, FINE, 1 / FINE), drawn) for drawn in (ramps, whole))
     for name, way in ways.items():
-        field, slope = deviations(way, exact, ramps)
-        alone, _ = deviations(way, exact, whole)
+        field, slope = deviations(with_slopes(way, ramps), exact)
+        alone, _ = deviations(with_slopes(way, whole), exact_whole)
         sys.stdout.write(f"{name:<26}{field:>8.4f}{slope:>8.2f}{alone:>14.4f}\n")
 
 
@@ -83,12 +83,16 @@ def sampled(emulator: Emulator, samples: int, band: float, ramp: Ramp) -> Tensor
     return emulator.transfer.p2g(share.unsqueeze(-1) / samples**grid.dim, cells, grid)
 
 
-def deviations(way: Field, exact: Field, ramps: list[tuple[Tensor, float, float, float]]) -> tuple[float, float]:
-    """Of the field, and of its derivative by the angle, relative to the exact one."""
-    one, other = (torch.stack([torch.stack(with_slope(field, *ramp)) for ramp in ramps]) for field in (way, exact))
-    reached = (one[:, 0] != 0) | (other[:, 0] != 0)
-    apart, size = (float((values[:, 1][reached]).square().mean().sqrt()) for values in (one - other, other))
-    return float((one - other)[:, 0][reached].square().mean().sqrt()), apart / size
+def deviations(one: Tensor, exact: Tensor) -> tuple[float, float]:
+    """Of fields (R, 2, …) from `with_slopes`, and of their derivatives, relative to the exact ones."""
+    reached = (one[:, 0] != 0) | (exact[:, 0] != 0)
+    apart, size = (float((values[:, 1][reached]).square().mean().sqrt()) for values in (one - exact, exact))
+    return float((one - exact)[:, 0][reached].square().mean().sqrt()), apart / size
+
+
+def with_slopes(field: Field, ramps: list[tuple[Tensor, float, float, float]]) -> Tensor:
+    """(R, 2, 1, 1, *S) fields of R ramps, and their derivatives by the angle."""
+    return torch.stack([torch.stack(with_slope(field, *ramp)) for ramp in ramps])
 
 
 def with_slope(field: Field, centre: Tensor, length: float, thickness: float, angle: float) -> tuple[Tensor, Tensor]:
