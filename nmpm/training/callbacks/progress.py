@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from datetime import timedelta
 from typing import Any
@@ -134,7 +135,7 @@ class Progress(ProgressBar):
 
     def _open(self, what: str, total: float, keep: bool = False) -> Tqdm:
         form = "{percentage:3.0f}% |{bar:20}| {desc}" if keep else "{desc} {n_fmt}/{total_fmt}"
-        pause = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS
+        pause, width = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS, _missing_width()
         return Tqdm(
             desc=what,
             total=total,
@@ -145,7 +146,8 @@ class Progress(ProgressBar):
             mininterval=pause,
             maxinterval=pause,
             miniters=0,
-            dynamic_ncols=True,
+            ncols=width,
+            dynamic_ncols=width is None,
         )
 
     def _count_batch(self) -> None:
@@ -156,3 +158,12 @@ class Progress(ProgressBar):
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def _missing_width() -> int | None:
+    """80 for a terminal that states a width of 0, as in some containers, where tqdm would write nothing; else None."""
+    try:
+        columns = os.get_terminal_size(sys.stdout.fileno()).columns
+    except (OSError, ValueError):
+        return None
+    return None if columns else 80
