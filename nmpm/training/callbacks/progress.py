@@ -135,7 +135,8 @@ class Progress(ProgressBar):
 
     def _open(self, what: str, total: float, keep: bool = False) -> Tqdm:
         form = "{percentage:3.0f}% |{bar:20}| {desc}" if keep else "{desc} {n_fmt}/{total_fmt}"
-        pause, width = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS, _missing_width()
+        pause = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS
+        columns, rows = _missing_size()
         return Tqdm(
             desc=what,
             total=total,
@@ -146,8 +147,9 @@ class Progress(ProgressBar):
             mininterval=pause,
             maxinterval=pause,
             miniters=0,
-            ncols=width,
-            dynamic_ncols=width is None,
+            ncols=columns,
+            nrows=rows,
+            dynamic_ncols=columns is None,
         )
 
     def _count_batch(self) -> None:
@@ -160,10 +162,10 @@ class Progress(ProgressBar):
             self._bar = None
 
 
-def _missing_width() -> int | None:
-    """80 for a terminal that states a width of 0, as in some containers, where tqdm would write nothing; else None."""
+def _missing_size() -> tuple[int, int] | tuple[None, None]:
+    """A size for terminals that state none, as in some containers, where tqdm would write nothing; else None."""
     try:
-        columns = os.get_terminal_size(sys.stdout.fileno()).columns
+        stated = os.get_terminal_size(sys.stdout.fileno()).columns > 0
     except (OSError, ValueError):
-        return None
-    return None if columns else 80
+        stated = True  # no terminal
+    return (None, None) if stated else (80, 24)
