@@ -1,14 +1,15 @@
-"""Obstacles with parameters that gradients reach: bodies filled with particles, as those of the training data are.
+"""Obstacles with parameters that gradients reach: a ramp's angle, a disc's radius, a polygon's corners.
 
-An emulator sees the share of each grid cell that obstacle particles fill, which changes smoothly as they move. So a
-loss on a rollout has gradients with respect to a ramp's angle or a polygon's corners::
+Each body knows its signed distance, from which `nmpm.emulator.bodies` rasterises it softly: as the share of each grid
+cell that is solid. So a loss on a rollout has gradients with respect to all of its parameters, sizes among them::
 
     angle = torch.tensor(-0.4, requires_grad=True)
-    state = model.state(position, obstacle=Ramp((0.5, 0.4), length=0.3, thickness=0.02, angle=angle).particles(spacing))
+    state = model.state(position, bodies=[Ramp((0.5, 0.4), length=0.3, thickness=0.03, angle=angle)])
     loss = model.differentiable_rollout(state, frames=100)[:, -1].sub(target).norm(dim=-1).mean()
     loss.backward()
 
-How many particles fill a body is counted from its sizes, and has no gradient.
+`Body.particles` fills a body with particles, as the bodies of the training data are: for datasets, simulators and
+files. Their number is counted from the body's sizes, and has no gradient.
 """
 
 from __future__ import annotations
@@ -32,6 +33,20 @@ _ON_EDGE = 1e-9  # share of a triangle: lattice points on a polygon's edges are 
 
 class Body(abc.ABC):
     """An obstacle in two dimensions."""
+
+    @abc.abstractmethod
+    def distance(self, points: Tensor) -> Tensor:
+        """Signed distance from the body's outline, negative inside, exact everywhere.
+
+        Args:
+            points: (..., 2) in domain length, on the CPU.
+
+        Returns:
+            (...) float64, differentiable with respect to the body's parameters and to the points.
+
+        Raises:
+            ConfigError: if a size is not positive, or a parameter is not finite.
+        """
 
     @abc.abstractmethod
     def particles(self, spacing: float) -> Tensor:
@@ -71,14 +86,25 @@ class Ramp(Body):
         along = torch.stack([torch.cos(angle), torch.sin(angle)])
         return cls(_tensor(end) + _tensor(length) / 2 * along, length, thickness, angle)
 
+    def distance(self, points: Tensor) -> Tensor:
+        sides = torch.stack([_size("length", self.length), _size("thickness", self.thickness)])
+        offset = points - _finite("centre", self.centre)
+        beyond = (offset @ self._axes().T).abs() - sides / 2
+        # On the outline the part for the inside, as a norm has no derivative at 0.
+        outside: Tensor = beyond.clamp(min=0).norm(dim=-1)
+        return torch.where((beyond > 0).any(-1), outside, beyond.amax(-1))
+
     def particles(self, spacing: float) -> Tensor:
         _check_spacing(spacing)
-        angle = _tensor(self.angle)
         along, across = (_lattice(_tensor(side), spacing) for side in (self.length, self.thickness))
         local = torch.stack(torch.meshgrid(along, across, indexing="ij"), dim=-1).reshape(-1, 2)
+        return _tensor(self.centre) + local @ self._axes()
+
+    def _axes(self) -> Tensor:
+        """(2, 2) unit vectors along and across the bar, as rows."""
+        angle = _finite("angle", self.angle)
         cos, sin = torch.cos(angle), torch.sin(angle)
-        axes = torch.stack([torch.stack([cos, sin]), torch.stack([-sin, cos])])
-        return _tensor(self.centre) + local @ axes
+        return torch.stack([torch.stack([cos, sin]), torch.stack([-sin, cos])])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +118,11 @@ class Disc(Body):
 
     centre: Point
     radius: Number
+
+    def distance(self, points: Tensor) -> Tensor:
+        offset = points - _finite("centre", self.centre)
+        found: Tensor = torch.linalg.vector_norm(offset, dim=-1) - _size("radius", self.radius)
+        return found
 
     def particles(self, spacing: float) -> Tensor:
         """Particles on a spiral with equal area each (Vogel 1979), one per spacing²; see `Body.particles`."""
@@ -118,13 +149,26 @@ class Polygon(Body):
     corners: Sequence[Point] | Tensor
 
     def __post_init__(self) -> None:
-        corners = self._corners().detach()
+        corners = _finite("corners", self._corners()).detach()
         if corners.dim() != 2 or corners.shape[0] < 3 or corners.shape[1] != 2:
             raise ConfigError(f"A polygon has three or more corners (x, y); these have shape {tuple(corners.shape)}.")
         sides = corners.roll(-1, 0) - corners
         turns = _cross(sides, sides.roll(-1, 0))
         if not ((turns > 0).all() or (turns < 0).all()):
             raise ConfigError("A polygon's corners must go once around a convex outline: divide it into convex ones.")
+
+    def distance(self, points: Tensor) -> Tensor:
+        corners = self._corners()
+        sides = corners.roll(-1, 0) - corners
+        lengths = sides.norm(dim=-1)
+        along = sides / lengths.unsqueeze(-1)
+        outward = torch.stack([along[:, 1], -along[:, 0]], dim=-1) * _cross(sides[0], sides[1]).detach().sign()
+        offset = points.unsqueeze(-2) - corners  # (..., K, 2)
+        beyond = (offset * outward).sum(-1)  # of the line through each side
+        place = (offset * along).sum(-1)
+        over_side = (place >= 0) & (place <= lengths) & (beyond >= 0)
+        outside = torch.minimum(torch.where(over_side, beyond, torch.inf), offset.norm(dim=-1)).amin(-1)
+        return torch.where((beyond > 0).any(-1), outside, beyond.amax(-1))
 
     def particles(self, spacing: float) -> Tensor:
         """Particles of a lattice, each a fixed mean of three corners; see `Body.particles`."""
@@ -176,14 +220,27 @@ def _check_spacing(spacing: float) -> None:
         raise ConfigError(f"spacing = {spacing} must be a positive number.")
 
 
+def _size(name: str, value: Number) -> Tensor:
+    size = _tensor(value)
+    _count(float(size.detach()), name, size)
+    return size
+
+
+def _finite(name: str, value: Number | Point) -> Tensor:
+    found = _tensor(value)
+    if not found.detach().isfinite().all():
+        raise ConfigError(f"An obstacle's {name} = {found.tolist()} must be finite.")
+    return found
+
+
 def _cross(a: Tensor, b: Tensor) -> Tensor:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _tensor(value: Number | Point) -> Tensor:
-    """In float64, with gradients of what is a tensor."""
+    """In float64 on the CPU, with gradients of what is a tensor."""
     if isinstance(value, Tensor):
-        return value.to(torch.float64)
+        return value.cpu().double()
     if isinstance(value, Sequence):
         return torch.stack([_tensor(each) for each in value])
     return torch.tensor(float(value), dtype=torch.float64)

@@ -38,11 +38,15 @@ class _Batched:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The same with a function applied to each tensor, those of fields among them."""
-        changed = {
-            name: change(value) if isinstance(value, Tensor) else {key: change(own) for key, own in value.items()}
-            for name, value in vars(self).items()
-        }
-        return type(self)(**changed)
+        return type(self)(**{name: _change(change, value) for name, value in vars(self).items()})
+
+
+def _change(
+    change: Callable[[Tensor], Tensor], value: Tensor | Mapping[str, Tensor] | None
+) -> Tensor | Mapping[str, Tensor] | None:
+    if value is None:
+        return None
+    return change(value) if isinstance(value, Tensor) else {key: change(own) for key, own in value.items()}
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class Particles(_Batched):
         obstacle_mask: (B, M) bool, False for padding.
         gravity: (B, D) in length per frame squared; zero where unknown.
         fields: By name, (B, N) values of the particles, or (B, 1) where each scene has one value.
+        obstacle_share: (B, M) how much of a particle's volume each obstacle particle stands for; None for all of it.
+            Bodies that are rasterised softly (`nmpm.emulator.bodies`) have shares, and gradients through them.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -71,6 +77,7 @@ class Particles(_Batched):
     obstacle_mask: Tensor
     gravity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+    obstacle_share: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -82,6 +89,8 @@ class Particles(_Batched):
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
         }
+        if self.obstacle_share is not None:
+            expected["obstacle_share"] = (batch, self.obstacle.shape[1])
         _check_shapes(self, expected)
         _check_fields(self.fields, [(batch, count), (batch, 1)], "Particles")
 
@@ -100,7 +109,7 @@ class Window(_Batched):
 
     Args:
         frames: (B, T, N, D) positions in domain length, T >= 2.
-        material, mask, obstacle, obstacle_mask, gravity: as in `Particles`.
+        material, mask, obstacle, obstacle_mask, gravity, obstacle_share: as in `Particles`.
         fields: By name, (B, T, N) values of the particles, or (B, 1, N) if they are constant in time, or (B, 1, 1)
             where each scene has one value.
 
@@ -115,6 +124,7 @@ class Window(_Batched):
     obstacle_mask: Tensor
     gravity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+    obstacle_share: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -127,6 +137,8 @@ class Window(_Batched):
             "obstacle_mask": (batch, self.obstacle.shape[1]),
             "gravity": (batch, dim),
         }
+        if self.obstacle_share is not None:
+            expected["obstacle_share"] = (batch, self.obstacle.shape[1])
         _check_shapes(self, expected)
         _check_fields(self.fields, [(batch, frames, count), (batch, 1, count), (batch, 1, 1)], "Window")
 
@@ -141,6 +153,7 @@ class Window(_Batched):
             obstacle_mask=state.obstacle_mask,
             gravity=state.gravity,
             fields={name: values.unsqueeze(1) for name, values in state.fields.items()},
+            obstacle_share=state.obstacle_share,
         )
 
     @property
@@ -155,6 +168,7 @@ class Window(_Batched):
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
             fields={name: values[:, min(1, values.shape[1] - 1)] for name, values in self.fields.items()},
+            obstacle_share=self.obstacle_share,
         )
 
     @property

@@ -57,6 +57,77 @@ def test_polygons_are_filled_evenly_either_way_round(corners, turn):
     torch.testing.assert_close(there.mean(0), back.mean(0))
 
 
+finite = st.floats(-1, 2)
+places = st.lists(st.tuples(finite, finite), min_size=1, max_size=20)
+
+
+@settings(deadline=None)
+@given(places, st.floats(-3, 3), st.floats(0.05, 0.4), st.floats(0.01, 0.05))
+def test_distances_from_ramps_are_the_simulators(points, angle, length, thickness):
+    ours = Ramp((0.5, 0.4), length, thickness, angle).distance(torch.tensor(points, dtype=torch.float64))
+    simulated = SimulatedRamp((0.5, 0.4), length, thickness, angle).distance(np.array(points))
+    np.testing.assert_allclose(ours.numpy(), simulated, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(places)
+def test_distances_from_discs_are_those_from_the_centre_less_the_radius(points):
+    ours = Disc((0.3, 0.6), 0.2).distance(torch.tensor(points, dtype=torch.float64))
+    np.testing.assert_allclose(ours.numpy(), [math.dist(point, (0.3, 0.6)) - 0.2 for point in points], atol=1e-12)
+
+
+@settings(deadline=None)
+@given(places, st.floats(-3, 3), st.booleans())
+def test_distances_from_a_turned_rectangle_are_the_same_as_from_it_as_polygon(points, angle, backwards):
+    where, ramp = torch.tensor(points, dtype=torch.float64), Ramp((0.5, 0.4), 0.3, 0.1, angle)
+    local = torch.tensor([[0.15, 0.05], [-0.15, 0.05], [-0.15, -0.05], [0.15, -0.05]], dtype=torch.float64)
+    turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]], dtype=torch.float64)
+    corners = torch.tensor([0.5, 0.4], dtype=torch.float64) + local @ turn
+    polygon = Polygon(corners.flip(0) if backwards else corners)
+    torch.testing.assert_close(polygon.distance(where), ramp.distance(where), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("point", "distance"),
+    [
+        ((0.5, 0.1), -0.1),  # inside
+        ((0.5, -0.3), 0.3),  # below a side
+        ((1.0, 1.0), math.sqrt(0.5)),  # beyond the long side
+        ((1.3, -0.4), 0.5),  # beyond a corner
+        ((-0.3, -0.4), 0.5),
+        ((0.5, 0.0), 0.0),
+        ((0.0, 0.0), 0.0),
+    ],
+)
+def test_distances_from_a_triangle(point, distance):
+    """One corner at the origin, one at (1, 0), with the long side from there to (0, 1)."""
+    triangle = Polygon([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+    assert float(triangle.distance(torch.tensor(point, dtype=torch.float64))) == pytest.approx(distance, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters"),
+    [
+        (lambda *given: Ramp(given[:2], *given[2:]), (0.5, 0.4, 0.3, 0.05, 0.4)),
+        (lambda *given: Disc(given[:2], given[2]), (0.5, 0.4, 0.1)),
+        (lambda *given: Polygon([given[:2], given[2:4], given[4:]]), (0.2, 0.3, 0.7, 0.25, 0.5, 0.6)),
+    ],
+)
+def test_gradients_of_distances_are_those_of_finite_differences(make, parameters):
+    points = torch.rand(200, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    values = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in parameters]
+    assert torch.autograd.gradcheck(lambda *given: make(*given).distance(points), values)
+
+
+def test_gradients_on_outlines_and_at_centres_are_finite_and_those_of_one_side():
+    """A norm has no derivative at 0, where points on an outline would have one."""
+    side = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    on_top = torch.tensor([[0.5, 0.5], [0.5, 0.4]], dtype=torch.float64)
+    for make in (lambda given: Ramp((0.5, 0.4), 0.6, given, 0.0), lambda given: Disc((0.5, 0.4), given / 2)):
+        slopes = torch.autograd.functional.jacobian(lambda given, make=make: make(given).distance(on_top), side)
+        assert slopes.tolist() == pytest.approx([-0.5, -0.5])
+
+
 @pytest.mark.parametrize(
     ("make", "parameters"),
     [
@@ -85,6 +156,10 @@ def test_particles_of_a_polygon_follow_every_affine_motion_of_its_corners():
         (lambda: Disc((0.5, 0.5), 0.0).particles(0.01), "radius = 0"),
         (lambda: Ramp((0.5, 0.5), float("nan"), 0.1, 0.0).particles(0.01), "side = nan"),
         (lambda: Disc((0.5, 0.5), 0.1).particles(0.0), "spacing = 0"),
+        (lambda: Disc((0.5, 0.5), -0.1).distance(torch.zeros(1, 2)), "radius = -0.1"),
+        (lambda: Ramp((0.5, 0.5), 0.1, 0.0, 0.0).distance(torch.zeros(1, 2)), "thickness = 0"),
+        (lambda: Ramp((0.5, float("inf")), 0.1, 0.1, 0.0).distance(torch.zeros(1, 2)), "centre = .*finite"),
+        (lambda: Polygon([(0.0, 0.0), (1.0, 0.0), (0.0, float("nan"))]), "corners = .*finite"),
         (lambda: Polygon(SQUARE[:2]), "three or more corners"),
         (lambda: Polygon([SQUARE[0], SQUARE[2], SQUARE[1], SQUARE[3]]), "convex"),
     ],

@@ -14,7 +14,7 @@ def state(batch: int = 3) -> Particles:
 def tensors(whole):
     """All tensors by name, those of fields among them."""
     found = vars(whole)
-    return {name: values for name, values in found.items() if name != "fields"} | dict(found["fields"])
+    return {name: values for name, values in found.items() if isinstance(values, torch.Tensor)} | dict(found["fields"])
 
 
 @pytest.mark.parametrize("whole", [state(), Window.of(state())], ids=["Particles", "Window"])

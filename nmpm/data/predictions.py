@@ -12,6 +12,7 @@ from torch import Tensor
 from nmpm._support.version import __version__
 from nmpm.data.families import FAMILIES
 from nmpm.data.format import Trajectory
+from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 
@@ -36,7 +37,15 @@ def predicted_trajectory(
         index: Which scene of the batch.
         fields: (B, T, N) predicted fields by name; stored as further datasets (T + 2, N), NaN for obstacles. The first
             two frames have the state's values, the first predicted ones where the state lacks them.
+
+    Raises:
+        DataError: if the state has bodies, which no file can hold as such.
     """
+    if state.obstacle_share is not None:
+        raise DataError(
+            "The state has obstacles as bodies, of which a file could hold no shapes: fill them with particles,"
+            " state(…, obstacle=body.particles(spacing)), and predict again."
+        )
     real = state.mask[index]
     start = torch.stack([state.position[index] - state.velocity[index], state.position[index]])
     position = torch.cat([start, predicted[index]])[:, real].cpu().numpy()

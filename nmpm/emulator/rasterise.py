@@ -42,7 +42,7 @@ def grid_state(
     volume = count * (scene.particle_volume / grid.cell_volume)
     parts = [mean, volume, solid]
     if scene.gravity_varies:
-        parts.append(_constant(grid.to_cell_displacement(particles.gravity), grid))
+        parts.append(_constant(grid.to_cell_displacement(particles.gravity, cells.dtype), grid))
     if scales is not None and scene.particle_fields:
         values = scales.of_particles(particles)
         sums, count = transfer.sums(values, membership.to(values.dtype), cells, grid)
@@ -72,21 +72,25 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
         return particles.position.new_zeros(batch, 0, *grid.shape)
     if not scene.obstacles:
         return walls.expand(batch, 1, *grid.shape)
-    cells = grid.to_cells(particles.obstacle)
-    return (walls + volume_fraction(scene, grid, transfer, particles.obstacle_mask, cells)).clamp(max=1.0)
+    precision = torch.promote_types(walls.dtype, torch.float32)
+    cells = grid.to_cells(particles.obstacle, precision)
+    volume: Tensor = particles.obstacle_mask.to(precision)
+    if particles.obstacle_share is not None:
+        volume = volume * particles.obstacle_share.to(precision)
+    return (walls + volume_fraction(scene, grid, transfer, volume, cells)).clamp(max=1.0)
 
 
-def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, mask: Tensor, cells: Tensor) -> Tensor:
+def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, volume: Tensor, cells: Tensor) -> Tensor:
     """The share of each cell taken by particles of all kinds, (B, 1, *S); above 1 where they are crowded.
 
     Args:
         scene: Gives the particles' volume.
         grid: What to rasterise onto.
         transfer: How to.
-        mask: (B, N) bool, which particles are real.
+        volume: (B, N), how much of a particle's volume each stands for: a mask, or shares in the precision of `cells`.
         cells: (B, N, D) positions in cells.
     """
-    count = transfer.p2g(mask.unsqueeze(-1).float(), cells, grid)
+    count = transfer.p2g(volume.to(cells.dtype).unsqueeze(-1), cells, grid)
     return count * (scene.particle_volume / grid.cell_volume)
 
 

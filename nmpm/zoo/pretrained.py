@@ -20,7 +20,7 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.optimization import AUTO, optimize
-from nmpm.zoo.states import StateBuilder
+from nmpm.zoo.states import Bodies, StateBuilder
 
 NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 """Precisions of a pretrained network, by name."""
@@ -74,6 +74,7 @@ class Pretrained:
         gravity: ArrayLike | Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         fields: Mapping[str, ArrayLike | Tensor] | None = None,
+        bodies: Bodies | None = None,
     ) -> Particles:
         """A state to start a rollout from, of N particles in each of B scenes, in D dimensions.
 
@@ -88,6 +89,8 @@ class Pretrained:
             dtype: Of positions, velocities and gravity; float64 for domains far from the origin.
             fields: Of `scene.fields`, by name: a number for all particles, (N,) or (B, N); (B,) of those that each
                 scene has one of. One that is left out has its mean over the training data.
+            bodies: Obstacles of `nmpm.obstacles`, in two dimensions: a list for all scenes, or a list for each of B. To
+                their parameters, such as angles and sizes, gradients flow.
 
         Returns:
             The state on the model's device, with velocities and gravity converted to frames.
@@ -95,13 +98,14 @@ class Pretrained:
         Raises:
             DataError: if shapes do not fit together, values are not finite, a particle is outside of the domain or far
                 faster than the model was calibrated for, a material is unknown, or gravity is not the model's.
+            ConfigError: if a body is impossible, or outside of the domain.
 
         Warns:
             UserWarning: if the velocities look as if they were per frame, or particles start inside an obstacle; naming
                 fields that the model does not have.
         """
         builder = StateBuilder(self.emulator, position, dtype)
-        return builder.build(velocity, material, obstacle, gravity, fields).to(self.emulator.device)
+        return builder.build(velocity, material, obstacle, gravity, fields, bodies).to(self.emulator.device)
 
     def example(self, seed: int = 0, count: int = 1000, blocks: int = 1) -> Particles:
         """A state to start from: blocks of particles thrown into the scene's box.

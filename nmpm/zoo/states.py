@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nmpm._support.messages import one_line, suggestion
+from nmpm.emulator.bodies import sample_bodies
 from nmpm.emulator.contact import Contact, obstacle_share
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.errors import DataError
+from nmpm.obstacles import Body
 from nmpm.particles import Particles
+
+Bodies = Sequence[Body] | Sequence[Sequence[Body]]
+"""Obstacles of all scenes, or of each."""
 
 TOO_FAST = 2.0
 """Speeds above this multiple of the calibrated range are errors."""
@@ -49,7 +54,13 @@ class StateBuilder:
         self.batch, self.count = self.position.shape[:2]
 
     def build(
-        self, velocity: Any, material: Any, obstacle: Any, gravity: Any, fields: Mapping[str, Any] | None = None
+        self,
+        velocity: Any,
+        material: Any,
+        obstacle: Any,
+        gravity: Any,
+        fields: Mapping[str, Any] | None = None,
+        bodies: Bodies | None = None,
     ) -> Particles:
         """The state, with velocities and gravity converted to frames.
 
@@ -57,6 +68,9 @@ class StateBuilder:
             DataError: as `Pretrained.state`.
         """
         dt, solid = self.scene.dt, self._obstacle(obstacle)
+        share = None
+        if bodies:
+            solid, share = self._add_bodies(solid, bodies)
         kind, speed = self._material(material), self._velocity(velocity)
         state = Particles(
             position=self.position.to(self.dtype),
@@ -67,6 +81,7 @@ class StateBuilder:
             obstacle_mask=torch.ones(solid.shape[:2], dtype=torch.bool, device=solid.device),
             gravity=(self._gravity(gravity) * dt**2).to(self.dtype),
             fields=self._fields(fields or {}),
+            obstacle_share=share,
         )
         check_inputs(self.emulator, state)
         self._check_speeds(speed, kind)
@@ -133,6 +148,23 @@ class StateBuilder:
         if not found.isfinite().all():
             raise DataError("obstacle has values that are not finite.")
         return found
+
+    def _add_bodies(self, solid: Tensor, given: Bodies) -> tuple[Tensor, Tensor]:
+        """(B, M, D) obstacle particles with those of bodies, and their shares (B, M)."""
+        if not self.scene.obstacles:
+            raise DataError("bodies: the model was trained without obstacles and would not see them; leave them out.")
+        common = all(isinstance(body, Body) for body in given)
+        if not common and (len(given) != self.batch or any(isinstance(bodies, Body) for bodies in given)):
+            raise DataError(
+                f"bodies: give one list of bodies for all scenes, or a list of such lists, one for each of {self.batch}"
+                f" scenes; this one has {len(given)} entries."
+            )
+        scenes = cast("Sequence[Sequence[Body]]", [given] if common else given)
+        points, share = sample_bodies(scenes, self.scene, self.emulator.grid)
+        share = share.expand(self.batch, -1)
+        whole = share.new_ones(solid.shape[:2])
+        joined = torch.cat([solid, points.expand(self.batch, *points.shape).to(solid)], dim=1)
+        return joined, torch.cat([whole, share], dim=1).to(self.dtype)
 
     def _gravity(self, given: Any) -> Tensor:
         scene, shape = self.scene, (self.batch, self.scene.dim)

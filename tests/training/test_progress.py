@@ -1,5 +1,8 @@
 """The line of progress, and that training asks the device for nothing between two logged steps."""
 
+import os
+import pty
+import sys
 import traceback
 
 import pytest
@@ -83,3 +86,17 @@ def test_with_time_alone_it_says_the_time_left(make_dataset, tmp_path, capsys):
     last = shown(capsys)[-1]
     assert last.startswith("100% |")
     assert f"training: step {trainer.global_step}, 0:00:00 left" in last
+
+
+def test_a_terminal_without_a_width_shows_the_line_nevertheless(make_dataset, tmp_path, monkeypatch):
+    """As in some containers, where a terminal states 0 columns."""
+    controller, terminal = pty.openpty()
+    data = data_of(make_dataset())
+    trainer = trainer_with(tmp_path, Progress(), max_steps=2)
+    with os.fdopen(terminal, "w") as screen, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdout", screen)
+        trainer.fit(module_of(data), data)
+        screen.flush()
+        written = os.read(controller, 65536).decode()
+    os.close(controller)
+    assert "step 2/2" in written

@@ -6,9 +6,10 @@ import pytest
 import torch
 from scenes import box
 
+from nmpm.data.predictions import predicted_trajectory
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import DataError
-from nmpm.obstacles import Ramp
+from nmpm.obstacles import Disc, Ramp
 from nmpm.processors import Pointwise
 from nmpm.zoo.registry import Pretrained
 
@@ -50,7 +51,7 @@ def test_numpy_torch_lists_and_batches_are_the_same(model):
         model.state(np.stack([POSITIONS] * 3), velocity).scenes(slice(1, 2)),
     )
     for other in others:
-        for name in {field.name for field in dataclasses.fields(one)} - {"fields"}:
+        for name in {field.name for field in dataclasses.fields(one)} - {"fields", "obstacle_share"}:
             assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
@@ -161,6 +162,44 @@ def test_velocities_per_frame_are_suspected(model):
 @pytest.mark.parametrize("speed", [0.0, 1e-6, 0.1, 1.5])
 def test_plausible_velocities_are_not(model, speed):
     model.state(POSITIONS, velocity=(speed, 0.0))
+
+
+def test_bodies_of_all_scenes_or_of_each_beside_particles():
+    model = model_of(box(obstacles=True))
+    positions, disc, ramp = np.stack([POSITIONS] * 2), Disc((0.3, 0.2), 0.05), Ramp((0.6, 0.2), 0.2, 0.05, 0.2)
+    together, own = model.state(positions, bodies=[disc]), model.state(positions, bodies=[[disc], [ramp]])
+    solid = model.emulator.solid
+    torch.testing.assert_close(solid(own)[:1], solid(together)[:1])
+    torch.testing.assert_close(solid(own)[1:], solid(model.state(POSITIONS, bodies=[ramp])))
+    filled = ramp.particles(0.02)
+    both = model.state(POSITIONS, obstacle=filled, bodies=[disc])
+    summed = solid(model.state(POSITIONS, obstacle=filled)) + solid(together)[:1] - model.emulator.walls
+    torch.testing.assert_close(solid(both), summed.clamp(max=1))
+    assert both.obstacle_share.dtype == torch.float32
+    assert model.rollout(both, 3).isfinite().all()
+
+
+def test_gradients_reach_the_parameters_of_bodies():
+    model = model_of(box(obstacles=True))
+    radius = torch.tensor(0.05, requires_grad=True)
+    state = model.state(POSITIONS, velocity=(0.0, -1.0), bodies=[Disc((0.5, 0.3), radius)])
+    model.differentiable_rollout(state, 4).sum().backward()
+    assert radius.grad.isfinite()
+    assert radius.grad != 0
+
+
+def test_bodies_that_do_not_fit_are_refused():
+    disc = Disc((0.5, 0.2), 0.05)
+    model = model_of(box(obstacles=True))
+    with pytest.raises(DataError, match="trained without obstacles"):
+        model_of(box()).state(POSITIONS, bodies=[disc])
+    with pytest.raises(DataError, match="one for each of 1 scenes; this one has 2"):
+        model.state(POSITIONS, bodies=[[disc], [disc]])
+    with pytest.raises(DataError, match="one list of bodies"):
+        model.state(POSITIONS, bodies=[disc, [disc]])
+    state = model.state(POSITIONS, bodies=[disc])
+    with pytest.raises(DataError, match="fill them with particles"):
+        predicted_trajectory(model.scene, state, model.rollout(state, 2), "a test")
 
 
 def test_particles_that_start_inside_an_obstacle_are_named():

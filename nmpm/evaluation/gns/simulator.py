@@ -165,8 +165,11 @@ class GraphSimulator(nn.Module):
         Velocities of before the state, which is all that a rollout knows, are taken to be its own.
 
         Raises:
-            DataError: if positions become non-finite or particles collapse; the message names the frame.
+            DataError: if positions become non-finite or particles collapse; the message names the frame. If the
+                state's obstacles are bodies, which are no particles.
         """
+        if state.obstacle_share is not None:
+            raise DataError("The state has obstacles as bodies: graph networks need them filled with particles.")
         path = state.position.unsqueeze(1).repeat(1, frames, 1, 1)
         for index, mask in enumerate(state.mask):
             position, velocity = state.position[index, mask], state.velocity[index, mask]

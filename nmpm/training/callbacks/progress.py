@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from datetime import timedelta
 from typing import Any
@@ -135,6 +136,7 @@ class Progress(ProgressBar):
     def _open(self, what: str, total: float, keep: bool = False) -> Tqdm:
         form = "{percentage:3.0f}% |{bar:20}| {desc}" if keep else "{desc} {n_fmt}/{total_fmt}"
         pause = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS
+        columns, rows = _missing_size()
         return Tqdm(
             desc=what,
             total=total,
@@ -145,7 +147,9 @@ class Progress(ProgressBar):
             mininterval=pause,
             maxinterval=pause,
             miniters=0,
-            dynamic_ncols=True,
+            ncols=columns,
+            nrows=rows,
+            dynamic_ncols=columns is None,
         )
 
     def _count_batch(self) -> None:
@@ -156,3 +160,12 @@ class Progress(ProgressBar):
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def _missing_size() -> tuple[int, int] | tuple[None, None]:
+    """A size for terminals that state none, as in some containers, where tqdm would write nothing; else None."""
+    try:
+        stated = os.get_terminal_size(sys.stdout.fileno()).columns > 0
+    except (OSError, ValueError):
+        stated = True  # no terminal
+    return (None, None) if stated else (80, 24)

@@ -32,6 +32,8 @@ in vec3 position; uniform mat4 view; void main() { gl_Position = view * vec4(pos
 const FLAT = `#version 300 es
 precision highp float; uniform vec4 plain; out vec4 pixel; void main() { pixel = plain; }`;
 const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
+/** Which positions besides the particles' own a mode reads: 1 of the frame before, 2 of the reference. */
+const OTHERS = { [MODES.speed]: 1, [MODES.error]: 2 };
 
 function compile(gl, vertex, fragment, attributes) {
   const program = gl.createProgram();
@@ -45,15 +47,16 @@ function compile(gl, vertex, fragment, attributes) {
   attributes.forEach((name, location) => gl.bindAttribLocation(program, location, name));
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-  return { program, at: (name) => gl.getUniformLocation(program, name) };
+  const found = {};
+  return { program, at: (name) => (found[name] ??= gl.getUniformLocation(program, name)) };
 }
 
 /** Draws particles and walls on a canvas. */
 class Drawing {
   /** @param colours RGB bytes of the particles; @param obstacles 16-bit positions, as those of trajectories. */
   constructor(canvas, colours, obstacles) {
-    // Discs are smooth by their shader, and walls in 2-D lie along pixels; only the slanted lines of 3-D need more.
-    const gl = canvas.getContext("webgl2", { antialias: scene.dim === 3, alpha: false });
+    // Discs are smooth by their shader and walls lie along pixels; in 3-D it would cost software renderers most of a frame.
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("This browser does not offer WebGL 2, which the viewer needs.");
     this.gl = gl;
     this.points = compile(gl, POINTS, DISC, ["position", "previous", "reference", "material", "field"]);
@@ -123,7 +126,9 @@ class Drawing {
     const part = (positions, at) => positions.subarray(at * size, (at + 1) * size);
     // Frame 0 has no frame before it: its speeds are those toward frame 1.
     const previous = frame > 0 ? frame - 1 : Math.min(1, scene.frames - 1);
-    [part(trajectory, frame), part(trajectory, previous), part(reference, frame)].forEach((values, location) => {
+    const needed = [part(trajectory, frame), part(trajectory, previous), part(reference, frame)];
+    needed.forEach((values, location) => {
+      if (location && location !== OTHERS[look.mode]) return;
       gl.bindBuffer(gl.ARRAY_BUFFER, this.frames[location]);
       gl.bufferData(gl.ARRAY_BUFFER, values, gl.STREAM_DRAW);
     });
@@ -144,6 +149,7 @@ class Drawing {
     if (!count) return;
     gl.useProgram(this.points.program);
     buffers.forEach((buffer, location) => {
+      if (location && location !== OTHERS[look.mode]) return gl.disableVertexAttribArray(location);
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
       gl.enableVertexAttribArray(location);
       gl.vertexAttribPointer(location, dim, gl.UNSIGNED_SHORT, true, 0, 0);

@@ -1,6 +1,7 @@
 // The viewer: playing, choices, keys.
 
 const RATES = [5, 15, 30, 60, 120, 240];
+const MOST_PIXELS = 2; // along each axis, to a pixel of the page: phones have 3, which nobody sees in discs
 const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost", "accent"];
 const element = (id) => document.getElementById(id);
 
@@ -152,9 +153,10 @@ class Viewer {
   }
 
   draw() {
-    const canvas = element("scene"), ratio = devicePixelRatio;
-    canvas.width = Math.round(canvas.clientWidth * ratio);
-    canvas.height = Math.round(canvas.clientHeight * ratio);
+    const canvas = element("scene"), ratio = Math.min(devicePixelRatio, MOST_PIXELS);
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.round(length * ratio));
+    // Setting a size, even the same, would allocate the picture anew.
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const gl = this.drawing.gl;
     gl.disable(gl.SCISSOR_TEST);
     gl.clearColor(...this.theme.page, 1);

@@ -1,0 +1,87 @@
+"""Soft rasterisation of obstacles with parameters: what the grid sees of them is a smooth function of all parameters.
+
+A body is sampled on a lattice of `SAMPLES` points per cell and axis, which does not move with it. Each point counts as
+far as it is solid: 1 inside, 0 outside, and smoothly between over a band of `BAND` cells around the outline, by the
+body's signed distance d,
+
+    share(d) = 1/2 - 3/4 u + 1/4 u³,  u = 2 d / (BAND · cell), cut to [-1, 1].
+
+The points are interpolated to the grid by the model's own p2g, as particles of obstacles are. So the grid sees what
+lattices of particles of all places and directions give on average; contact and support, which read the grid, follow.
+`benchmarks/bodies.py` measures both against the exact mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
+from nmpm.obstacles import Body
+from nmpm.scene import Scene
+
+SAMPLES = 3
+"""Points along each axis of a cell."""
+
+BAND = 0.5
+"""Width of the band, in cells, over which a body's outline is smoothed."""
+
+
+def sample_bodies(scenes: Sequence[Sequence[Body]], scene: Scene, grid: Grid) -> tuple[Tensor, Tensor]:
+    """Obstacle particles with shares that stand for bodies, for `Particles.obstacle` and `.obstacle_share`.
+
+    Where bodies overlap, their union is solid. What is outside of the domain is left out.
+
+    Args:
+        scenes: The bodies of each of B scenes.
+        scene: Gives the particles' volume, of which shares are.
+        grid: What the model rasterises onto.
+
+    Returns:
+        (K, 2) points in domain length, of all scenes together; (B, K) shares of a particle's volume, differentiable
+        with respect to the bodies' parameters. Both float64, on the CPU.
+
+    Raises:
+        ConfigError: if the scene is not in two dimensions, or a body is impossible or outside of the domain.
+    """
+    if grid.dim != 2:
+        raise ConfigError(f"Bodies are obstacles in two dimensions; this model's scenes have {grid.dim}.")
+    points = _lattice(grid)
+    solid = torch.stack([_union(bodies, points, grid) for bodies in scenes])
+    near = (solid.detach() > 0).any(0)
+    volume = grid.cell_volume / SAMPLES**grid.dim
+    return points[near], solid[:, near] * (volume / scene.particle_volume)
+
+
+def solid_share(distance: Tensor, width: float) -> Tensor:
+    """1 inside of a body, 0 outside, and smoothly between over a band of some width around its outline.
+
+    Args:
+        distance: (...) signed distances, negative inside.
+        width: Of the band, in the same unit.
+    """
+    u = (2 * distance / width).clamp(-1, 1)
+    return 0.5 - 0.75 * u + 0.25 * u**3
+
+
+def _lattice(grid: Grid) -> Tensor:
+    """(K, 2) points over the whole domain, in domain length."""
+    axes = [(torch.arange(SAMPLES * n, dtype=torch.float64, device="cpu") + 0.5) / SAMPLES for n in grid.shape]
+    return grid.to_length(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, grid.dim))
+
+
+def _union(bodies: Sequence[Body], points: Tensor, grid: Grid) -> Tensor:
+    """(K,) how solid each point is."""
+    width = BAND * min(grid.spacing)
+    shares = []
+    for body in bodies:
+        share = solid_share(body.distance(points), width)
+        if not bool((share.detach() > 0).any()):
+            raise ConfigError(
+                f"{type(body).__name__}: no part of it is within the domain, or it is far thinner than a cell."
+            )
+        shares.append(share)
+    return torch.stack(shares).amax(0) if shares else points.new_zeros(len(points))
