@@ -32,6 +32,7 @@ from beside_simulator import read_rivals
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from rolling import roll_to_end
 from timing import Spread, clock_for, make_parser, time_alternating, write_json
 
 from nmpm._support.atomic import atomic_write
@@ -168,10 +169,8 @@ def emulation(emulator: Emulator, window: Window) -> Callable[[], None]:
     context = emulator.context(window.initial)
 
     def emulate() -> None:
-        particles = window.initial
         with torch.inference_mode():
-            for _ in range(FRAMES // emulator.frames):
-                particles = emulator(particles, context).state_after(particles)
+            roll_to_end(lambda particles: emulator(particles, context), window.initial, FRAMES // emulator.frames)
 
     emulate()
     return emulate

@@ -179,6 +179,27 @@ def test_the_setup_without_kernels_differs_from_the_shipped_one_in_what_runs_alo
     torch.testing.assert_close(*paths)
 
 
+def test_calls_that_are_rolled_on_predict_a_rollout():
+    from rolling import roll_on, roll_to_end
+
+    scene = load_preset("goop").scene
+    torch.manual_seed(0)
+    emulator = EmulatorRecipe(scene, cells=16, frames=4, processor=UNet(width=4, depth=2)).build().eval()
+    state = cloud(scene, batch=2)
+    with torch.no_grad():
+        context = emulator.context(state)
+        bundles = [bundle.position for bundle, _ in roll_on(lambda now: emulator(now, context), state, 3)]
+        last = roll_to_end(lambda now: emulator(now, context), state, 3)
+    torch.testing.assert_close(torch.cat(bundles, dim=1), rollout(emulator, state, 12))
+    assert torch.equal(last.position, bundles[-1][:, -1])
+
+
+def test_costs_of_scenes_are_drawn_again_from_stored_figures(tmp_path):
+    path = tmp_path / "costs.png"
+    assert run_script("scene_costs", "--redraw", str(ROOT / "scene_costs.json"), "--figure", str(path)) == ""
+    assert path.read_bytes()[:4] == b"\x89PNG"
+
+
 def test_repeated_rollout_calls_start_from_the_same_state():
     import workloads
 
