@@ -10,7 +10,8 @@ is close to linear in the particles, so their ratio is a number of substeps:
     break-even = (ms per frame of the emulator) / (ms per substep of the simulator)
 
 Emulation pays where the cheapest stable simulation of the same error needs more substeps than that. The cost model of
-the map, ms = a + b × particles, is fitted to all widths but the widest and checked on that. Points: settings of the
+the map, ms = a + b × particles, is fitted to all widths but the widest and checked on that. Presets that are not named
+keep their figures in map.json, and the name of the processor on which they were measured. Points: settings of the
 trade's tables (`benchmarks/trade/NAME/trade.csv`, see `beside_simulator.py`), the cheapest simulation that is no less
 accurate than the model.
 """
@@ -18,12 +19,13 @@ accurate than the model.
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -44,6 +46,7 @@ from nmpm.data.loading.recording import RecordingReader
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.calibration import calibrate
 from nmpm.errors import ZooError
+from nmpm.evaluation.machine import describe_device
 from nmpm.particles import Window
 from nmpm.sim import InitialState, Preset, load_preset
 from nmpm.zoo import Zoo
@@ -78,6 +81,7 @@ class Case:
         substeps: Of the preset.
         substep: Of the simulator, seconds.
         frame: Of the emulator, seconds.
+        hardware: Processor.
     """
 
     name: str
@@ -87,6 +91,12 @@ class Case:
     substeps: int
     substep: Spread
     frame: Spread
+    hardware: str
+
+    @classmethod
+    def read(cls, plain: Mapping[str, Any]) -> Self:
+        """The case of an entry of map.json."""
+        return cls(**{**plain, "substep": Spread(**plain["substep"]), "frame": Spread(**plain["frame"])})
 
     @property
     def break_even(self) -> float:
@@ -160,8 +170,9 @@ def measure(name: str, times: int, rounds: int) -> Case:
     pairs = zip(seconds["more"], seconds["one"], strict=True)
     substep = [(more - one) / frames / preset.substeps for more, one in pairs]
     frame = [value / FRAMES for value in seconds["emulator"]]
-    solver = f"{preset.generator}, {len(preset.box)}-D"
-    return Case(name, times, len(start.position), solver, preset.substeps, Spread.of(substep), Spread.of(frame))
+    solver, hardware = f"{preset.generator}, {len(preset.box)}-D", describe_device(torch.device("cpu"))
+    spreads = Spread.of(substep), Spread.of(frame)
+    return Case(name, times, len(start.position), solver, preset.substeps, *spreads, hardware)
 
 
 def emulation(emulator: Emulator, window: Window) -> Callable[[], None]:
@@ -177,13 +188,22 @@ def emulation(emulator: Emulator, window: Window) -> Callable[[], None]:
 
 
 def fit_cost(cases: Sequence[Case], seconds: Sequence[float]) -> dict[str, float]:
-    """The line a + b × particles through all but the widest case, and the latter's cost over that of the line."""
+    """The line a + b × particles through all but the widest case.
+
+    Returns:
+        offset: a, seconds.
+        slope: b, seconds per particle.
+        misfit: The largest relative distance of a fitted case from the line.
+        check: The widest case's cost over that of the line.
+    """
     counts = np.array([case.particles for case in cases], dtype=float)
     values = np.array(seconds)
     weights = 1 / values[:-1]  # relative errors count
     matrix = np.stack([np.ones(len(counts) - 1), counts[:-1]], axis=1)
     offset, slope = np.linalg.lstsq(matrix * weights[:, None], values[:-1] * weights, rcond=None)[0]
-    return {"offset": offset, "slope": slope, "check": float(values[-1] / (offset + slope * counts[-1]))}
+    ratios = values / (offset + slope * counts)
+    misfit, check = float(np.abs(ratios[:-1] - 1).max()), float(ratios[-1])
+    return {"offset": offset, "slope": slope, "misfit": misfit, "check": check}
 
 
 def equal_error(name: str) -> dict[str, Any] | None:
@@ -229,13 +249,13 @@ def write_map(cases: Mapping[str, Sequence[Case]], path: Path) -> None:
 def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
     """Print the table, and return all figures."""
     out = sys.stdout.write
-    out("| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps |\n")
-    out("|---|---|---:|---:|---:|---:|\n")
+    out("| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps | on |\n")
+    out("|---|---|---:|---:|---:|---:|---|\n")
     for rows in cases.values():
         for case in rows:
             out(
                 f"| {case.name} × {case.times} | {case.solver} | {case.particles:,} | {case.substep.format()} |"
-                f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} |\n"
+                f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} | {case.hardware} |\n"
             )
     costs = {
         name: {
@@ -246,12 +266,21 @@ def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
         if len(rows) > 2
     }
     for name, cost in costs.items():
-        checks = ", ".join(f"{part} {fit['check']:.2f}" for part, fit in cost.items())
+        checks = ", ".join(f"{part} {fit['check']:.2f} (others {fit['misfit']:.0%} off)" for part, fit in cost.items())
         out(f"{name}: the widest case over the fitted line: {checks}\n")
-    points = [point for name in cases if (point := equal_error(name)) is not None]
+    tables = sorted(path.parent.name for path in TRADE.glob("*/trade.csv"))
+    points = [point for name in tables if (point := equal_error(name)) is not None]
     for point in points:
         out(f"{point['name']}: {point['model']} is {point['speed_up']:.2g} times as fast as {point['simulator']}\n")
     return {"cases": [asdict(case) for rows in cases.values() for case in rows], "costs": costs, "points": points}
+
+
+def read_cases(path: Path) -> dict[str, list[Case]]:
+    """The cases of an earlier map.json by preset; none if there is no such file."""
+    cases: dict[str, list[Case]] = {}
+    for plain in json.loads(path.read_text(encoding="utf-8"))["cases"] if path.is_file() else ():
+        cases.setdefault(plain["name"], []).append(Case.read(plain))
+    return cases
 
 
 def main() -> None:
@@ -263,7 +292,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=TRADE, help="folder of map.json and map.png")
     chosen: Namespace = parser.parse_args()
     torch.set_num_threads(1)
-    cases = {
+    cases = read_cases(chosen.out / "map.json") | {
         name: [measure(name, times, chosen.rounds) for times in chosen.times or WIDTHS[name]] for name in chosen.names
     }
     found = report(cases)

@@ -32,7 +32,7 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "calibration", "call_profile", "dam_break", "generalisation", "gns",
-    "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness", "where_emulation_pays",
+    "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -322,21 +322,26 @@ def test_gpu_runs_an_interrupted_step_again(tmp_path):
 
 
 def test_the_map_states_break_even_for_every_width(tmp_path):
+    import where_emulation_pays
+
     text = run_script("where_emulation_pays", "goop", "--times", "1", "2", "--rounds", "1", "--out", str(tmp_path))
     found = json.loads((tmp_path / "map.json").read_text())
     narrow, wide = found["cases"]
     assert wide["particles"] > narrow["particles"]
     assert min(case["frame"]["median"] for case in found["cases"]) > 0
     assert "| goop × 2 | MLS-MPM, 2-D |" in text
+    kept = where_emulation_pays.read_cases(tmp_path / "map.json")["goop"]
+    assert [case.particles for case in kept] == [narrow["particles"], wide["particles"]]
+    assert all(case.hardware for case in kept)
     assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_cost_is_fitted_to_all_but_the_widest():
     import where_emulation_pays as script
 
-    cases = [script.Case("", 1, count, "", 1, None, None) for count in (100, 200, 400)]
+    cases = [script.Case("", 1, count, "", 1, None, None, "") for count in (100, 200, 400)]
     fit = script.fit_cost(cases, [3.0, 5.0, 18.0])
-    assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})
+    assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "misfit": 0.0, "check": 2.0})
 
 
 def test_wide_scenes_hold_copies_of_a_narrow_one_side_by_side():
@@ -410,6 +415,24 @@ def test_a_graph_network_is_trained_and_written_at_the_times_asked_for(tmp_path,
     assert last.curve[: len(first.curve)] == first.curve
     assert text.count("loss") == 24
     assert run_script("gns", *words) == ""  # it goes on from the end
+
+
+def test_all_trades_are_commands_that_their_programs_understand(tmp_path):
+    import trades
+
+    text = run_script("trades", "--dry-run", "--out", str(tmp_path / "all"))
+    assert [line.split(",")[0] for line in text.splitlines()] == [
+        "gns", "goop", "waterramps", "dambreak2d", "waterdrop-xl", "map",
+    ]  # fmt: skip
+    assert not (tmp_path / "all").exists()
+    steps = trades.list_steps(tmp_path)
+    for name, models in trades.MODELS.items():
+        words = steps[name].words
+        assert set(models) <= set(words)
+        assert (ROOT.parent / words[words.index("--config") + 1]).is_file()
+    one = run_script("trades", "--dry-run", "--steps", "map")
+    assert one.startswith("map, about")
+    assert one.count("\n") == 1
 
 
 def test_a_model_is_its_own_ensemble_and_commits_whole_bundles():
