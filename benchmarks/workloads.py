@@ -23,11 +23,12 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.generate import preset_metadata
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader
 from nmpm.data.progress import progress_bar
+from nmpm.data.seeds import derive_seed
 from nmpm.decoders import Absolute, Decoder, Residual
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.calibration import calibrate

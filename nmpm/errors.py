@@ -16,5 +16,9 @@ class ConfigError(NmpmError, ValueError):
     """A configuration asks for something that cannot be."""
 
 
+class UnstableError(ConfigError):
+    """A simulation does not stay stable with the given settings."""
+
+
 class ZooError(NmpmError, LookupError):
     """A model that the zoo does not hold, or holds damaged."""

@@ -31,8 +31,8 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
-    "against_recordings", "beside_simulator", "calibration", "call_profile", "dam_break", "generalisation", "gns",
-    "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
+    "against_recordings", "beside_simulator", "calibration", "call_profile", "cropping", "dam_break", "generalisation",
+    "gns", "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 

@@ -18,11 +18,9 @@ import shutil
 import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.version import __version__
@@ -38,6 +36,7 @@ from nmpm.data.format import (
 )
 from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, write_part
 from nmpm.data.progress import progress_bar
+from nmpm.data.seeds import DRAWS, seed_of_draw, simulate_first_stable
 from nmpm.data.shard import Shard
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import ConfigError, DataError
@@ -65,6 +64,8 @@ class SimulationRequest:
         preset: The family of scenes.
         counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
         seed: The seeds of all trajectories are derived from it.
+        redrawn: By split and index, the trajectories whose first seeds were unstable, and how many were. Known once
+            they are simulated.
 
     Raises:
         ConfigError: if a split is unknown or missing, all are empty, or a number is negative.
@@ -73,6 +74,7 @@ class SimulationRequest:
     preset: Preset
     counts: Mapping[str, int]
     seed: int = 0
+    redrawn: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not _is_valid_counts(self.counts) or not self.splits or self.seed < 0:
@@ -88,18 +90,17 @@ class SimulationRequest:
         return tuple(split for split in SPLITS if self.counts[split])
 
     def to_dict(self) -> dict[str, Any]:
-        """The request as plain lists, strings and numbers."""
+        """The request as plain lists, strings and numbers, without what is known only once it is simulated."""
         counts = {split: self.counts[split] for split in SPLITS}
         return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": self.preset.revision}
 
+    def place(self, split: str, index: int) -> tuple[int, int, int]:
+        """What the seeds of one trajectory are derived from; independent of the counts."""
+        return self.seed, SPLITS.index(split), index
+
     def trajectory_seed(self, split: str, index: int) -> int:
-        """Seed of one trajectory; independent of the counts."""
-        return derive_seed(self.seed, SPLITS.index(split), index)
-
-
-def derive_seed(*entropy: int) -> int:
-    """A seed that depends on all the numbers."""
-    return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> np.uint64(1))
+        """Seed of one trajectory."""
+        return seed_of_draw(self.place(split, index), self.redrawn.get(split, {}).get(str(index), 0))
 
 
 def generate(
@@ -171,7 +172,9 @@ def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
     first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
     for index in range(len(first)):
         statistics.add(first.read(index))
-    extra = metadata.extra | statistics.result() | {_KEY: request.to_dict()}
+    redrawn = _find_redrawn(request, folder)
+    simulation = request.to_dict() | ({"redrawn": redrawn} if redrawn else {})
+    extra = metadata.extra | statistics.result() | {_KEY: simulation}
     write_metadata(folder, dataclasses.replace(metadata, extra=extra))
     shutil.rmtree(folder / PARTS, ignore_errors=True)
 
@@ -256,7 +259,7 @@ def _simulate_part(
         if interrupted.is_set():
             raise CancelledError
 
-    run = request.preset.simulate(request.trajectory_seed(split, index), stop_if_interrupted)
+    run = simulate_first_stable(request.preset, request.place(split, index), stop_if_interrupted)
     write_part(part_path(folder, split, index), run)
 
 
@@ -268,6 +271,19 @@ def _assemble(request: SimulationRequest, folder: Path, split: str) -> None:
             write_split(path, read_parts(parts, advance))
     for part in parts:
         part.unlink(missing_ok=True)
+
+
+def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[str, int]]:
+    """The trajectories whose first seeds were unstable, and how many were, by split and index."""
+    found: dict[str, dict[str, int]] = {}
+    for split in request.splits:
+        stored = Split(folder / f"{split}.h5")
+        for index in range(len(stored)):
+            place, seed = request.place(split, index), int(stored.attributes(index)["seed"])
+            draw = next(draw for draw in range(DRAWS) if seed_of_draw(place, draw) == seed)
+            if draw:
+                found.setdefault(split, {})[str(index)] = draw
+    return found
 
 
 def preset_metadata(preset: Preset) -> Metadata:

@@ -87,19 +87,20 @@ class Preset(abc.ABC):
 
         Raises:
             DataError: if the arrays do not fit together, or a particle is outside of the box or inside an obstacle.
-            ConfigError: if the simulation becomes unstable; the message names the frame.
+            UnstableError: if the simulation becomes unstable; the message names the frame.
         """
 
     def simulate(self, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
         """A trajectory of `self.frames` + 1 frames; the same preset and seed give the same bits.
 
         Raises:
-            ConfigError: if no initial state fits into the box, or the simulation becomes unstable.
+            ConfigError: if no initial state fits into the box.
+            UnstableError: if the simulation becomes unstable.
         """
         try:
             trajectory = self.simulate_from(self.draw(seed), self.frames, progress)
         except ConfigError as error:
-            raise ConfigError(f"Preset {self.name}, seed {seed}: {error}") from error
+            raise type(error)(f"Preset {self.name}, seed {seed}: {error}") from error
         trajectory.attributes["seed"] = seed
         return trajectory
 

@@ -52,7 +52,7 @@ def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
                 f"{model.name}: its data are of revision {stated.get('revision')} of the simulator, which is now"
                 f" {preset.revision} and gives other trajectories."
             )
-        return preset, SimulationRequest(preset, stated["counts"], stated["seed"])
+        return preset, SimulationRequest(preset, stated["counts"], stated["seed"], stated.get("redrawn", {}))
     if model.preset not in preset_names():
         raise ConfigError(f"{model.name} was tested on recorded data ({model.card.get('dataset')}): give their folder.")
     preset = load_preset(str(model.preset))

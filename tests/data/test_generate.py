@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.generate import generate
-from nmpm.errors import ConfigError, DataError
+from nmpm.data.generate import SimulationRequest, generate
+from nmpm.data.seeds import seed_of_draw
+from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import MpmPreset, load_preset
 
 GOOP = load_preset("goop")
@@ -143,6 +144,56 @@ def test_resumes_with_the_existing_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: simulated.append(seed) or simulate(preset, seed))
     generate(TINY, tmp_path, COUNTS, workers=1)
     assert len(simulated) == 3
+
+
+UNSTABLE = {
+    SimulationRequest(TINY, COUNTS, 5).place("train", 1): 1,
+    SimulationRequest(TINY, COUNTS, 5).place("test", 0): 2,
+}
+"""How many of a trajectory's first seeds blow up."""
+
+
+@pytest.fixture
+def unstable(monkeypatch) -> None:
+    """Some seeds blow up in frame 20."""
+    bad = {seed_of_draw(place, draw) for place, count in UNSTABLE.items() for draw in range(count)}
+    simulate = MpmPreset.simulate
+
+    def blows_up(preset, seed, *progress):
+        if seed in bad and preset.frames >= 20:
+            raise UnstableError(f"seed {seed}: blown up in frame 20")
+        return simulate(preset, seed, *progress)
+
+    monkeypatch.setattr(MpmPreset, "simulate", blows_up)
+
+
+@pytest.mark.usefixtures("unstable")
+def test_another_seed_takes_the_place_of_an_unstable_one(made, tmp_path, caplog):
+    generate(TINY, tmp_path, COUNTS, seed=5)
+    simulation = read_metadata(tmp_path).extra["simulation"]
+    assert simulation["redrawn"] == {"train": {"1": 1}, "test": {"0": 2}}
+    assert caplog.text.count("blown up in frame 20") == 3
+
+    train, test = (Split(tmp_path / f"{split}.h5") for split in ("train", "test"))
+    request = SimulationRequest(TINY, COUNTS, 5, simulation["redrawn"])
+    assert test.attributes(0)["seed"] == request.trajectory_seed("test", 0)
+    for index in (0, 2, 3):  # the others are what they were
+        np.testing.assert_array_equal(train.read(index).position, Split(made / "train.h5").read(index).position)
+    assert train.attributes(1)["seed"] == request.trajectory_seed("train", 1)
+    generate(TINY, tmp_path, COUNTS, seed=5)  # the same data as requested
+
+
+def test_a_dataset_of_stable_seeds_names_none(made):
+    assert "redrawn" not in read_metadata(made).extra["simulation"]
+
+
+def test_a_preset_that_is_always_unstable_is_an_error(tmp_path, monkeypatch):
+    def blows_up(preset, seed, *_):
+        raise UnstableError(f"seed {seed}: blown up")
+
+    monkeypatch.setattr(MpmPreset, "simulate", blows_up)
+    with pytest.raises(UnstableError, match="5 seeds in a row"):
+        generate(TINY, tmp_path, COUNTS, seed=5)
 
 
 def test_concurrent_calls_give_the_same_bytes(made, tmp_path):

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from threading import Lock
 
 from nmpm.data.format import SPLITS, Trajectory
-from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.background import Task, map_in_threads, raise_if_abandoned, run_in_thread
 from nmpm.data.loading.recording import Recording, RecordingReader
 from nmpm.data.progress import progress_bar
+from nmpm.data.seeds import simulate_first_stable
 from nmpm.errors import ConfigError
 from nmpm.sim import Preset
 
@@ -41,10 +42,10 @@ class SimulatedRecordings:
         """Simulates one trajectory.
 
         Raises:
-            ConfigError: if the simulation fails; names preset and seed.
+            ConfigError: if the simulation fails from several seeds in a row; names preset and seed.
         """
-        seed = derive_seed(self.seed, _STREAM, index)
-        run = self.preset.simulate(seed, progress=lambda _: raise_if_abandoned())
+        place = (self.seed, _STREAM, index)
+        run = simulate_first_stable(self.preset, place, progress=lambda _: raise_if_abandoned())
         trajectory = Trajectory(run.position, run.particle_type, run.attributes)
         return self.reader.recording(trajectory, f"{self.preset.name}, simulated trajectory {index}")
 

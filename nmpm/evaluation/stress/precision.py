@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.data.seeds import try_seeds
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.evaluation.stress.lines import Line, Size
@@ -81,15 +82,18 @@ def growth(distance: Tensor) -> float:
 
 
 def _simulator_growth(subject: Subject, preset: Preset, frames: int, size: Size) -> float:
-    rng, slopes = np.random.default_rng(subject.seed), []
+    rng = np.random.default_rng(subject.seed)
     side = max(high - low for low, high in preset.domain)
-    for seed in subject.seeds(size.scenes):
+
+    def slope(seed: int) -> float:
         start = preset.draw(seed)
         noise = NUDGE * side * rng.standard_normal(start.position.shape)
         pair = start, dataclasses.replace(start, position=start.position + noise)
         runs = [preset.simulate_from(state, frames).position[1:] for state in pair]
         distance = np.sqrt(np.square(runs[0] - runs[1]).sum(-1).mean(-1))
-        slopes.append(growth(torch.from_numpy(distance)))
+        return growth(torch.from_numpy(distance))
+
+    slopes = [try_seeds(place, slope) for place in subject.places(size.scenes)]
     return float(np.mean(slopes))
 
 

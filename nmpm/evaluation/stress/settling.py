@@ -10,7 +10,7 @@ from nmpm.emulator import Emulator
 from nmpm.emulator.rollouts import stream
 from nmpm.evaluation.shape import Shape, measure_shape
 from nmpm.evaluation.stress.lines import Line, Size
-from nmpm.evaluation.stress.subject import Subject, simulate_scenes
+from nmpm.evaluation.stress.subject import Subject, simulate_beside
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset
 from nmpm.sim.twin import twin_of
@@ -53,9 +53,7 @@ def _compare(
 ) -> list[dict[int, dict[str, float]]]:
     """Measures of the twin and of each emulator over the simulator's, scene by scene, as long ones take memory."""
     found: list[Shapes] = [{frame: [] for frame in frames} for _ in range(len(emulators) + 2)]
-    truths = simulate_scenes(subject, preset, scenes, max(frames))
-    twins = simulate_scenes(subject, preset, scenes, max(frames), twin_of(preset))
-    for truth, twin in zip(truths, twins, strict=True):
+    for truth, twin in simulate_beside(subject, preset, scenes, max(frames), [twin_of(preset)]):
         shapes = [_recorded(subject.emulator, window, frames) for window in (truth, twin)]
         shapes += [_predicted(emulator, truth.initial, frames) for emulator in emulators]
         for kept, own in zip(found, shapes, strict=True):

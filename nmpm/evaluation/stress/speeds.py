@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from contextlib import suppress
 
 from nmpm.emulator import rollout
+from nmpm.errors import UnstableError
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject, simulate_window
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, trace_bundles
@@ -18,7 +20,7 @@ _GROUP = "fast and slow"
 
 
 def speeds(subject: Subject, size: Size) -> Iterator[Line]:
-    """Initial speeds and gravity times a factor, beside the simulator where there is one."""
+    """Initial speeds and gravity times a factor, beside the simulator where there is one that stays stable."""
     for factor in SPEEDS:
         yield _line(subject, f"initial speed × {factor:g}", _with_speed(subject, factor, size))
     for factor in GRAVITIES:
@@ -49,13 +51,15 @@ def _line(subject: Subject, name: str, window: Window) -> Line:
 
 def _with_speed(subject: Subject, factor: float, size: Size) -> Window:
     if subject.preset is not None:
-        return simulate_window(subject, subject.preset.varied(speed=factor), size.scenes, size.compared)
+        with suppress(UnstableError):
+            return simulate_window(subject, subject.preset.varied(speed=factor), size.scenes, size.compared)
     state = subject.starts(size.scenes)
     return Window.of(state.with_motion(state.position, factor * state.velocity))
 
 
 def _with_gravity(subject: Subject, factor: float, size: Size) -> Window:
     if subject.preset is not None:
-        return simulate_window(subject, subject.preset.varied(gravity=factor), size.scenes, size.compared)
+        with suppress(UnstableError):
+            return simulate_window(subject, subject.preset.varied(gravity=factor), size.scenes, size.compared)
     state = subject.starts(size.scenes)
     return Window.of(dataclasses.replace(state, gravity=factor * state.gravity))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import derive_seed, preset_metadata
+from nmpm.data.generate import preset_metadata
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.loading.recording import Recording, RecordingReader
+from nmpm.data.seeds import try_seeds
 from nmpm.emulator import Emulator
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset
@@ -55,40 +56,59 @@ class Subject:
         few = max(1, min(1000, int(0.1 * scene.volume / scene.particle_volume)))
         return thrown_blocks(scene, count=few, seed=self.seed).to(self.device)
 
-    def seeds(self, count: int) -> list[int]:
-        """Seeds of scenes that no dataset holds."""
-        return [derive_seed(self.seed, _STREAM, index) for index in range(count)]
+    def places(self, count: int) -> list[tuple[int, int, int]]:
+        """What the seeds of scenes that no dataset holds are derived from, see `nmpm.data.seeds`."""
+        return [(self.seed, _STREAM, index) for index in range(count)]
 
     def with_emulator(self, emulator: Emulator) -> Subject:
         """The same test of another emulator."""
         return replace(self, emulator=emulator)
 
 
-def simulate_window(subject: Subject, preset: Preset, count: int, frames: int, solver: Preset | None = None) -> Window:
+def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -> Window:
     """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the subject's device.
 
     Args:
-        subject: Gives the seeds of the scenes.
-        preset: Draws their initial states.
+        subject: Says which scenes.
+        preset: Draws their initial states and simulates them.
         count: Scenes.
         frames: Frames after the first two.
-        solver: Simulates them; left out, the preset itself.
+
+    Raises:
+        UnstableError: if the simulator does not stay stable from several seeds in a row.
     """
-    return _window(subject, preset, subject.seeds(count), frames, solver)
-
-
-def simulate_scenes(
-    subject: Subject, preset: Preset, count: int, frames: int, solver: Preset | None = None
-) -> Iterator[Window]:
-    """The scenes of `simulate_window` one by one, which bounds the memory of long ones."""
-    for seed in subject.seeds(count):
-        yield _window(subject, preset, [seed], frames, solver)
-
-
-def _window(subject: Subject, preset: Preset, seeds: list[int], frames: int, solver: Preset | None) -> Window:
-    reader, recordings = RecordingReader(preset_metadata(preset), preset.scene), []
-    for seed in seeds:
-        trajectory = (solver or preset).simulate_from(preset.draw(seed), frames + 1)
-        stored = Trajectory(trajectory.position, trajectory.particle_type, trajectory.attributes)
-        recordings.append(reader.recording(stored, f"{preset.name}, seed {seed}"))
+    recordings = [recording for place in subject.places(count) for recording in _record(preset, place, frames, ())]
     return collate(recordings, preset.scene).to(subject.device)
+
+
+def simulate_scenes(subject: Subject, preset: Preset, count: int, frames: int) -> Iterator[Window]:
+    """The scenes of `simulate_window` one by one, which bounds the memory of long ones."""
+    for (window,) in simulate_beside(subject, preset, count, frames, ()):
+        yield window
+
+
+def simulate_beside(
+    subject: Subject, preset: Preset, count: int, frames: int, others: Sequence[Preset]
+) -> Iterator[list[Window]]:
+    """The scenes of `simulate_window` one by one, each as the preset and as others simulate it.
+
+    A scene from which any of them does not stay stable makes room for another.
+    """
+    for place in subject.places(count):
+        recordings = _record(preset, place, frames, others)
+        yield [collate([recording], preset.scene).to(subject.device) for recording in recordings]
+
+
+def _record(preset: Preset, place: tuple[int, ...], frames: int, others: Sequence[Preset]) -> list[Recording]:
+    """One scene as the preset and others simulate it, from the first seed with which all stay stable."""
+    reader = RecordingReader(preset_metadata(preset), preset.scene)
+
+    def simulate(seed: int) -> list[Recording]:
+        start, found = preset.draw(seed), []
+        for solver in (preset, *others):
+            run = solver.simulate_from(start, frames + 1)
+            stored = Trajectory(run.position, run.particle_type, run.attributes)
+            found.append(reader.recording(stored, f"{preset.name}, seed {seed}"))
+        return found
+
+    return try_seeds(place, simulate)

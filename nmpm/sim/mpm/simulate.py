@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import DataError, UnstableError
 from nmpm.scene import Interval
 from nmpm.sim.arrays import Array
 from nmpm.sim.mpm.particles import MpmParticles
@@ -27,7 +27,7 @@ def record_frames(
 
     Raises:
         DataError: if a particle starts inside an obstacle.
-        ConfigError: if the state is no longer finite; the message names the substep.
+        UnstableError: if the state is no longer finite; the message names the substep.
     """
     stepper.enclose(particles)
     moving, dim = particles.position.shape
@@ -46,7 +46,7 @@ def _advance_frame(stepper: MpmStepper, particles: MpmParticles, substeps: int, 
         try:
             stepper.step(particles)
         except FloatingPointError as error:
-            raise ConfigError(
+            raise UnstableError(
                 f"{error} after substep {substep + 1} of {substeps} of frame {frame}; take more substeps, slower "
                 "particles or a softer material."
             ) from error

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import DataError, UnstableError
 from nmpm.scene import Interval
 from nmpm.sim.sph.fluid import SphParticles
 from nmpm.sim.sph.obstacles import PolygonObstacle
@@ -27,7 +27,7 @@ def record_frames(
         The positions, and the largest deviation of density, as a part of that at rest.
 
     Raises:
-        ConfigError: if the simulation becomes unstable; the message names the frame.
+        UnstableError: if the simulation becomes unstable; the message names the frame.
     """
     stepper.initialise(particles)
     walls = stepper.boundary.position[stepper.boundary.visible]
@@ -50,19 +50,19 @@ def _advance_frame(stepper: SphStepper, particles: SphParticles, substeps: int, 
             for _ in range(substeps):
                 stepper.step(particles)
     except FloatingPointError as error:
-        raise ConfigError(f"{error} in frame {frame}; take more substeps or a higher speed of sound.") from error
+        raise UnstableError(f"{error} in frame {frame}; take more substeps or a higher speed of sound.") from error
     rest, sound = stepper.fluid.density, stepper.fluid.speed_of_sound
     deviation = float(np.abs(particles.density / rest - 1).max())
     fastest = float(np.hypot(*particles.velocity.T).max())
     if not (deviation <= DENSITY_LIMIT and fastest <= sound):
-        raise ConfigError(
+        raise UnstableError(
             f"The simulation has blown up in frame {frame}: density deviates by {deviation:.0%} (limit "
             f"{DENSITY_LIMIT:.0%}), the fastest particle moves at {fastest:.3g} m/s (sound: {sound:.3g}). Take more "
             "substeps, a higher speed of sound or more viscosity, or leave this seed out."
         )
     outside = stepper.boundary.count_outside(particles.position)
     if outside:
-        raise ConfigError(f"{outside} particles are outside of the box or in an obstacle in frame {frame}.")
+        raise UnstableError(f"{outside} particles are outside of the box or in an obstacle in frame {frame}.")
     return deviation
 
 

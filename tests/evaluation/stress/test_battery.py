@@ -7,19 +7,22 @@ import torch
 from scenes import box, cloud
 
 from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
+from nmpm.data.seeds import seed_of_draw
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import beyond_walls, rollout
+from nmpm.errors import UnstableError
 from nmpm.evaluation.stress import GROUPS, Line, Size, Subject, battery
 from nmpm.evaluation.stress.precision import growth, nudge
 from nmpm.evaluation.stress.report import as_json, summary, write
 from nmpm.evaluation.stress.settling import compare_shapes
 from nmpm.evaluation.stress.sizes import widen_scene
-from nmpm.evaluation.stress.subject import simulate_scenes, simulate_window
+from nmpm.evaluation.stress.subject import simulate_beside, simulate_scenes, simulate_window
 from nmpm.evaluation.stress.trace import Trace, energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
 from nmpm.processors import Pointwise
-from nmpm.sim import load_preset
+from nmpm.sim import MpmPreset, load_preset
+from nmpm.sim.twin import twin_of
 
 TINY = Size(
     scenes=1,
@@ -114,6 +117,42 @@ def test_scenes_one_by_one_are_those_of_a_window():
     for index, one in enumerate(simulate_scenes(subject, subject.preset, 2, 5)):
         count = int(one.mask.sum())
         assert torch.equal(one.target[0], together.target[index, :, :count])
+
+
+def test_scenes_in_which_a_simulator_is_unstable_make_room_for_others(monkeypatch):
+    subject = goop()
+    place, simulate_from = subject.places(2)[1], MpmPreset.simulate_from
+    bad = subject.preset.draw(seed_of_draw(place, 0)).position
+    twin = twin_of(subject.preset)
+
+    def blows_up(preset, start, frames, progress=None):
+        if preset.substeps == twin.substeps and start.position.shape == bad.shape and (start.position == bad).all():
+            raise UnstableError("blown up")
+        return simulate_from(preset, start, frames, progress)
+
+    usual = simulate_window(subject, subject.preset, 2, 5)
+    monkeypatch.setattr(MpmPreset, "simulate_from", blows_up)
+    first, second = (truth for truth, _ in simulate_beside(subject, subject.preset, 2, 5, [twin]))
+    assert torch.equal(first.initial.position[0], usual.initial.position[0, : first.initial.position.shape[1]])
+    expected = subject.preset.draw(seed_of_draw(place, 1)).position
+    assert len(expected) == int(second.mask.sum())
+
+
+def test_speeds_at_which_the_simulator_is_unstable_are_tested_without_it(monkeypatch):
+    subject = goop()
+    fastest = max(abs(subject.preset.draw(seed).velocity).max() for seed in range(20))
+    simulate_from = MpmPreset.simulate_from
+
+    def blows_up(preset, start, frames, progress=None):
+        if abs(start.velocity).max() > 1.2 * fastest:
+            raise UnstableError("blown up")
+        return simulate_from(preset, start, frames, progress)
+
+    monkeypatch.setattr(MpmPreset, "simulate_from", blows_up)
+    lines = {line.name: line for line in battery(subject, TINY, {"speeds": GROUPS["speeds"]})}
+    assert "mse" in lines["initial speed × 1"].figures
+    assert lines["initial speed × 10"].passed is not None
+    assert "mse" not in lines["initial speed × 10"].figures
 
 
 def test_a_model_that_makes_energy_fails():
