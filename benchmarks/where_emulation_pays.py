@@ -22,7 +22,7 @@ import dataclasses
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -172,6 +172,8 @@ def measure(name: str, times: int, rounds: int) -> Case:
     frame = [value / FRAMES for value in seconds["emulator"]]
     solver, hardware = f"{preset.generator}, {len(preset.box)}-D", describe_device(torch.device("cpu"))
     spreads = Spread.of(substep), Spread.of(frame)
+    if spreads[0].median <= 0:
+        raise SystemExit(f"{name} × {times}: two simulations differ by less than the noise; give more --rounds.")
     return Case(name, times, len(start.position), solver, preset.substeps, *spreads, hardware)
 
 
@@ -246,17 +248,8 @@ def write_map(cases: Mapping[str, Sequence[Case]], path: Path) -> None:
         figure.savefig(part, format="png")
 
 
-def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
-    """Print the table, and return all figures."""
-    out = sys.stdout.write
-    out("| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps | on |\n")
-    out("|---|---|---:|---:|---:|---:|---|\n")
-    for rows in cases.values():
-        for case in rows:
-            out(
-                f"| {case.name} × {case.times} | {case.solver} | {case.particles:,} | {case.substep.format()} |"
-                f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} | {case.hardware} |\n"
-            )
+def figures(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
+    """The cases, the fitted costs of presets with three widths or more, and points of the trade's tables."""
     costs = {
         name: {
             "emulator": fit_cost(rows, [case.frame.median for case in rows]),
@@ -265,14 +258,25 @@ def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
         for name, rows in cases.items()
         if len(rows) > 2
     }
-    for name, cost in costs.items():
-        checks = ", ".join(f"{part} {fit['check']:.2f} (others {fit['misfit']:.0%} off)" for part, fit in cost.items())
-        out(f"{name}: the widest case over the fitted line: {checks}\n")
     tables = sorted(path.parent.name for path in TRADE.glob("*/trade.csv"))
     points = [point for name in tables if (point := equal_error(name)) is not None]
-    for point in points:
-        out(f"{point['name']}: {point['model']} is {point['speed_up']:.2g} times as fast as {point['simulator']}\n")
     return {"cases": [asdict(case) for rows in cases.values() for case in rows], "costs": costs, "points": points}
+
+
+def table_lines(cases: Mapping[str, Sequence[Case]], found: Mapping[str, Any]) -> Iterator[str]:
+    """A Markdown table of the cases, then what was fitted and what the trade's tables say."""
+    yield "| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps | on |"
+    yield "|---|---|---:|---:|---:|---:|---|"
+    for case in (case for rows in cases.values() for case in rows):
+        yield (
+            f"| {case.name} × {case.times} | {case.solver} | {case.particles:,} | {case.substep.format()} |"
+            f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} | {case.hardware} |"
+        )
+    for name, cost in found["costs"].items():
+        checks = ", ".join(f"{part} {fit['check']:.2f} (others {fit['misfit']:.0%} off)" for part, fit in cost.items())
+        yield f"{name}: the widest case over the fitted line: {checks}"
+    for point in found["points"]:
+        yield f"{point['name']}: {point['model']} is {point['speed_up']:.2g} times as fast as {point['simulator']}"
 
 
 def read_cases(path: Path) -> dict[str, list[Case]]:
@@ -292,11 +296,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=TRADE, help="folder of map.json and map.png")
     chosen: Namespace = parser.parse_args()
     torch.set_num_threads(1)
-    cases = read_cases(chosen.out / "map.json") | {
-        name: [measure(name, times, chosen.rounds) for times in chosen.times or WIDTHS[name]] for name in chosen.names
-    }
-    found = report(cases)
-    write_json(chosen.out / "map.json", found)
+    cases = read_cases(chosen.out / "map.json")
+    for name in chosen.names:
+        cases[name] = []
+        for times in chosen.times or WIDTHS[name]:
+            cases[name].append(measure(name, times, chosen.rounds))
+            write_json(chosen.out / "map.json", figures(cases))  # kept if a wider case is interrupted
+    sys.stdout.write("\n".join(table_lines(cases, figures(cases))) + "\n")
     write_map(cases, chosen.out / "map.png")
 
 
