@@ -15,9 +15,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from rolling import roll_to_end
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
-from nmpm.emulator import Emulator, RolloutContext, unroll
+from nmpm.emulator import Emulator, RolloutContext
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.steps import steps_for
 from nmpm.evaluation.stress.subject import Subject
@@ -31,13 +32,11 @@ BUNDLES = 20
 
 
 @torch.no_grad()
-def roll_on(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext]:
+def late_state(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext]:
     """A scene of the model's own, `BUNDLES` bundles into its rollout, and what the rollout knows of its start."""
     particles = Subject(name, emulator, 32, load_preset(name)).starts(1)
     context = emulator.context(particles)
-    for bundle in unroll(emulator, particles, BUNDLES):
-        particles = bundle.state_after(particles)
-    return particles, context
+    return roll_to_end(lambda state: emulator(state, context), particles, BUNDLES), context
 
 
 def split_call(emulator: Emulator, particles: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:
@@ -80,7 +79,7 @@ def main() -> None:
     found: dict[str, Any] = {}
     for name in chosen.models:
         emulator = Zoo.load(name).emulator.to(chosen.device)
-        state, context = roll_on(emulator, name)
+        state, context = late_state(emulator, name)
         with torch.no_grad():
             parts = split_call(emulator, state, context)
             found[name] = summarise(time_alternating(parts, chosen.rounds, clock_for(chosen.device)))

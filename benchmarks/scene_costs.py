@@ -2,6 +2,7 @@
 
 python benchmarks/scene_costs.py --threads 1 --json scene_costs.json --figure benchmarks/scene_costs.png
 python benchmarks/scene_costs.py --sweeps rest errors --cases goop
+python benchmarks/scene_costs.py --redraw scene_costs.json --figure benchmarks/scene_costs.png
 
 "On" is what rollouts do by themselves: kernels, windows around the particles, no calls for what is at rest. "Off" are
 tensor operations on the whole grid, bundle after bundle. CPU time in ms, median (quartiles). Water or goop lies in a
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -21,6 +23,7 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
+from rolling import roll_on
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 from torch import Tensor
 from windows import build_emulator as build_wider
@@ -102,13 +105,10 @@ def time_call(emulator: Emulator, state: Particles, rounds: int) -> Row:
 @torch.no_grad()
 def roll_out_plainly(emulator: Emulator, particles: Particles, bundles: int) -> list[Bundle]:
     """A rollout with everything off."""
-    whole, found = emulator.with_windows(None), []
+    whole = emulator.with_windows(None)
     with using("native"):
         context = whole.context(particles)
-        for _ in range(bundles):
-            found.append(whole(particles, context))
-            particles = found[-1].state_after(particles)
-    return found
+        return [bundle for bundle, _ in roll_on(lambda state: whole(state, context), particles, bundles)]
 
 
 @torch.no_grad()
@@ -121,9 +121,7 @@ def roll_out(emulator: Emulator, particles: Particles, bundles: int) -> list[Bun
 def states_before_rest(emulator: Emulator, start: Particles) -> list[Particles]:
     """The states of a rollout up to the first that its bundle leaves as it is; all, if it never rests."""
     context, states = emulator.context(start), [start]
-    for _ in range(2 * ROLLOUT):
-        bundle = emulator(states[-1], context)
-        after = bundle.state_after(states[-1])
+    for _, after in roll_on(lambda state: emulator(state, context), start, 2 * ROLLOUT):
         if torch.equal(after.position, states[-1].position) and torch.equal(after.velocity, states[-1].velocity):
             break
         states.append(after)
@@ -215,23 +213,26 @@ def _format_spread(seconds: list[float]) -> str:
 def draw(rows: list[Row], path: Path) -> None:
     """A panel for each sweep: medians against what is varied, solid with everything on, dashed without."""
     from matplotlib import pyplot
+    from matplotlib.lines import Line2D
 
     sweeps = list(dict.fromkeys(row["sweep"] for row in rows))
-    figure, panels = pyplot.subplots(1, len(sweeps), figsize=(4 * len(sweeps), 3.4), squeeze=False)
+    size = (4 * len(sweeps), 3.6)
+    figure, panels = pyplot.subplots(1, len(sweeps), figsize=size, squeeze=False, layout="constrained")
     colours = dict(zip(CASES, ("tab:green", "tab:blue", "tab:orange", "tab:red"), strict=True))
     for panel, sweep in zip(panels[0], sweeps, strict=True):
         for case in dict.fromkeys(row["case"] for row in rows if row["sweep"] == sweep):
             own = [row for row in rows if (row["sweep"], row["case"]) == (sweep, case)]
             for name, style in (("on", "-"), ("off", "--")):
                 times = [1e3 * statistics.median(row[name]) for row in own]
-                label = case if name == "on" else None
-                panel.plot([row["x"] for row in own], times, style, marker=".", color=colours[case], label=label)
+                panel.plot([row["x"] for row in own], times, style, marker=".", color=colours[case])
         panel.set(xlabel=AXES[sweep], ylabel="ms a rollout" if sweep == "rest" else "ms a call", yscale="log")
         panel.set_xscale("log" if sweep in ("particles", "grids") else "linear")
-        panel.legend(fontsize=7)
-    figure.suptitle("solid: on; dashed: off", fontsize=9)
-    figure.tight_layout()
+    names = dict.fromkeys(row["case"] for row in rows)
+    lines = [Line2D([], [], color=colours[name], marker=".", label=name) for name in names]
+    lines += [Line2D([], [], color="0.3", linestyle=style, label=name) for name, style in (("on", "-"), ("off", "--"))]
+    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
+    pyplot.close(figure)
 
 
 def main() -> None:
@@ -244,7 +245,13 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=4, help="whose errors are compared")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--figure", type=Path, help="draw the times to this file")
+    parser.add_argument(
+        "--redraw", type=Path, metavar="JSON", help="draw the times of an earlier --json; measure nothing"
+    )
     chosen = parser.parse_args()
+    if chosen.redraw is not None:
+        draw(json.loads(chosen.redraw.read_text(encoding="utf-8"))["times"], chosen.figure or Path("scene_costs.png"))
+        return
     torch.set_num_threads(chosen.threads)
     sys.stdout.write(f"{describe_machine(torch.device('cpu'), chosen.threads)}\n")
     rows: list[Row] = []

@@ -10,7 +10,8 @@ is close to linear in the particles, so their ratio is a number of substeps:
     break-even = (ms per frame of the emulator) / (ms per substep of the simulator)
 
 Emulation pays where the cheapest stable simulation of the same error needs more substeps than that. The cost model of
-the map, ms = a + b × particles, is fitted to all widths but the widest and checked on that. Points: settings of the
+the map, ms = a + b × particles, is fitted to all widths but the widest and checked on that. Presets that are not named
+keep their figures in map.json, and the name of the processor on which they were measured. Points: settings of the
 trade's tables (`benchmarks/trade/NAME/trade.csv`, see `beside_simulator.py`), the cheapest simulation that is no less
 accurate than the model.
 """
@@ -18,12 +19,13 @@ accurate than the model.
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,6 +34,7 @@ from beside_simulator import read_rivals
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from rolling import roll_to_end
 from timing import Spread, clock_for, make_parser, time_alternating, write_json
 
 from nmpm._support.atomic import atomic_write
@@ -43,6 +46,7 @@ from nmpm.data.loading.recording import RecordingReader
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.calibration import calibrate
 from nmpm.errors import ZooError
+from nmpm.evaluation.machine import describe_device
 from nmpm.particles import Window
 from nmpm.sim import InitialState, Preset, load_preset
 from nmpm.zoo import Zoo
@@ -77,6 +81,7 @@ class Case:
         substeps: Of the preset.
         substep: Of the simulator, seconds.
         frame: Of the emulator, seconds.
+        hardware: Processor.
     """
 
     name: str
@@ -86,6 +91,12 @@ class Case:
     substeps: int
     substep: Spread
     frame: Spread
+    hardware: str
+
+    @classmethod
+    def read(cls, plain: Mapping[str, Any]) -> Self:
+        """The case of an entry of map.json."""
+        return cls(**{**plain, "substep": Spread(**plain["substep"]), "frame": Spread(**plain["frame"])})
 
     @property
     def break_even(self) -> float:
@@ -159,8 +170,11 @@ def measure(name: str, times: int, rounds: int) -> Case:
     pairs = zip(seconds["more"], seconds["one"], strict=True)
     substep = [(more - one) / frames / preset.substeps for more, one in pairs]
     frame = [value / FRAMES for value in seconds["emulator"]]
-    solver = f"{preset.generator}, {len(preset.box)}-D"
-    return Case(name, times, len(start.position), solver, preset.substeps, Spread.of(substep), Spread.of(frame))
+    solver, hardware = f"{preset.generator}, {len(preset.box)}-D", describe_device(torch.device("cpu"))
+    spreads = Spread.of(substep), Spread.of(frame)
+    if spreads[0].median <= 0:
+        raise SystemExit(f"{name} × {times}: two simulations differ by less than the noise; give more --rounds.")
+    return Case(name, times, len(start.position), solver, preset.substeps, *spreads, hardware)
 
 
 def emulation(emulator: Emulator, window: Window) -> Callable[[], None]:
@@ -168,23 +182,30 @@ def emulation(emulator: Emulator, window: Window) -> Callable[[], None]:
     context = emulator.context(window.initial)
 
     def emulate() -> None:
-        particles = window.initial
         with torch.inference_mode():
-            for _ in range(FRAMES // emulator.frames):
-                particles = emulator(particles, context).state_after(particles)
+            roll_to_end(lambda particles: emulator(particles, context), window.initial, FRAMES // emulator.frames)
 
     emulate()
     return emulate
 
 
 def fit_cost(cases: Sequence[Case], seconds: Sequence[float]) -> dict[str, float]:
-    """The line a + b × particles through all but the widest case, and the latter's cost over that of the line."""
+    """The line a + b × particles through all but the widest case.
+
+    Returns:
+        offset: a, seconds.
+        slope: b, seconds per particle.
+        misfit: The largest relative distance of a fitted case from the line.
+        check: The widest case's cost over that of the line.
+    """
     counts = np.array([case.particles for case in cases], dtype=float)
     values = np.array(seconds)
     weights = 1 / values[:-1]  # relative errors count
     matrix = np.stack([np.ones(len(counts) - 1), counts[:-1]], axis=1)
     offset, slope = np.linalg.lstsq(matrix * weights[:, None], values[:-1] * weights, rcond=None)[0]
-    return {"offset": offset, "slope": slope, "check": float(values[-1] / (offset + slope * counts[-1]))}
+    ratios = values / (offset + slope * counts)
+    misfit, check = float(np.abs(ratios[:-1] - 1).max()), float(ratios[-1])
+    return {"offset": offset, "slope": slope, "misfit": misfit, "check": check}
 
 
 def equal_error(name: str) -> dict[str, Any] | None:
@@ -227,17 +248,8 @@ def write_map(cases: Mapping[str, Sequence[Case]], path: Path) -> None:
         figure.savefig(part, format="png")
 
 
-def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
-    """Print the table, and return all figures."""
-    out = sys.stdout.write
-    out("| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps |\n")
-    out("|---|---|---:|---:|---:|---:|\n")
-    for rows in cases.values():
-        for case in rows:
-            out(
-                f"| {case.name} × {case.times} | {case.solver} | {case.particles:,} | {case.substep.format()} |"
-                f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} |\n"
-            )
+def figures(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
+    """The cases, the fitted costs of presets with three widths or more, and points of the trade's tables."""
     costs = {
         name: {
             "emulator": fit_cost(rows, [case.frame.median for case in rows]),
@@ -246,13 +258,33 @@ def report(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
         for name, rows in cases.items()
         if len(rows) > 2
     }
-    for name, cost in costs.items():
-        checks = ", ".join(f"{part} {fit['check']:.2f}" for part, fit in cost.items())
-        out(f"{name}: the widest case over the fitted line: {checks}\n")
-    points = [point for name in cases if (point := equal_error(name)) is not None]
-    for point in points:
-        out(f"{point['name']}: {point['model']} is {point['speed_up']:.2g} times as fast as {point['simulator']}\n")
+    tables = sorted(path.parent.name for path in TRADE.glob("*/trade.csv"))
+    points = [point for name in tables if (point := equal_error(name)) is not None]
     return {"cases": [asdict(case) for rows in cases.values() for case in rows], "costs": costs, "points": points}
+
+
+def table_lines(cases: Mapping[str, Sequence[Case]], found: Mapping[str, Any]) -> Iterator[str]:
+    """A Markdown table of the cases, then what was fitted and what the trade's tables say."""
+    yield "| preset | solver | particles | ms per substep | ms per frame, emulator | break-even, substeps | on |"
+    yield "|---|---|---:|---:|---:|---:|---|"
+    for case in (case for rows in cases.values() for case in rows):
+        yield (
+            f"| {case.name} × {case.times} | {case.solver} | {case.particles:,} | {case.substep.format()} |"
+            f" {case.frame.format()} | {case.break_even:.2g} of {case.substeps} | {case.hardware} |"
+        )
+    for name, cost in found["costs"].items():
+        checks = ", ".join(f"{part} {fit['check']:.2f} (others {fit['misfit']:.0%} off)" for part, fit in cost.items())
+        yield f"{name}: the widest case over the fitted line: {checks}"
+    for point in found["points"]:
+        yield f"{point['name']}: {point['model']} is {point['speed_up']:.2g} times as fast as {point['simulator']}"
+
+
+def read_cases(path: Path) -> dict[str, list[Case]]:
+    """The cases of an earlier map.json by preset; none if there is no such file."""
+    cases: dict[str, list[Case]] = {}
+    for plain in json.loads(path.read_text(encoding="utf-8"))["cases"] if path.is_file() else ():
+        cases.setdefault(plain["name"], []).append(Case.read(plain))
+    return cases
 
 
 def main() -> None:
@@ -264,11 +296,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=TRADE, help="folder of map.json and map.png")
     chosen: Namespace = parser.parse_args()
     torch.set_num_threads(1)
-    cases = {
-        name: [measure(name, times, chosen.rounds) for times in chosen.times or WIDTHS[name]] for name in chosen.names
-    }
-    found = report(cases)
-    write_json(chosen.out / "map.json", found)
+    cases = read_cases(chosen.out / "map.json")
+    for name in chosen.names:
+        cases[name] = []
+        for times in chosen.times or WIDTHS[name]:
+            cases[name].append(measure(name, times, chosen.rounds))
+            write_json(chosen.out / "map.json", figures(cases))  # kept if a wider case is interrupted
+    sys.stdout.write("\n".join(table_lines(cases, figures(cases))) + "\n")
     write_map(cases, chosen.out / "map.png")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
+from rolling import roll_on, roll_to_end
 from timing import make_timing_parser
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -39,6 +40,7 @@ from nmpm.sim import Preset, load_preset
 from nmpm.training.losses import position_error
 from nmpm.transfer import Linear, Nearest, Transfer, using
 
+Call = Callable[[Particles, RolloutContext], Bundle]
 UNCONSTRAINED = Constraints(solids=False)
 CELLS, FRAMES, DEPTH = 64, 8, 3
 
@@ -67,6 +69,18 @@ class Setup:
     def backend(self) -> AbstractContextManager[None]:
         """Within it what the setup says runs around the network."""
         return nullcontext() if self.kernels else using("native")
+
+    def predictor(self, emulator: Emulator, context: RolloutContext, call: Call) -> Callable[[Particles], Bundle]:
+        """A call from a state: in the rollout's context, or in one of its own in the paper's form.
+
+        Args:
+            emulator: Predicts.
+            context: Of the rollout's first state.
+            call: Of the emulator.
+        """
+        if self.paper:
+            return lambda particles: call(particles, emulator.context(particles))
+        return lambda particles: call(particles, context)
 
 
 SETUPS: Mapping[str, Setup] = MappingProxyType(
@@ -169,17 +183,11 @@ class TrainingStep:
 
     def predict(self) -> Tensor:
         """Positions of K bundles of m frames, (B, K m, N, D)."""
-        particles, bundles = self.window.initial, []
-        context = self.emulator.context(particles)
-        for _ in range(self.unroll):
-            if self.setup.paper:
-                context = self.emulator.context(particles)
-            bundle = self._predict_bundle(particles, context)
-            particles = bundle.state_after(particles)
-            bundles.append(bundle.position)
-        return torch.cat(bundles, dim=1)
+        start = self.window.initial
+        predict = self.setup.predictor(self.emulator, self.emulator.context(start), self._call)
+        return torch.cat([bundle.position for bundle, _ in roll_on(predict, start, self.unroll)], dim=1)
 
-    def _predict_bundle(self, particles: Particles, context: RolloutContext) -> Bundle:
+    def _call(self, particles: Particles, context: RolloutContext) -> Bundle:
         if self.recompute:
             recomputed: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
             return recomputed
@@ -207,13 +215,8 @@ class RolloutCalls:
     @torch.inference_mode()
     def __call__(self) -> None:
         """All calls."""
-        particles, context = self.state, self.context
         with self.setup.backend():
-            for _ in range(self.calls):
-                if self.setup.paper:
-                    context = self.emulator.context(particles)
-                bundle = self.emulator(particles, context)
-                particles = bundle.state_after(particles)
+            roll_to_end(self.setup.predictor(self.emulator, self.context, self.emulator), self.state, self.calls)
 
 
 def simulate_windows(preset: Preset, seed: int, scenes: int, workers: int) -> Iterator[Window]:

@@ -33,7 +33,7 @@ SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__m
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
     "generalisation", "gns", "hidden_state", "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness",
-    "where_emulation_pays",
+    "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -180,6 +180,27 @@ def test_the_setup_without_kernels_differs_from_the_shipped_one_in_what_runs_alo
     torch.testing.assert_close(*paths)
 
 
+def test_calls_that_are_rolled_on_predict_a_rollout():
+    from rolling import roll_on, roll_to_end
+
+    scene = load_preset("goop").scene
+    torch.manual_seed(0)
+    emulator = EmulatorRecipe(scene, cells=16, frames=4, processor=UNet(width=4, depth=2)).build().eval()
+    state = cloud(scene, batch=2)
+    with torch.no_grad():
+        context = emulator.context(state)
+        bundles = [bundle.position for bundle, _ in roll_on(lambda now: emulator(now, context), state, 3)]
+        last = roll_to_end(lambda now: emulator(now, context), state, 3)
+    torch.testing.assert_close(torch.cat(bundles, dim=1), rollout(emulator, state, 12))
+    assert torch.equal(last.position, bundles[-1][:, -1])
+
+
+def test_costs_of_scenes_are_drawn_again_from_stored_figures(tmp_path):
+    path = tmp_path / "costs.png"
+    assert run_script("scene_costs", "--redraw", str(ROOT / "scene_costs.json"), "--figure", str(path)) == ""
+    assert path.read_bytes()[:4] == b"\x89PNG"
+
+
 def test_repeated_rollout_calls_start_from_the_same_state():
     import workloads
 
@@ -302,21 +323,26 @@ def test_gpu_runs_an_interrupted_step_again(tmp_path):
 
 
 def test_the_map_states_break_even_for_every_width(tmp_path):
+    import where_emulation_pays
+
     text = run_script("where_emulation_pays", "goop", "--times", "1", "2", "--rounds", "1", "--out", str(tmp_path))
     found = json.loads((tmp_path / "map.json").read_text())
     narrow, wide = found["cases"]
     assert wide["particles"] > narrow["particles"]
     assert min(case["frame"]["median"] for case in found["cases"]) > 0
     assert "| goop × 2 | MLS-MPM, 2-D |" in text
+    kept = where_emulation_pays.read_cases(tmp_path / "map.json")["goop"]
+    assert [case.particles for case in kept] == [narrow["particles"], wide["particles"]]
+    assert all(case.hardware for case in kept)
     assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_cost_is_fitted_to_all_but_the_widest():
     import where_emulation_pays as script
 
-    cases = [script.Case("", 1, count, "", 1, None, None) for count in (100, 200, 400)]
+    cases = [script.Case("", 1, count, "", 1, None, None, "") for count in (100, 200, 400)]
     fit = script.fit_cost(cases, [3.0, 5.0, 18.0])
-    assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "check": 2.0})
+    assert fit == pytest.approx({"offset": 1.0, "slope": 0.02, "misfit": 0.0, "check": 2.0})
 
 
 def test_wide_scenes_hold_copies_of_a_narrow_one_side_by_side():
@@ -390,6 +416,24 @@ def test_a_graph_network_is_trained_and_written_at_the_times_asked_for(tmp_path,
     assert last.curve[: len(first.curve)] == first.curve
     assert text.count("loss") == 24
     assert run_script("gns", *words) == ""  # it goes on from the end
+
+
+def test_all_trades_are_commands_that_their_programs_understand(tmp_path):
+    import trades
+
+    text = run_script("trades", "--dry-run", "--out", str(tmp_path / "all"))
+    assert [line.split(",")[0] for line in text.splitlines()] == [
+        "gns", "goop", "waterramps", "dambreak2d", "waterdrop-xl", "map",
+    ]  # fmt: skip
+    assert not (tmp_path / "all").exists()
+    steps = trades.list_steps(tmp_path)
+    for name, models in trades.MODELS.items():
+        words = steps[name].words
+        assert set(models) <= set(words)
+        assert (ROOT.parent / words[words.index("--config") + 1]).is_file()
+    one = run_script("trades", "--dry-run", "--steps", "map")
+    assert one.startswith("map, about")
+    assert one.count("\n") == 1
 
 
 def test_a_model_is_its_own_ensemble_and_commits_whole_bundles():
