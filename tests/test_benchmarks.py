@@ -32,7 +32,8 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "calibration", "call_profile", "cropping", "dam_break", "generalisation",
-    "gns", "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
+    "gns", "hidden_state", "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness",
+    "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -464,6 +465,15 @@ def test_a_shift_moves_the_grid_and_nothing_else():
     )
     assert moved.grid.lower == pytest.approx(expected)
     assert run_time_knob.shifted(emulator, (0.0, 0.0)) is emulator
+
+
+def test_a_simulator_restarted_before_anything_is_strained_goes_on_as_it_was():
+    from hidden_state import restart
+
+    preset = load_preset("goop").with_frames(6)
+    frames = preset.simulate(0).position
+    again = restart(preset, preset.draw(0), frames[:2], 4)
+    np.testing.assert_allclose(again, frames[2:6], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["goop", "waterramps", "dambreak2d"])
