@@ -32,7 +32,7 @@ def test_an_index_is_always_the_same_trajectory():
 
 def test_simulates_no_trajectory_twice_for_the_same_request(monkeypatch):
     seeds, simulate = [], MpmPreset.simulate
-    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, **_: seeds.append(seed) or simulate(preset, seed))
+    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: seeds.append(seed) or simulate(preset, seed))
     recordings = live()
     for indices in ([0, 1], [2, 3], [0, 1], [2, 3]):
         recordings.load(indices)
