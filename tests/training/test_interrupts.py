@@ -92,7 +92,7 @@ def test_an_interruption_before_training_says_that_there_is_nothing_to_go_on_fro
 
     monkeypatch.setattr("nmpm.data.datamodule.TrajectoryDataModule.prepare_data", interrupted)
     assert fit("run") == 130
-    assert "interrupted before the first step; there is nothing to go on from." in capfd.readouterr().err
+    assert "interrupted before the first step. The same command starts again" in capfd.readouterr().err
     assert fit("run", "--ckpt_path", "last") == 1
     said = capfd.readouterr().err
     assert re.search(r"--ckpt_path last: there is no run/checkpoints/last\.ckpt; checkpoints there: none", said)
