@@ -231,7 +231,7 @@ class EmulatorCLI(LightningCLI):
     def _how_to_go_on(self) -> str:
         step = self.stop_on_signal.saved_step
         if step is None and not self.run_folder.checkpoints["last"].is_file():
-            return "interrupted before the first step. The same command starts again; trajectories simulated so far are kept."
+            return "interrupted before the first step. The same command starts again; simulated trajectories are kept."
         where = f"stopped at step {step}" if step is not None else "interrupted"
         return f"{where}. Go on with: {resuming_command(self.words)}"
 
