@@ -54,6 +54,8 @@ class TrajectoryDataModule(LightningDataModule):
         passes: How often the windows of a buffer are drawn, on average, before the next buffer.
         emphasis: Fraction of the training windows that is drawn in proportion to the motion in them, in [0, 1]; the
             rest is drawn uniformly. Useful where recordings end with a long rest.
+        openings: Fraction of the training windows that start in one of a trajectory's first 16 frames, in [0, 1]. Every
+            rollout starts there, but only few of a trajectory's windows do.
         bucket_batches: Training batches in a row whose windows are sorted by their number of particles and dealt to
             them anew, so that a large scene does not make small ones pay for padding; 1 for none.
         seed: Seed of the order of the training windows.
@@ -82,6 +84,7 @@ class TrajectoryDataModule(LightningDataModule):
         buffer_size: int = 16,
         passes: float = 4,
         emphasis: float = 0.0,
+        openings: float = 0.0,
         bucket_batches: int = 1,
         seed: int = 0,
         family: str | None = None,
@@ -102,8 +105,8 @@ class TrajectoryDataModule(LightningDataModule):
                 raise ConfigError(f"{key} = {value} must be at least 1.")
         self.data_source = _make_source(path, name, source, StatedFacts(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
-        self.buffer_size, self.passes, self.emphasis = buffer_size, passes, emphasis
-        self.bucket_batches = bucket_batches
+        self.buffer_size, self.passes = buffer_size, passes
+        self.emphasis, self.openings, self.bucket_batches = emphasis, openings, bucket_batches
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
         self._provider: RecordingProvider | None = None
         self._history: _BatchHistory | None = None
@@ -155,6 +158,7 @@ class TrajectoryDataModule(LightningDataModule):
             passes=self.passes,
             seed=self.seed,
             emphasis=self.emphasis,
+            openings=self.openings,
             bucket=self.bucket_batches,
             start=history.start,
         )

@@ -146,8 +146,10 @@ class TrajectoryBuffer:
         """The windows of each of a bucket's batches, of all ranks that share the buffer."""
         together = len(self.plan.drawing_ranks(rank, world)) == world
         own = (0, 1) if together else (rank, world)
-        steps = ((index, self.plan.draw(index, rank, world)) for index in bucket)
-        drawn = [window for index, step in steps for window in self._emphasise(step, contents.motion, index, *own)]
+        drawn: list[tuple[int, int]] = []
+        for index in bucket:
+            step = self._emphasise(self.plan.draw(index, rank, world), contents.motion, index, *own)
+            drawn += self.plan.open(step, index, *own)
         return self.plan.deal(bucket, drawn, [contents.size(trajectory) for trajectory, _ in drawn])
 
     def _load(self, members: Sequence[int], previous: _BufferContents | None) -> _BufferContents:

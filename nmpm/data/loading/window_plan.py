@@ -26,7 +26,10 @@ from nmpm.errors import ConfigError
 
 T = TypeVar("T")
 
-_TRAJECTORIES, _WINDOWS, MOTION, _BUCKETS = 0, 1, 2, 3  # separate the streams of random numbers
+_TRAJECTORIES, _WINDOWS, MOTION, _BUCKETS, _OPENINGS = 0, 1, 2, 3, 4  # separate the streams of random numbers
+
+OPENING = 16
+"""Frames that count as the opening of a trajectory."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class WindowPlan:
         emphasis: Fraction of the windows that is drawn in proportion to the motion in them, in [0, 1].
         start: Where the batches of this size start, if there were batches of another size before.
         bucket: Batches in a row whose windows are sorted by size; 1 for none.
+        openings: Fraction of the windows that is moved to one of the first `OPENING` frames of its trajectory.
 
     Raises:
         ConfigError: if a number is out of its range.
@@ -72,6 +76,7 @@ class WindowPlan:
     emphasis: float = 0.0
     start: PlanStart = PlanStart()
     bucket: int = 1
+    openings: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "buffer_size", "passes", "bucket"):
@@ -79,8 +84,9 @@ class WindowPlan:
                 raise ConfigError(f"{name} = {getattr(self, name)} must be positive.")
         if self.seed < 0:
             raise ConfigError(f"seed = {self.seed} must not be negative.")
-        if not 0 <= self.emphasis <= 1:
-            raise ConfigError(f"emphasis = {self.emphasis} must be between 0 and 1: a fraction of the windows.")
+        for name in ("emphasis", "openings"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} = {getattr(self, name)} must be between 0 and 1: a fraction of the windows.")
 
     def windows(self, trajectory: int) -> int:
         """Number of windows in a trajectory."""
@@ -131,6 +137,22 @@ class WindowPlan:
         return [
             (members[owner], window - int(ends[owner]) + self.windows(members[owner]))
             for owner, window in zip(owners, chosen, strict=True)
+        ]
+
+    def open(self, drawn: Sequence[tuple[int, int]], index: int, rank: int, world: int) -> list[tuple[int, int]]:
+        """The windows of a rank's batch, a share of them moved to the openings of their trajectories.
+
+        Random numbers are drawn for the batches of all ranks, as a single process with one large batch would.
+        """
+        if not self.openings:
+            return list(drawn)
+        rng = np.random.default_rng((self.seed, _OPENINGS, index, 0))
+        moved = rng.random(len(drawn) * world) < self.openings
+        firsts = rng.integers(0, OPENING, len(drawn) * world)
+        own = slice(rank * len(drawn), (rank + 1) * len(drawn))
+        return [
+            (trajectory, min(int(first), self.windows(trajectory) - 1) if move else frame)
+            for (trajectory, frame), move, first in zip(drawn, moved[own], firsts[own], strict=True)
         ]
 
     def bucket_of(self, index: int, world: int) -> range:

@@ -15,7 +15,7 @@ from nmpm.data.format import Split, read_metadata
 from nmpm.data.loading.background import raise_if_abandoned
 from nmpm.data.loading.buffer import MotionSampler, TrajectoryBuffer
 from nmpm.data.loading.recording import Recording, SplitRecordings
-from nmpm.data.loading.window_plan import WindowPlan
+from nmpm.data.loading.window_plan import OPENING, WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 
@@ -233,8 +233,32 @@ def test_with_emphasis_ranks_together_have_the_batch_of_one_process(make_dataset
         assert torch.equal(torch.cat([part.frames for part in ranks]), whole.frames)
 
 
-@pytest.mark.parametrize("emphasis", [-0.1, 1.5])
-def test_emphasis_outside_of_0_to_1_is_refused(make_dataset, emphasis):
-    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, emphasis=emphasis)
-    with pytest.raises(ConfigError, match="emphasis"):
+def test_openings_move_windows_to_the_first_frames_of_their_trajectories():
+    plan = WindowPlan(frames=(60, 40, 10), length=8, batch_size=1000, buffer_size=3, passes=100, seed=0)
+    plain = plan.batch(0, 0, 1)
+    half, whole = (dataclasses.replace(plan, openings=share).open(plain, 0, 0, 1) for share in (0.5, 1.0))
+    assert plan.open(plain, 0, 0, 1) == plain
+    assert [trajectory for trajectory, _ in whole] == [trajectory for trajectory, _ in plain]
+    for trajectory, limit in enumerate((OPENING, OPENING, 3)):
+        assert {first for own, first in whole if own == trajectory} == set(range(limit))
+    stayed = np.mean([one == other for one, other in zip(plain, half, strict=True)])
+    assert 0.45 < stayed < 0.6
+
+
+def test_with_openings_ranks_together_have_the_batch_of_one_process(make_dataset):
+    folder = make_dataset()
+    of = {
+        size: TrajectoryDataModule(path=str(folder), horizon=4, batch_size=size, emphasis=0.3, openings=0.5)
+        for size in (2, 6)
+    }
+    parts = [of[2].train_dataloader().buffer.batches(rank=rank, world=3) for rank in range(3)]
+    for *ranks, whole in islice(zip(*parts, of[6].train_dataloader().buffer.batches(), strict=True), 12):
+        assert torch.equal(torch.cat([part.frames for part in ranks]), whole.frames)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5])
+@pytest.mark.parametrize("name", ["emphasis", "openings"])
+def test_shares_of_windows_outside_of_0_to_1_are_refused(make_dataset, name, share):
+    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, **{name: share})
+    with pytest.raises(ConfigError, match=name):
         data.train_dataloader()
