@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator import Emulator
-from nmpm.emulator.bodies import BAND, SAMPLES, solid_share
+from nmpm.emulator.bodies import BAND, SAMPLES, lattice, solid_share
 from nmpm.obstacles import Ramp
 from nmpm.zoo import Zoo
 
@@ -77,10 +77,9 @@ def filled(emulator: Emulator, ramp: Ramp) -> Tensor:
 def sampled(emulator: Emulator, samples: int, band: float, ramp: Ramp) -> Tensor:
     """The field of a ramp that is sampled softly, see `nmpm.emulator.bodies`."""
     grid = emulator.grid
-    axes = [(torch.arange(samples * n, dtype=torch.float64) + 0.5) / samples for n in grid.shape]
-    cells = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(1, -1, grid.dim)
-    share = solid_share(ramp.distance(grid.to_length(cells)), band * min(grid.spacing))
-    return emulator.transfer.p2g(share.unsqueeze(-1) / samples**grid.dim, cells, grid)
+    points = lattice(grid, samples).unsqueeze(0)
+    share = solid_share(ramp.distance(points), band * min(grid.spacing))
+    return emulator.transfer.p2g(share.unsqueeze(-1) / samples**grid.dim, grid.to_cells(points, torch.float64), grid)
 
 
 def deviations(one: Tensor, exact: Tensor) -> tuple[float, float]:

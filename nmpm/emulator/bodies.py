@@ -49,7 +49,7 @@ def sample_bodies(scenes: Sequence[Sequence[Body]], scene: Scene, grid: Grid) ->
     """
     if grid.dim != 2:
         raise ConfigError(f"Bodies are obstacles in two dimensions; this model's scenes have {grid.dim}.")
-    points = _lattice(grid)
+    points = lattice(grid, SAMPLES)
     solid = torch.stack([_union(bodies, points, grid) for bodies in scenes])
     near = (solid.detach() > 0).any(0)
     volume = grid.cell_volume / SAMPLES**grid.dim
@@ -67,9 +67,9 @@ def solid_share(distance: Tensor, width: float) -> Tensor:
     return 0.5 - 0.75 * u + 0.25 * u**3
 
 
-def _lattice(grid: Grid) -> Tensor:
-    """(K, 2) points over the whole domain, in domain length."""
-    axes = [(torch.arange(SAMPLES * n, dtype=torch.float64, device="cpu") + 0.5) / SAMPLES for n in grid.shape]
+def lattice(grid: Grid, samples: int) -> Tensor:
+    """(K, D) points over the whole domain, so many per cell and axis, in domain length; float64, on the CPU."""
+    axes = [(torch.arange(samples * n, dtype=torch.float64, device="cpu") + 0.5) / samples for n in grid.shape]
     return grid.to_length(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, grid.dim))
 
 

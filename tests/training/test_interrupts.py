@@ -86,13 +86,14 @@ def test_an_interrupted_training_goes_on_where_it_was_by_the_command_that_it_pri
         assert torch.equal(value, weights("run")[name]), name
 
 
-def test_an_interruption_before_training_says_that_there_is_nothing_to_go_on_from(fit, monkeypatch, capfd):
+def test_an_interruption_before_training_says_that_the_same_command_starts_again(fit, monkeypatch, capfd):
     def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("nmpm.data.datamodule.TrajectoryDataModule.prepare_data", interrupted)
     assert fit("run") == 130
-    assert "interrupted before the first step. The same command starts again" in capfd.readouterr().err
+    message = "interrupted before the first step. The same command starts again; simulated trajectories are kept."
+    assert message in capfd.readouterr().err
     assert fit("run", "--ckpt_path", "last") == 1
     said = capfd.readouterr().err
     assert re.search(r"--ckpt_path last: there is no run/checkpoints/last\.ckpt; checkpoints there: none", said)
