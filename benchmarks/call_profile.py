@@ -3,8 +3,8 @@
 python benchmarks/call_profile.py --threads 1 --models goop waterramps --json call_profile.json
 
 Each part is called by itself, in turn with the others and with the whole call, 20 bundles into a rollout of a scene of
-the model's own; CPU time in µs, median (quartiles) over the rounds. "Rest" is a call without its network and without
-the kernels: Python and torch between them. The kernels' own time contains the conversion of tensors to arrays.
+the model's own; CPU time in µs, least, median (quartiles) over the rounds. "Rest" is a call without its network and
+without the kernels: Python and torch between them. The kernels' own time contains the conversion of tensors to arrays.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from rolling import roll_to_end
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
 from nmpm.emulator import Emulator, RolloutContext
-from nmpm.emulator.departure import Departure
-from nmpm.emulator.steps import steps_for
+from nmpm.emulator.fused.direct import DirectCall
+from nmpm.errors import ConfigError
 from nmpm.evaluation.stress.subject import Subject
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
@@ -41,31 +41,40 @@ def late_state(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext
 
 def split_call(emulator: Emulator, particles: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:
     """The whole call, and each of its parts on the values that the call gives it."""
-    steps = steps_for(emulator, emulator._plan, particles, context.solid)
-    cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
-    normalised = emulator.normalise(state)
+    plan = emulator._plan
+    if plan is None:
+        raise ConfigError("Its parts are no kernels (`nmpm.emulator.fused.plan`): profile another model.")
+    call = DirectCall(emulator, plan, context)
+    start = call.rasterise(particles)
+    normalised = call.normalise(start)
     output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
-    own = (cells, velocity, gravity, particles.material, particles.mask, state, output, emulator.output_scale)
-    start = Departure(*own)
-    path = steps.path(start, context)
-    parts: dict[str, Callable[[], object]] = {
+    path = call.path(start, output, None)
+    return {
         CALL: lambda: emulator(particles, context),
         NETWORK: lambda: emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision),
-        "p2g": lambda: steps.rasterise(particles, context.solid),
-        "normalise": lambda: emulator.normalise(state),
-        "path and constraints": lambda: steps.path(start, context),
+        "p2g": lambda: call.rasterise(particles),
+        "normalise": lambda: call.normalise(start),
+        "path and constraints": lambda: call.path(start, output, None),
+        "velocity, density cap, to length": lambda: call.finish(start, path.copy()),
     }
-    if emulator.constraints.density_cap:
-        parts["density cap"] = lambda: steps.uncrowded(start, path, context)
-    return parts | {"to length": lambda: steps.to_length(path.clone(), path.dtype)}
+
+
+def count_operations(action: Callable[[], object]) -> int:
+    """Operations of torch that an action dispatches, those within others included."""
+    with torch.profiler.profile() as profile:
+        action()
+    return sum(event.count for event in profile.key_averages())
 
 
 def summarise(seconds: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Quartiles of each part in µs, and of what is left of a call in the same round."""
+    """Least and quartiles of each part in µs, and of what is left of a call in the same round."""
     rest = [2 * call - sum(values) for call, *values in zip(seconds[CALL], *seconds.values(), strict=True)]
     around = [call - network for call, network in zip(seconds[CALL], seconds[NETWORK], strict=True)]
     figures = {**seconds, "rest": rest, "all but the network": around}
-    return {name: [1e6 * value for value in statistics.quantiles(values)] for name, values in figures.items()}
+    return {
+        name: [1e6 * value for value in (min(values), *statistics.quantiles(values))]
+        for name, values in figures.items()
+    }
 
 
 def main() -> None:
@@ -75,7 +84,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=60)
     chosen = parser.parse_args()
     torch.set_num_threads(chosen.threads)
-    sys.stdout.write(f"{describe_machine(chosen.device, chosen.threads)}; µs, median (quartiles)\n")
+    sys.stdout.write(f"{describe_machine(chosen.device, chosen.threads)}; µs, least, median (quartiles)\n")
     found: dict[str, Any] = {}
     for name in chosen.models:
         emulator = Zoo.load(name).emulator.to(chosen.device)
@@ -83,9 +92,12 @@ def main() -> None:
         with torch.no_grad():
             parts = split_call(emulator, state, context)
             found[name] = summarise(time_alternating(parts, chosen.rounds, clock_for(chosen.device)))
-        sys.stdout.write(f"{name}, {state.position.shape[1]} particles\n")
-        for part, (low, middle, high) in found[name].items():
-            sys.stdout.write(f"  {part:<24}{middle:8.0f} ({low:.0f}-{high:.0f})\n")
+            around = count_operations(parts[CALL]) - count_operations(parts[NETWORK])
+        sys.stdout.write(
+            f"{name}, {state.position.shape[1]} particles; {around} operations of torch around its network\n"
+        )
+        for part, (least, low, middle, high) in found[name].items():
+            sys.stdout.write(f"  {part:<34}{least:8.0f}{middle:8.0f} ({low:.0f}-{high:.0f})\n")
     write_json(chosen.json, found)
 
 

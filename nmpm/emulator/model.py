@@ -25,10 +25,12 @@ from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.fused.plan import make_plan
+from nmpm.emulator.fused.views import Views
+from nmpm.emulator.outputs import with_output
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
-from nmpm.emulator.steps import steps_for
-from nmpm.emulator.windows import Coverage, Windows, choose_windows, find_in_windows, usable_memory
+from nmpm.emulator.steps import FusedSteps, steps_for
+from nmpm.emulator.windows import Windows
 from nmpm.emulator.windows.reads import check_reads
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -213,7 +215,8 @@ class Emulator(nn.Module):
         self.field_scales.warn_of_missing(particles)
         solid = self.solid(particles)
         surroundings = steps_for(self, self._plan, particles, solid).survey(solid)
-        return RolloutContext(solid, self.budget(particles), surroundings)
+        views = None if surroundings is None else Views()
+        return RolloutContext(solid, self.budget(particles), surroundings, views=views)
 
     def solid(self, particles: Particles) -> Tensor:
         """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
@@ -246,6 +249,8 @@ class Emulator(nn.Module):
         """The bundle, operation by operation; only the network is left to the runtime."""
         device = particles.position.device.type
         steps = steps_for(self, self._plan, particles, context.solid)
+        if isinstance(steps, FusedSteps) and not torch.compiler.is_compiling():
+            return steps.predict(self, particles, context)
         with _full_precision(device):
             cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
             normalised = self.normalise(state)
@@ -253,25 +258,14 @@ class Emulator(nn.Module):
                 normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
         own = particles
 
-        def find_path(coverage: Coverage | None) -> tuple[Departure, Tensor, Mapping[str, Tensor]]:
-            if coverage is None:
-                output = self.runtime.fields(self.processor, normalised, self.network_precision)
-                if memory is not None:
-                    memory.keep(output)
-            else:
-                output = coverage.predict(self.processor, normalised.to(self.network_precision))
-            readable = None if coverage is None else coverage.readable
+        def find_path(output: Tensor, readable: Tensor | None) -> tuple[Departure, Tensor, Mapping[str, Tensor]]:
             with _full_precision(device):
                 flows, scale = output[:, :, : self._flows], self.output_scale[:, : self._flows]
                 start = Departure(cells, velocity, gravity, own.material, own.mask, state, flows, scale, readable)
                 path = steps.path(start, context)
                 return start, path, self._evolve_fields(own, start, path, output) if self.scene.evolving else {}
 
-        windows = memory = None
-        if not (self.training or self.runtime.fixed_shapes):
-            memory = usable_memory(context.memory, self.windows, self.processor, self.recipe, state)
-            windows = choose_windows(self.windows, self.processor, self.recipe, state, memory)
-        start, path, evolved = find_in_windows(windows, find_path)
+        start, path, evolved = with_output(self, state, normalised, context, find_path)
         with _full_precision(device):
             precision = particles.position.dtype
             step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)

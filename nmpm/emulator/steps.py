@@ -20,7 +20,7 @@ from nmpm.particles import Particles
 from nmpm.transfer.backends import kernels_take
 
 if TYPE_CHECKING:
-    from nmpm.emulator.bundle import RolloutContext
+    from nmpm.emulator.bundle import Bundle, RolloutContext
     from nmpm.emulator.fused.surroundings import Surroundings
     from nmpm.emulator.model import Emulator
 
@@ -104,10 +104,16 @@ class FusedSteps(Steps):
     walls: Tensor
 
     def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
-        if torch.compiler.is_compiling() or not (self.plan.obstacles or self.plan.density_cap):
+        if torch.compiler.is_compiling():
             return None
         found: tuple[Surroundings, ...] = _kernels().survey_rollout(self.plan, solid, self.walls)
         return found
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        """The bundle of `emulator`, without operations of torch around the network; not in graphs being traced."""
+        from nmpm.emulator.fused.direct import predict
+
+        return predict(emulator, self.plan, particles, context)
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         own = particles

@@ -182,7 +182,7 @@ def test_padding_changes_nothing_to_the_bit_not_even_if_it_is_not_a_number():
 
 def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):
     scene = box(obstacles=True)
-    for name in ("path._CHUNK", "rasterise._CHUNK", "calls._CHUNK"):
+    for name in ("path._CHUNK", "rasterise._CHUNK", "batch._CHUNK"):
         monkeypatch.setattr(f"nmpm.emulator.fused.{name}", 256)
     emulator = emulator_of(scene, constraints=Constraints(energy=True, rest_speed=0.01)).requires_grad_(False)
     threads = torch.get_num_threads()

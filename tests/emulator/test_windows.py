@@ -144,7 +144,7 @@ def coverage_of(emulator, particles):
     chosen = []
     with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "nmpm.emulator.model.choose_windows", lambda *these: chosen.append(choose_windows(*these)) or chosen[-1]
+            "nmpm.emulator.outputs.choose_windows", lambda *these: chosen.append(choose_windows(*these)) or chosen[-1]
         )
         emulator(particles)
     return chosen[0] if chosen else None

@@ -9,12 +9,8 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.fused.views import as_array as as_array
 from nmpm.transfer.fused.fields import unpack_bfloat16, unpack_float32
-
-
-def as_array(tensor: Tensor) -> Any:
-    """The tensor's memory; a copy where it is not contiguous."""
-    return np.ascontiguousarray(tensor.detach().numpy())
 
 
 def as_copy(tensor: Tensor) -> Any:
@@ -22,12 +18,12 @@ def as_copy(tensor: Tensor) -> Any:
     return tensor.detach().clone(memory_format=torch.contiguous_format).numpy()
 
 
-def output_rows(output: Tensor) -> tuple[Any, Any]:
-    """A network's output as rows (B, size, m C), one per node, and the kernel that unpacks them."""
-    rows = output.detach().movedim((1, 2), (-2, -1)).flatten(-2).flatten(1, -2)
-    if output.dtype == torch.bfloat16:
-        return rows.contiguous().view(torch.uint16).numpy(), unpack_bfloat16
-    return rows.float().contiguous().numpy(), unpack_float32
+def output_arrays(output: Tensor) -> tuple[Any, Any]:
+    """A network's output (B, m, C, *S) as an array (B, m, C, size), and the kernel that unpacks it, of any strides."""
+    values = output.detach().flatten(3)
+    if output.dtype == torch.bfloat16:  # which Numpy lacks: as bits
+        return values.view(torch.uint16).numpy(), unpack_bfloat16
+    return values.float().numpy(), unpack_float32
 
 
 def material_rows(material: Tensor, materials: int) -> Any:

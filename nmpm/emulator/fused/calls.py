@@ -5,27 +5,20 @@ Shapes as in `nmpm.particles`; tensors are float32 on the CPU and carry no gradi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm._support.parallel import map_ranges, split
-from nmpm.emulator.fused.arrays import as_array, check_materials, material_rows, output_rows
-from nmpm.emulator.fused.crowd import CrowdArrays, spread_scene
-from nmpm.emulator.fused.flight import land
-from nmpm.emulator.fused.path import SceneArrays, check_scene_reads, clear_of_obstacles, fly_scene, rest_scene
-from nmpm.emulator.fused.plan import Plan
-from nmpm.emulator.fused.rasterise import rasterise_scene
+from nmpm.emulator.fused.arrays import as_array, material_rows
+from nmpm.emulator.fused.batch import Batch, fly_batch, land_batch, rasterise_batch, spread_batch
+from nmpm.emulator.fused.plan import Array, Plan
 from nmpm.emulator.fused.surroundings import Surroundings, survey, survey_rollout
 
 __all__ = ["predict_path", "rasterise", "survey", "survey_rollout", "to_length", "uncrowd"]
 
-_CHUNK = 2**14
+_NONE = np.empty(0, np.float32)
 
 
 def rasterise(
@@ -37,30 +30,17 @@ def rasterise(
         (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) grid state, whose
         channels lie next to each other in memory.
     """
-    batch, count, dim = position.shape
-    cells, moved = np.empty((2, batch, count, dim), np.float32)
-    pull = as_array(gravity) / plan.box[1]
-    channels = len(plan.mass) * (dim + 1) + plan.solid + dim * plan.constants
-    state = np.empty((batch, *plan.shape, channels), np.float32)
-    kinds, threads = material_rows(material, len(plan.mass)), torch.get_num_threads()
-    solids = as_array(solid).reshape(batch, solid.shape[1], state[0].size // channels)
-    inputs: tuple[Any, ...] = (
-        as_array(position),
-        as_array(velocity),
-        pull,
-        kinds,
-        as_array(mask),
-        solids,
-        cells,
-        moved,
+    kinds = material_rows(material, len(plan.mass))
+    found = rasterise_batch(
+        plan, as_array(position), as_array(velocity), as_array(gravity), kinds, as_array(mask), as_array(solid)
     )
-    rows = state.reshape(batch, solids.shape[2], channels)
-    for scene in range(batch):
-        first, speed, fall, kind, real, wall, here, own = (values[scene] for values in inputs)
-        rasterise_scene(plan, first, speed, fall, kind, real, wall, here, own, rows[scene], threads)
-    tensors = map(torch.from_numpy, (cells, moved, pull.reshape(batch, 1, dim), state))
-    positions, velocities, falls, grid = tensors
-    return positions, velocities, falls, grid.movedim(-1, 1)
+    cells, moved, pull = map(torch.from_numpy, (found.cells, found.velocity, found.gravity))
+    return cells, moved, pull.unsqueeze(1), to_grid(plan, found.state)
+
+
+def to_grid(plan: Plan, rows: Array) -> Tensor:
+    """Rows (B, size, C), one per node, as a tensor (B, C, *S) of the same memory."""
+    return torch.from_numpy(rows.reshape(len(rows), *plan.shape, rows.shape[2])).movedim(-1, 1)
 
 
 def predict_path(
@@ -76,28 +56,12 @@ def predict_path(
         UncoveredReadError: if a particle reads the output where it must not, see `Departure`.
         IndexError: if a particle's material is none of the scene's.
     """
-    batch, count, dim = cells.shape
-    frames, size = output.shape[1], math.prod(plan.shape)
-    path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
-    own, threads = material_rows(material, len(plan.mass)), torch.get_num_threads()
-    check_materials(plan, own)
-    rows = as_array(state.movedim(1, -1)).reshape(batch, size, state.shape[1])
-    factors, flows = as_array(scale).reshape(-1), np.empty((frames, size, output.shape[2]), np.float32)
-    predicted, unpack = output_rows(output)
+    rows = as_array(state.movedim(1, -1)).reshape(len(state), plan.size, state.shape[1])
+    kinds = material_rows(material, len(plan.mass))
+    start = Batch(as_array(cells), as_array(velocity), as_array(gravity)[:, 0], kinds, as_array(mask), rows)
     known = survey(plan, solid, walls) if surroundings is None else surroundings
-    inputs: tuple[Any, ...] = (as_array(cells), as_array(velocity), own, as_array(mask), as_array(gravity)[:, 0], rows)
-    for scene in range(batch):
-        unpack(predicted[scene], factors, flows)
-        here, speed, kind, real, fall, grid = (values[scene] for values in inputs)
-        start = SceneArrays(here, speed, kind, real, fall, grid, flows)
-        fly_scene(start, plan, None if budget is None else float(budget[scene]), path[scene], threads)
-        if readable is not None:
-            check_scene_reads(start, plan, as_array(readable[scene]).reshape(-1), path[scene], threads)
-        if plan.obstacles and plan.solids:
-            clear_of_obstacles(start, plan, known[scene], path[scene], threads)
-        if plan.rest_speed:
-            rest_scene(start, plan, known[scene].share, path[scene], threads)
-    return torch.from_numpy(path)
+    allowed, cells_read = (None if own is None else as_array(own) for own in (budget, readable))
+    return torch.from_numpy(fly_batch(plan, start, output, as_array(scale).reshape(-1), allowed, cells_read, known))
 
 
 def uncrowd(
@@ -109,18 +73,13 @@ def uncrowd(
     From a path (B, m, N, D) of `predict_path`, and by a plan with a density cap.
     """
     known = survey(plan, solid, walls) if surroundings is None else surroundings
-    own, threads = material_rows(material, len(plan.mass)), torch.get_num_threads()
-    spread = np.empty(path.shape, np.float32)
-    inputs: tuple[Any, ...] = (as_array(cells), own, as_array(mask), as_array(gravity)[:, 0], as_array(path))
-    for scene, around in enumerate(known):
-        arrays = CrowdArrays(*(values[scene] for values in inputs))
-        spread_scene(arrays, plan, around, None if budget is None else float(budget[scene]), spread[scene], threads)
-    return torch.from_numpy(spread)
+    kinds = material_rows(material, len(plan.mass))
+    start = Batch(as_array(cells), _NONE, as_array(gravity)[:, 0], kinds, as_array(mask), _NONE)
+    allowed = None if budget is None else as_array(budget)
+    return torch.from_numpy(spread_batch(plan, start, as_array(path), allowed, known))
 
 
 def to_length(plan: Plan, path: Tensor) -> Tensor:
-    """The path (B, m, N, D) in domain length, in its own memory: fresh memory would take longer than the conversion."""
-    for frames in path.numpy():
-        convert = partial(land, frames, plan.box)
-        map_ranges(convert, split(frames.shape[1], _CHUNK), torch.get_num_threads())
+    """The path (B, m, N, D) in domain length, in its own memory."""
+    land_batch(plan, path.numpy())
     return path

@@ -164,6 +164,27 @@ def weigh(material: Any, mask: Any, mass: Any, share: Any) -> Any:
 
 
 @jit
+def last_velocity(cells: Any, path: Any, box: Any, velocity: Any) -> Any:
+    """Fill in velocities (N, D) in domain length per frame from the last step of a path (m, N, D) from `cells`."""
+    frames = len(path)
+    last = path[frames - 1]
+    before = path[frames - 2] if frames > 1 else cells
+    for d in range(cells.shape[1]):
+        width = box[1, d]
+        for p in range(len(cells)):
+            velocity[p, d] = (last[p, d] - before[p, d]) * width
+
+
+@jit
+def first_excess(energies: Any, limit: Any) -> Any:
+    """Index of the first energy above the limit; their number where there is none."""
+    for frame in range(len(energies)):
+        if energies[frame] > limit:
+            return frame
+    return len(energies)
+
+
+@jit
 def land(path: Any, box: Any, low: Any, high: Any) -> Any:
     """Convert a path (m, N, D) to domain length in place.
 

@@ -1,6 +1,6 @@
 """The kernels as operators of torch, `torch.ops.nmpm.*`, which torch.compile and torch.export pass on as they are.
 
-They have no gradients and run on the CPU. Outside of such graphs `nmpm.emulator.fused.calls` is called directly, as
+They have no gradients and run on the CPU. Outside of such graphs `nmpm.emulator.fused.direct` calls the kernels, as
 torch's dispatcher takes as long as a kernel does on a small scene.
 """
 
@@ -71,8 +71,7 @@ def _uncrowd(plan: str, *tensors: Any) -> Tensor:
 def _fake_rasterise(plan: str, position: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     known = read_plan(plan)
     batch, dim = len(position), known.dim
-    channels = len(known.mass) * (dim + 1) + known.solid + dim * known.constants
-    state = position.new_empty(batch, *known.shape, channels).movedim(-1, 1)
+    state = position.new_empty(batch, *known.shape, known.channels).movedim(-1, 1)
     return torch.empty_like(position), torch.empty_like(tensors[0]), position.new_empty(batch, 1, dim), state
 
 

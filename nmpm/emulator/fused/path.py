@@ -11,10 +11,10 @@ import numpy as np
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
 from nmpm.emulator.fused import contact
-from nmpm.emulator.fused.flight import fly, leaves, weigh
+from nmpm.emulator.fused.flight import first_excess, fly, leaves, weigh
 from nmpm.emulator.fused.limit import propose, shorten
 from nmpm.emulator.fused.plan import Array, Plan
-from nmpm.emulator.fused.support import fill_drops, rest, support
+from nmpm.emulator.fused.support import rest, support
 from nmpm.emulator.fused.surroundings import Surroundings
 from nmpm.emulator.windows.reads import UncoveredReadError
 
@@ -52,9 +52,9 @@ def fly_scene(start: SceneArrays, plan: Plan, budget: float | None, path: Array,
     )  # fmt: skip
     energies = map_ranges(free, ranges, threads)
     if budget is not None and energies:
-        exceeds = sum(energies) > budget + ROUNDING * abs(budget)
-        if exceeds.any():
-            _limit(start, plan, budget, share, carried, int(exceeds.argmax()), path, threads)
+        first = first_excess(sum(energies[1:], energies[0]), budget + ROUNDING * abs(budget))
+        if first < len(path):
+            _limit(start, plan, budget, share, carried, first, path, threads)
 
 
 def _limit(
@@ -133,11 +133,9 @@ def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, thread
     """
     held, grid = np.empty(len(start.state), np.bool_), (plan.shape, plan.wraps)
     support(start.state, plan.volume_channels, share, start.gravity, grid, plan.floor_rows, held)
-    fall = np.empty((len(path), plan.dim), np.float32)
-    fill_drops(start.gravity, fall)
     speed = np.float32(plan.rest_speed)
     still = partial(
-        rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE), share, grid, held, fall, plan.limits
+        rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE), share, grid, held, plan.limits
     )  # fmt: skip
     map_ranges(still, split(len(start.cells), _CHUNK), threads)
 

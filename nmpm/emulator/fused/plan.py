@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -91,6 +92,16 @@ class Plan:
     def dim(self) -> int:
         """Number of axes."""
         return len(self.shape)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of cells."""
+        return math.prod(self.shape)
+
+    @cached_property
+    def channels(self) -> int:
+        """Number of channels of the grid state."""
+        return len(self.mass) * (self.dim + 1) + self.solid + self.dim * self.constants
 
     @property
     def trains(self) -> bool:

@@ -105,7 +105,6 @@ def rest(
     share: Any,
     grid: Any,
     held: Any,
-    drops: Any,
     bounds: Any,
     low: Any,
     high: Any,
@@ -123,15 +122,18 @@ def rest(
         share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
         grid: The tuple of shape and periodic axes.
         held: (size,) bool, from `support`.
-        drops: (m, D), from `fill_drops`.
         bounds: As for `flight.fly`.
         low: The first particle.
         high: The one after the last.
     """
-    frames, dim = path.shape[0], path.shape[1 + 1]
+    frames, dim = len(path), cells.shape[1]
+    drops, still = np.empty((frames, dim), np.float32), np.empty(high - low, np.bool_)
+    fill_drops(gravity, drops)
+    middle = path[max(frames // 2, 1) - 1, low:high]
+    _find_still(cells[low:high], middle, path[frames - 1, low:high], frames, gravity, speed, free_fall, still)
     place, value = np.empty((1, dim), np.float32), np.empty(1, np.float32)
     for p in range(low, high):
-        if not _is_still(cells, path, gravity, speed, free_fall, p):
+        if not still[p - low]:
             continue
         falls = not held[_node(cells, grid, p)]
         if falls and len(share) > 0:
@@ -148,21 +150,23 @@ def rest(
 
 
 @jit
-def _is_still(cells: Any, path: Any, gravity: Any, speed: Any, free_fall: Any, p: Any) -> Any:
-    """Whether a particle neither moves nor falls."""
-    frames, dim = path.shape[0], path.shape[1 + 1]
-    half = frames // 2
-    moved, gained, gravity_square = ZERO, ZERO, ZERO
-    for d in range(dim):
-        gravity_square += gravity[d] * gravity[d]
-        way = path[frames - 1, p, d] - cells[p, d]
-        moved += way * way
-        if frames > 1:
-            middle = path[half - 1, p, d]
-            late = (path[frames - 1, p, d] - middle) / np.float32(frames - half)
-            gained += (late - (middle - cells[p, d]) / np.float32(half)) * gravity[d]
-    falls = frames > 1 and gained > free_fall * np.float32(frames) * HALF * gravity_square
-    return np.sqrt(moved) < speed * np.float32(frames) and not falls
+def _find_still(
+    cells: Any, middle: Any, last: Any, frames: Any, gravity: Any, speed: Any, free_fall: Any, still: Any
+) -> Any:
+    """Fill in which particles neither move nor fall, from their places at a bundle's start, half-way and at its end."""
+    early = np.float32(max(frames // 2, 1))
+    late = np.float32(max(frames - frames // 2, 1))
+    furthest, square = speed * np.float32(frames), ZERO
+    for d in range(len(gravity)):
+        square += gravity[d] * gravity[d]
+    falling = free_fall * np.float32(frames) * HALF * square
+    for p in range(len(cells)):
+        moved, gained = ZERO, ZERO
+        for d in range(len(gravity)):
+            way = last[p, d] - cells[p, d]
+            moved += way * way
+            gained += ((last[p, d] - middle[p, d]) / late - (middle[p, d] - cells[p, d]) / early) * gravity[d]
+        still[p] = np.sqrt(moved) < furthest and not (frames > 1 and gained > falling)
 
 
 @jit

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from nmpm._support.parallel import for_each
 from nmpm.emulator.fused import calls
 from nmpm.emulator.fused.adjoint import fly_back, rasterise_back
-from nmpm.emulator.fused.arrays import as_array, as_copy, check_materials, material_rows, output_rows
+from nmpm.emulator.fused.arrays import as_array, as_copy, check_materials, material_rows, output_arrays
 from nmpm.emulator.fused.path import SceneArrays, fly_scene
 from nmpm.emulator.fused.plan import Plan
 
@@ -115,7 +115,7 @@ class _Starts:
         self.material = material_rows(material, len(plan.mass))
         rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
         self._arrays = as_array(cells), as_array(velocity), self.material, as_array(mask), as_array(gravity)[:, 0], rows
-        self._output, self._unpack = output_rows(output)
+        self._output, self._unpack = output_arrays(output)
         self._scale, self._shape = as_array(scale).reshape(-1), (output.shape[1], rows.shape[1], output.shape[2])
 
     def __getitem__(self, scene: int) -> SceneArrays:

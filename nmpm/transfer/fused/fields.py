@@ -16,33 +16,34 @@ def unpack_float32(output: Any, scale: Any, fields: Any) -> Any:
     """Fill in the fields.
 
     Args:
-        output: (size, m C) float32.
+        output: (m, C, size) float32, of any strides.
         scale: (m C,) factors.
         fields: (m, size, C), is filled.
     """
     channels = fields.shape[2]
-    for begin in range(0, len(output), _BLOCK):
-        end = min(begin + _BLOCK, len(output))
+    for begin in range(0, fields.shape[1], _BLOCK):
+        end = min(begin + _BLOCK, fields.shape[1])
         for frame in range(len(fields)):
-            for node in range(begin, end):
-                for c in range(channels):
-                    k = frame * channels + c
-                    fields[frame, node, c] = output[node, k] * scale[k]
+            for c in range(channels):
+                these, field = output[frame, c, begin:end], fields[frame, begin:end]
+                factor = scale[frame * channels + c]
+                for node in range(len(these)):
+                    field[node, c] = these[node] * factor
 
 
 @jit
 def unpack_bfloat16(output: Any, scale: Any, fields: Any) -> Any:
     """As `unpack_float32`, from the bits of bfloat16 numbers, uint16: the upper half of those of float32."""
-    width, channels = output.shape[1], fields.shape[2]
-    bits = np.empty(_BLOCK * width, np.uint32)
+    channels = fields.shape[2]
+    bits = np.empty(_BLOCK, np.uint32)
     values = bits.view(np.float32)
-    for begin in range(0, len(output), _BLOCK):
-        end = min(begin + _BLOCK, len(output))
-        for node in range(begin, end):
-            for k in range(width):
-                bits[(node - begin) * width + k] = np.uint32(output[node, k]) << np.uint32(16)
+    for begin in range(0, fields.shape[1], _BLOCK):
+        end = min(begin + _BLOCK, fields.shape[1])
         for frame in range(len(fields)):
-            for node in range(begin, end):
-                for c in range(channels):
-                    k = frame * channels + c
-                    fields[frame, node, c] = values[(node - begin) * width + k] * scale[k]
+            for c in range(channels):
+                these, field = output[frame, c, begin:end], fields[frame, begin:end]
+                factor = scale[frame * channels + c]
+                for node in range(len(these)):
+                    bits[node] = np.uint32(these[node]) << np.uint32(16)
+                for node in range(len(these)):
+                    field[node, c] = values[node] * factor

@@ -14,10 +14,11 @@ ZERO, ONE = np.float32(0), np.float32(1)
 @jit
 def to_cells(position: Any, velocity: Any, box: Any, cells: Any, moved: Any) -> Any:
     """Fill in positions and velocities (N, D) in cells, from those in domain length and the (2, D) `box`."""
-    for p in range(len(position)):
-        for d in range(position.shape[1]):
-            cells[p, d] = (position[p, d] - box[0, d]) / box[1, d]
-            moved[p, d] = velocity[p, d] / box[1, d]
+    for d in range(position.shape[1]):
+        lowest, width = box[0, d], box[1, d]
+        for p in range(len(position)):
+            cells[p, d] = (position[p, d] - lowest) / width
+            moved[p, d] = velocity[p, d] / width
 
 
 @jit
@@ -46,3 +47,24 @@ def fill_state(sums: Any, width: Any, particle_volume: Any, solid: Any, constant
             channel += 1
         for k in range(len(constants)):
             state[node, channel + k] = constants[k]
+
+
+@jit
+def normalise(state: Any, low: Any, high: Any, mean: Any, deviation: Any, out: Any) -> Any:
+    """Fill in what the network sees (size, C) of a grid state (size, C), as `Emulator.normalise`; NaN stays.
+
+    Args:
+        state: In grid units.
+        low: (C,), as are all statistics.
+        high: The range that values are clipped to.
+        mean: Is subtracted.
+        deviation: Is divided by.
+        out: Is filled.
+    """
+    for c in range(state.shape[1]):
+        least, most, middle, width = low[c], high[c], mean[c], deviation[c]
+        for node in range(len(state)):
+            value = state[node, c]
+            value = most if value > most else value
+            value = least if value < least else value
+            out[node, c] = (value - middle) / width
