@@ -87,14 +87,12 @@ def _models(names: list[str]) -> dict[str, Emulator]:
 
 def _measure(candidates: list[Candidate], scenes: Scenes, out: Path) -> list[Outcome]:
     from rich.console import Console
-    from rich.progress import Progress
 
-    from nmpm._support.progress import progress_columns
+    from nmpm._support.progress import terminal_progress
     from nmpm.evaluation.compare import compare, count_steps
     from nmpm.evaluation.trade import Store
 
-    console = Console(stderr=True)
-    with Progress(*progress_columns(), console=console, transient=True, refresh_per_second=1) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task("compare", total=count_steps(candidates, scenes))
         return compare(candidates, scenes, Store(out), lambda what: progress.update(task, advance=1, description=what))
 

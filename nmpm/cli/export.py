@@ -77,7 +77,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _export(chosen: argparse.Namespace, out: Path) -> None:
+    from rich.console import Console
+
     from nmpm._support.devices import find_device
+    from nmpm._support.progress import terminal_progress
     from nmpm.zoo import export, load_model
 
     model = load_model(chosen.model, root=chosen.root)
@@ -85,8 +88,11 @@ def _export(chosen: argparse.Namespace, out: Path) -> None:
     kinds: Mapping[str, type[Part]] = {kind.__name__: kind for kind in (export.Step, export.Network, export.Solid)}
     part = kinds[chosen.part](emulator).to(find_device(chosen.device))
     form = export.FORMATS[chosen.format]
-    form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
-    difference = form.difference(part, out, batch=1, count=300)
+    with terminal_progress(Console(stderr=True)) as progress:
+        task = progress.add_task(f"Writing {out.name}", total=2)
+        form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
+        progress.update(task, completed=1, description=f"Comparing {out.name} with the model")
+        difference = form.difference(part, out, batch=1, count=300)
     if not difference <= TOLERANCE:
         out.unlink()
         raise DataError(

@@ -121,9 +121,8 @@ def _family(model: Pretrained) -> str | None:
 def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
     """Predict, and write the two frames of the start and the prediction, with what is needed to draw them."""
     from rich.console import Console
-    from rich.progress import Progress
 
-    from nmpm._support.progress import progress_columns
+    from nmpm._support.progress import terminal_progress
     from nmpm.data.format import write_split
     from nmpm.data.predictions import predicted_trajectory
     from nmpm.emulator import Rollout, stream_rollout
@@ -132,7 +131,7 @@ def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> N
     count, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
     bundles = stream_rollout(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
     # On the CPU, as a device may have less memory than a long rollout needs.
-    with Progress(*progress_columns(), console=Console(stderr=True), transient=True) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         rollout = Rollout.join([bundle.cpu() for bundle in progress.track(bundles, count, description="rollout")])
     origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
     start = state.to("cpu")

@@ -151,13 +151,12 @@ def _show(name: str) -> None:
 def _preview(preset: Preset, seed: int, path: Path) -> None:
     import numpy as np
     from rich.console import Console
-    from rich.progress import Progress
 
-    from nmpm._support.progress import progress_columns
+    from nmpm._support.progress import terminal_progress
     from nmpm.sim.preset import BOUNDARY
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
-    with Progress(*progress_columns(), console=Console(stderr=True), transient=True) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
         trajectory = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
     moving, scene = trajectory.particle_type != BOUNDARY, preset.scene

@@ -96,14 +96,12 @@ def _subject(chosen: argparse.Namespace) -> Subject:
 
 def _run_groups(subject: Subject, size: Size, groups: list[str], quiet: bool) -> list[Line]:
     from rich.console import Console
-    from rich.progress import Progress
 
-    from nmpm._support.progress import progress_columns
+    from nmpm._support.progress import terminal_progress
     from nmpm.evaluation.stress import GROUPS, battery
 
     lines: list[Line] = []
-    console = Console(stderr=True)
-    with Progress(*progress_columns(), console=console, transient=True, disable=quiet) as progress:
+    with terminal_progress(Console(stderr=True, quiet=quiet)) as progress:
         task = progress.add_task("stress", total=len(groups))
         for name in groups:
             progress.update(task, description=name)

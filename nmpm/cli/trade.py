@@ -131,13 +131,11 @@ def _graph_folders(names: list[str]) -> dict[str, TrainedGraph]:
 
 def _measure(choices: list[Choice], scenes: Scenes, sweep: Sweep, out: Path, keep: bool) -> list[Point]:
     from rich.console import Console
-    from rich.progress import Progress
 
-    from nmpm._support.progress import progress_columns
+    from nmpm._support.progress import terminal_progress
     from nmpm.evaluation.trade import Store, count_steps, measure
 
-    console = Console(stderr=True)
-    with Progress(*progress_columns(), console=console, transient=True, refresh_per_second=1) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task("trade", total=count_steps(choices, scenes, sweep))
         return measure(
             choices, scenes, sweep, Store(out, keep),

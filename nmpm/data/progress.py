@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import Progress
 
-from nmpm._support.progress import progress_columns
+from nmpm._support.progress import lacks_widgets, progress_columns
 
 
 @contextmanager
@@ -20,6 +20,7 @@ def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Callab
         total: Number of steps; None where it is unknown.
         done: Steps that are done already.
     """
-    with Progress(*progress_columns(), console=Console(stderr=True)) as progress:
+    console = Console(stderr=True)
+    with Progress(*progress_columns(), console=console, disable=lacks_widgets(console)) as progress:
         task = progress.add_task(what, total=total, completed=done)
         yield lambda: progress.advance(task)
