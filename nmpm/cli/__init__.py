@@ -62,7 +62,9 @@ def usage() -> str:
     from nmpm._support.shipped import config_names
 
     lines = [f"  {name:<10} {summary}" for name, (_, summary) in COMMANDS.items()]
-    configs = textwrap.fill(", ".join(config_names()), 98, initial_indent="  ", subsequent_indent="  ")
+    configs = textwrap.fill(
+        ", ".join(config_names()), 98, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
+    )
     return USAGE.format(commands="\n".join(lines), configs=configs)
 
 

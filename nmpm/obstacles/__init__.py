@@ -1,7 +1,7 @@
 """Obstacles with parameters that gradients reach: a ramp's angle, a disc's radius, a polygon's corners.
 
 Each body knows its signed distance, from which `nmpm.emulator.bodies` rasterises it softly: as the share of each grid
-cell that is solid. So a loss on a rollout has gradients with respect to all of its parameters, sizes among them::
+cell that is solid. So a loss on a rollout has gradients with respect to all of its parameters, sizes among them:
 
     angle = torch.tensor(-0.4, requires_grad=True)
     state = model.state(position, bodies=[Ramp((0.5, 0.4), length=0.3, thickness=0.03, angle=angle)])
