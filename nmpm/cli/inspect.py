@@ -120,8 +120,8 @@ def _dataset_of(path: Path) -> Path:
         return path.parent
     Split(path)
     raise DataError(
-        f"{path}: its folder is not that of a dataset which it is a part of. To look at its trajectories, call nmpm"
-        f" view {path}, or nmpm render {path}."
+        f"{path}: it is not a split of a dataset, which are train.h5, valid.h5 and test.h5 beside a metadata.json. To"
+        f" look at its trajectories: nmpm view {path}, or nmpm render {path}."
     )
 
 
