@@ -12,7 +12,7 @@ from typing import Any
 from nmpm._support.atomic import atomic_write
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
-from nmpm.data.generate import SimulationRequest
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ZooError
 from nmpm.zoo.entries import load_entry, read_card
 from nmpm.zoo.index import refresh, write_card, write_index
