@@ -102,12 +102,12 @@ def _request(dataset: Dataset) -> tuple[str, SimulationRequest]:
 
 def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
     """The report of a test with the time, steps and curve of all trainings before it."""
-    parts = history.parts
+    stages = history.stages
     best = history.best() or history.trainings[-1]
-    until = parts[: parts.index(best) + 1]
+    until = stages[: stages.index(best) + 1]
     training = report["training"] | {
-        "steps": sum(part.steps() for part in until),
-        "seconds": round(sum(part.seconds() for part in until), 1),
+        "steps": sum(stage.steps() for stage in until),
+        "seconds": round(sum(stage.seconds() for stage in until), 1),
         "precision": best.precision(),
     }
     return report | {"training": training, "curve": history.curve()}

@@ -143,7 +143,7 @@ class History:
         return found
 
     @property
-    def before(self) -> Published | None:
+    def starting_entry(self) -> Published | None:
         """The entry that the first training goes on from, or would; None where it starts from random weights."""
         copy = Published.find(self.folder / COPY)
         if copy is not None or self.entry is None or self.dataset.start or self.trainings:
@@ -151,9 +151,10 @@ class History:
         return Published.find(self.entry)
 
     @property
-    def parts(self) -> list[Published | Training]:
-        """The entry before the trainings, where there is one, and the trainings."""
-        return [*([] if self.before is None else [self.before]), *self.trainings]
+    def stages(self) -> list[Published | Training]:
+        """The entry that the first training goes on from, where there is one, and the trainings."""
+        entry = self.starting_entry
+        return [*([] if entry is None else [entry]), *self.trainings]
 
     def best(self) -> Training | None:
         """The training of the lowest validation error; None before the first validation."""
@@ -165,27 +166,32 @@ class History:
         trainings = self.trainings
         if trainings and not trainings[-1].finished:
             return len(trainings)
-        return None if (trainings or self.before) and self.stops() else len(trainings) + 1
+        return None if (trainings or self.starting_entry) and self.stops() else len(trainings) + 1
 
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
         trainings, extension = self.trainings, self.extension
         if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.length(len(trainings) + 1) <= 0:
             return True
-        errors = [part.error() for part in self.parts]
+        errors = [stage.error() for stage in self.stages]
         return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
 
     def length(self, number: int) -> float:
         """Hours of the training of that number: what the dataset still lacks, else those of an extension."""
-        if number > 1:
-            return self.extension.hours
-        done = 0.0 if self.before is None else self.before.seconds() / 3600
-        return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
+        return self.extension.hours if number > 1 else self._first_length(self._hours_of_entry())
 
     def planned_hours(self, count: int) -> float:
-        """Hours of so many trainings, and of the entry before them."""
-        before = 0.0 if self.before is None else self.before.seconds() / 3600
-        return before + sum(self.length(number) for number in range(1, count + 1))
+        """Hours of so many trainings, at least one, and of the entry that the first one goes on from."""
+        done = self._hours_of_entry()
+        return done + self._first_length(done) + (count - 1) * self.extension.hours
+
+    def _hours_of_entry(self) -> float:
+        entry = self.starting_entry
+        return 0.0 if entry is None else entry.seconds() / 3600
+
+    def _first_length(self, done: float) -> float:
+        """Hours of the first training, after so many hours of the entry that it goes on from."""
+        return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
 
     def open(self, number: int) -> Training:
         """The training of that number, started if it has not been."""
@@ -202,11 +208,11 @@ class History:
 
     def _weights(self) -> Path | None:
         """What the next training starts from: the best weights so far; None for random ones."""
-        best, before = self.best(), self.before
-        if before is not None and before.folder != self.folder / COPY:
-            before = before.copy_to(self.folder / COPY)
-        if before is not None and (best is None or before.error() <= best.error()):
-            return before.folder
+        best, entry = self.best(), self.starting_entry
+        if entry is not None and entry.folder != self.folder / COPY:
+            entry = entry.copy_to(self.folder / COPY)
+        if entry is not None and (best is None or entry.error() <= best.error()):
+            return entry.folder
         if best is None and self.dataset.start and not self.trainings:
             best = self._origin().best()
         return None if best is None else best.best
@@ -237,7 +243,7 @@ class History:
         """Seconds, steps and validation MSE over all trainings, one after the other."""
         points: list[list[float]] = []
         seconds, steps = 0.0, 0
-        for part in self.parts:
-            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in part.curve()]
-            seconds, steps = seconds + part.seconds(), steps + part.steps()
+        for stage in self.stages:
+            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in stage.curve()]
+            seconds, steps = seconds + stage.seconds(), steps + stage.steps()
         return points
