@@ -13,6 +13,7 @@ from types import MappingProxyType
 import torch
 import yaml
 
+from nmpm._support.messages import counted
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.evaluation.gns import TrainedGraph
@@ -222,7 +223,7 @@ def _with_substeps(preset: Preset, substeps: int) -> Preset | None:
 
 def _simulator_name(factor: int, substeps: int) -> str:
     coarse = "" if factor == 1 else f"1/{factor} resolution, "
-    return f"simulator, {coarse}{substeps} substep{'s' * (substeps > 1)}"
+    return f"simulator, {coarse}{counted(substeps, 'substep')}"
 
 
 def _simulator_settings(factor: int, substeps: int) -> dict[str, str | int | float]:
@@ -253,7 +254,7 @@ def _models(settings: ModelSettings, name: str, emulator: Emulator, device: torc
                 f"{cells:g} × cells": cells != 1,
                 runtime: runtime != settings.runtime[0],
                 f"batch {batch}": batch != 1,
-                f"{threads} threads": threads != settings.threads[0],
+                counted(threads, "thread"): threads != settings.threads[0],
             }
             yield ModelChoice(
                 name=", ".join([name, *(part for part, shown in parts.items() if shown)]),
