@@ -45,9 +45,9 @@ class EmulatorCLI(LightningCLI):
     """Links what the model needs from the data and the other way round, and ends a fit with a test.
 
     Args:
-        words: The command as the user gave it.
-        locks: Takes the descriptor of the run folder's lock. (Callbacks that copy the module copy this object too, so
-            it must not hold what cannot be copied.)
+        words: The command line as the user gave it.
+        locks: A list that the descriptor of the run folder's lock is appended to. (Callbacks that copy the module copy
+            this object too, so it must not hold what cannot be copied.)
         options: Of LightningCLI.
     """
 
@@ -76,7 +76,7 @@ class EmulatorCLI(LightningCLI):
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
     def _model_scene(self, scene: Scene) -> Scene:
-        """The data's scene; with the fields of the checkpoint that is to be judged, which the data may lack."""
+        """The data's scene, with fields of the checkpoint under evaluation that the data lack."""
         config = self.config[self.subcommand]
         if self.subcommand == "fit" or not config["ckpt_path"]:
             return scene
@@ -91,7 +91,7 @@ class EmulatorCLI(LightningCLI):
         """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder.
 
         Raises:
-            ConfigError: if a model that was not trained is to be judged, or the learning rate is not positive.
+            ConfigError: if an untrained model would be evaluated, or the learning rate is not positive.
         """
         config = self.config[self.subcommand]
         config["weights_only"] = True
@@ -148,7 +148,7 @@ class EmulatorCLI(LightningCLI):
         return Path(config["dirpath"]) / f"{config['filename']}{ModelCheckpoint.FILE_EXTENSION}"
 
     def before_fit(self) -> None:
-        """Refuse, before data are simulated, what cannot be trained, and lock the run's folder.
+        """Check, before data are simulated, that the training can run, and lock the run's folder.
 
         Raises:
             ConfigError: if the training has no end, another process trains in the folder, it holds a run that is not

@@ -183,7 +183,7 @@ def _simulate_part(
         if interrupted.is_set():
             raise CancelledError
 
-    run = simulate_first_stable(request.preset, request.place(split, index), stop_if_interrupted)
+    run = simulate_first_stable(request.preset, request.entropy(split, index), stop_if_interrupted)
     write_part(part_path(folder, split, index), run)
 
 
@@ -203,8 +203,8 @@ def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[st
     for split in request.splits:
         stored = Split(folder / f"{split}.h5")
         for index in range(len(stored)):
-            place, seed = request.place(split, index), int(stored.attributes(index)["seed"])
-            draw = next(draw for draw in range(DRAWS) if seed_of_draw(place, draw) == seed)
+            entropy, seed = request.entropy(split, index), int(stored.attributes(index)["seed"])
+            draw = next(draw for draw in range(DRAWS) if seed_of_draw(entropy, draw) == seed)
             if draw:
                 found.setdefault(split, {})[str(index)] = draw
     return found

@@ -1,4 +1,4 @@
-"""What is asked of a simulated dataset: its scenes, how many, and the seeds of all trajectories."""
+"""The request for a simulated dataset: its preset, the numbers of trajectories, and the seed of each."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class SimulationRequest:
         counts = {split: self.counts[split] for split in SPLITS}
         return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": self.preset.revision}
 
-    def place(self, split: str, index: int) -> tuple[int, int, int]:
-        """What the seeds of one trajectory are derived from; independent of the counts."""
+    def entropy(self, split: str, index: int) -> tuple[int, int, int]:
+        """The numbers that the seeds of a trajectory are derived from; independent of the counts."""
         return self.seed, SPLITS.index(split), index
 
     def trajectory_seed(self, split: str, index: int) -> int:
         """Seed of one trajectory."""
-        return seed_of_draw(self.place(split, index), self.redrawn.get(split, {}).get(str(index), 0))
+        return seed_of_draw(self.entropy(split, index), self.redrawn.get(split, {}).get(str(index), 0))
 
     def check_same(self, stored: object, folder: Path) -> None:
         """Compare it with the request that a folder's data were simulated by, as read from its JSON.

@@ -1,4 +1,4 @@
-"""The table of all models of a zoo, and entries brought up to date with the code that writes cards."""
+"""Writes the table of a zoo's models, and rewrites cards, READMEs and charts of its entries."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_index(root: Path) -> Path:
 
 
 def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None, failures: str | None = None) -> None:
-    """Write again what is derived from an entry's card and weights: lifecycle, README and chart.
+    """Rewrite what is derived from an entry's card and weights: lifecycle, README and chart.
 
     A golden rollout is added where the card has none; one that there is stays, as it would hide a change. The card is
     written after each measure.

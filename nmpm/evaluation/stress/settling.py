@@ -1,4 +1,4 @@
-"""Settling: from ordinary starts to well past rest, does the material stand as high as in the simulator?"""
+"""Settling: the shape of the material once it is at rest, beside the simulator's from the same initial states."""
 
 from __future__ import annotations
 

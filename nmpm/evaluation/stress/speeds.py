@@ -50,7 +50,7 @@ def _line(subject: Subject, name: str, window: Window) -> Line:
 
 
 def _changed_window(subject: Subject, size: Size, *, speed: float = 1.0, gravity: float = 1.0) -> Window:
-    """Scenes with initial speeds and gravity times a factor: simulated, or else two frames without a truth."""
+    """Scenes with initial speeds and gravity times a factor: simulated, or two frames and nothing to compare with."""
     if subject.preset is not None:
         with suppress(UnstableError):
             changed = subject.preset.varied(speed=speed, gravity=gravity)

@@ -37,13 +37,13 @@ POOLS: Mapping[str, Callable[[Point], bool]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a point stands in one error.
+    """A point's mean error with its interval, and its membership in the Pareto set.
 
     Args:
         mean: Over scenes.
         low, high: Bootstrap interval of 95%.
         member: Whether it is in the Pareto set: of one scene at a time if its batch is 1, else of all choices.
-        probability: Of that, under resampling of the scenes.
+        probability: Share of resamples of the scenes in which it is a member.
     """
 
     mean: float
@@ -74,7 +74,7 @@ def describe_measure(name: str) -> str:
 
 
 def standings(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str, Standing]:
-    """Where each point stands that has the error in all scenes, by name."""
+    """The standing of each point that has the error in all scenes, by name."""
     known = [point for point in points if math.isfinite(point.mean(measure))]
     if not known:
         return {}

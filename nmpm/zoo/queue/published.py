@@ -1,4 +1,4 @@
-"""What an entry of the zoo brings into further trainings of its dataset: its weights, and what they took."""
+"""Entries of the zoo that further trainings start from: weights, validation curve, hours and steps of training."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Published:
         return entry if entry.curve() else None
 
     def copy_to(self, folder: Path) -> Published:
-        """Copy it, so that a later entry in its place does not change what trainings started from."""
+        """Copy the entry, so that trainings keep their starting point when the zoo's entry is replaced."""
         part = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)
         shutil.copytree(self.folder, part)
@@ -51,9 +51,9 @@ class Published:
         return min(float(point[2]) for point in self.curve())
 
     def seconds(self) -> float:
-        """Of training."""
+        """Seconds of training."""
         return float(self.card.get("training", {}).get("seconds", 0.0))
 
     def steps(self) -> int:
-        """Of training."""
+        """Steps of training."""
         return int(self.card.get("training", {}).get("steps", 0))

@@ -1,4 +1,4 @@
-"""How far the trainings of a dataset are, read from their folders alone, so that a process may die at any time."""
+"""Progress of the trainings of a dataset, read from their folders alone: a process may be killed at any time."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Training:
         return self.folder / BEST
 
     def start(self, words: list[str]) -> None:
-        """Write down its command and its configuration, which later changes of the shipped one do not touch."""
+        """Write its command, and a copy of its configuration, so that changes of the shipped one do not reach it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(find_config(words[words.index("--config") + 1]), self.folder / CONFIG)
         with atomic_write(self.folder / WORDS) as part:
@@ -82,17 +82,17 @@ class Training:
         return min((point[2] for point in self.curve()), default=float("inf"))
 
     def seconds(self) -> float:
-        """Of training so far, as of its last checkpoint."""
+        """Seconds of training so far, as of its last checkpoint."""
         record = self._record()
         return float(record.get("training", record).get("seconds", record.get("trained_seconds", 0.0)))
 
     def steps(self) -> int:
-        """Of training so far, as of its last checkpoint."""
+        """Steps of training so far, as of its last checkpoint."""
         record = self._record()
         return int(record.get("training", record).get("steps", record.get("trained_steps", 0)))
 
     def precision(self) -> str:
-        """Of the training, as its command or else its configuration states it."""
+        """Precision of the training, as its command or else its configuration states it."""
         words = self._words()
         if "--trainer.precision" in words:
             return words[words.index("--trainer.precision") + 1]
@@ -144,7 +144,7 @@ class History:
 
     @property
     def starting_entry(self) -> Published | None:
-        """The entry that the first training goes on from, or would; None where it starts from random weights."""
+        """The entry that the first training goes on from; None where it starts from random weights."""
         copy = Published.find(self.folder / COPY)
         if copy is not None or self.entry is None or self.dataset.start or self.trainings:
             return copy
@@ -218,7 +218,7 @@ class History:
         return None if best is None else best.best
 
     def waits_for(self) -> str:
-        """What must be there before the first training, in words; empty where nothing is missing."""
+        """What the first training waits for, in words: data or another training; empty where nothing is missing."""
         if self.dataset.lacks_data:
             return f"--data {self.dataset.name}=FOLDER"
         origin = self._origin().trainings
