@@ -30,7 +30,7 @@ class Subject:
         emulator: In evaluation mode, on the device that the battery runs on.
         horizon: Frames that its training unrolled.
         preset: The simulator of its training data; None where they were recorded.
-        seed: Decides the scenes.
+        seed: Of the scenes.
     """
 
     name: str

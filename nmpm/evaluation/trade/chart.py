@@ -86,7 +86,7 @@ def _draw_points(axes: Any, points: Sequence[Point], where: Mapping[str, Standin
 
 
 def _draw_exact(axes: Any, point: Point) -> Any:
-    """A vertical line, as an error of 0 is nowhere on a logarithmic axis; returns its text."""
+    """A vertical line, as a logarithmic axis has no place for an error of 0; returns its text."""
     colour = _MARKERS[point.kind]["color"]
     axes.axvline(point.milliseconds, color=colour, lw=1)
     return axes.annotate(

@@ -20,7 +20,7 @@ class Published:
 
     Args:
         folder: With its card, configuration and weights.
-        card: What the card says.
+        card: The content of its card.
     """
 
     folder: Path

@@ -52,7 +52,7 @@ class Training:
             part.write_text(json.dumps(words, indent=1), encoding="utf-8")
 
     def command(self) -> list[str]:
-        """The words of `nmpm fit` that start it or go on with it."""
+        """The arguments of `nmpm` that start it or go on with it."""
         words = [*self._words(), "--trainer.default_root_dir", str(self.folder)]
         if (self.folder / LAST).is_file():
             return [*words, "--ckpt_path", "last"]
@@ -61,7 +61,7 @@ class Training:
         return words
 
     def test_command(self, folder: Path) -> list[str]:
-        """The words of `nmpm test` for the best weights, a copy of which lies in another folder.
+        """The arguments of `nmpm` that test the best weights, of which another folder has a copy.
 
         In float32, as `Zoo.load` runs them.
         """
