@@ -27,9 +27,9 @@ from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
+from nmpm.training.compatibility import check_same_recipe
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.parts import check_same_recipe
 from nmpm.training.run_folder import RunFolder
 from nmpm.zoo.registry import load_model
 

@@ -251,7 +251,7 @@ def test_hours_of_the_entry_count_and_its_error_is_to_be_improved(tmp_path, seco
     history = History(Dataset("small", "goop.yaml", 2.0), folder, Extension(hours=1.0, gain=0.03, limit=4.0), entry)
     assert history.next_round() == following
     if hours is not None:
-        assert history.length(len(errors) + 1) == hours
+        assert history.hours_of(len(errors) + 1) == hours
 
 
 def test_planned_hours_read_the_card_of_the_entry_once(tmp_path, monkeypatch):

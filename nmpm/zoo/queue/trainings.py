@@ -171,25 +171,25 @@ class History:
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
         trainings, extension = self.trainings, self.extension
-        if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.length(len(trainings) + 1) <= 0:
+        if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.hours_of(len(trainings) + 1) <= 0:
             return True
         errors = [stage.error() for stage in self.stages]
         return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
 
-    def length(self, number: int) -> float:
+    def hours_of(self, number: int) -> float:
         """Hours of the training of that number: what the dataset still lacks, else those of an extension."""
-        return self.extension.hours if number > 1 else self._first_length(self._hours_of_entry())
+        return self.extension.hours if number > 1 else self._hours_of_first(self._hours_of_entry())
 
     def planned_hours(self, count: int) -> float:
         """Hours of so many trainings, at least one, and of the entry that the first one goes on from."""
         done = self._hours_of_entry()
-        return done + self._first_length(done) + (count - 1) * self.extension.hours
+        return done + self._hours_of_first(done) + (count - 1) * self.extension.hours
 
     def _hours_of_entry(self) -> float:
         entry = self.starting_entry
         return 0.0 if entry is None else entry.seconds() / 3600
 
-    def _first_length(self, done: float) -> float:
+    def _hours_of_first(self, done: float) -> float:
         """Hours of the first training, after so many hours of the entry that it goes on from."""
         return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
 
@@ -198,7 +198,7 @@ class History:
         trainings = self.trainings
         if number <= len(trainings):
             return trainings[number - 1]
-        training, hours, weights = Training(self.folder / str(number)), self.length(number), self._weights()
+        training, hours, weights = Training(self.folder / str(number)), self.hours_of(number), self._weights()
         training.start(
             new_training(self.dataset)
             if weights is None
@@ -234,7 +234,7 @@ class History:
         count = max(len(trainings), 1)
         finished = trainings[-1].finished if trainings else self.next_round() is None
         done = trainings[-1].seconds() / 3600 if trainings else 0.0
-        left = 0.0 if finished else max(self.length(count) - done, 0.0)
+        left = 0.0 if finished else max(self.hours_of(count) - done, 0.0)
         if self.next_round() is None or extension.hours <= 0:
             return left, left
         return left, left + max(extension.limit - self.planned_hours(count), 0.0)
