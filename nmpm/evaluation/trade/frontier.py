@@ -32,7 +32,7 @@ POOLS: Mapping[str, Callable[[Point], bool]] = MappingProxyType(
         "no simulator": lambda point: point.kind is not Kind.SIMULATOR,
     }
 )
-"""What a user has to choose from, by name: where data were recorded there is no simulator."""
+"""Which points a user can choose from, by name: recorded data come without a simulator."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class Standing:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to run from a budget on, up to that of the next advice.
+    """What to run for budgets from `milliseconds` up to that of the next advice.
 
     Args:
         milliseconds: Smallest budget per frame for which it holds.
-        name: The choice; empty where nothing is fast enough.
-        sentence: It in words.
+        name: Name of the choice; empty where nothing is fast enough.
+        sentence: The advice in words.
     """
 
     milliseconds: float

@@ -37,15 +37,15 @@ from nmpm.sim.config import from_section, section_entries
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """Settings of every model, all combinations of them.
+    """Settings of every model; all combinations of them are measured.
 
     Args:
-        precision: Of the network, see `models.PRECISIONS`.
+        precision: Precisions of the network, see `models.PRECISIONS`.
         constraints: "held" and "free", see `models.CONSTRAINTS`.
-        cells: Times as many grid cells along each axis as in training.
+        cells: Factors on the number of grid cells along each axis, relative to training.
         runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
-        batch: Scenes at once.
-        threads: Of torch.
+        batch: Batch sizes, in scenes.
+        threads: Numbers of torch's threads.
     """
 
     precision: tuple[str, ...] = ("float32", "bfloat16")
@@ -61,7 +61,7 @@ class SimulatorSettings:
     """Settings of the simulator.
 
     Args:
-        coarser: Times as wide cells (SPH: particles); 1 is as shipped.
+        coarser: Factors on the width of cells (SPH: on the spacing of particles); 1 is as shipped.
         substeps: Shares of the shipped number of substeps, which a coarser simulation divides by its factor. Those that
             turn out unstable are reported as such; `Preset.stable_substeps` is measured too.
     """
@@ -72,11 +72,11 @@ class SimulatorSettings:
 
 @dataclass(frozen=True)
 class Floors:
-    """What accuracy means at best.
+    """Limits of accuracy: errors of the simulator compared with itself.
 
     Args:
         nudge: Noise on the initial positions, as a share of the domain's longest side; 0 for none.
-        twin: The simulator with so large a share of its substeps; 0 for none.
+        twin: Share of the simulator's substeps that its twin takes; 0 for no twin.
     """
 
     nudge: float = 1e-6
@@ -145,8 +145,8 @@ def read_sweep(text: str, where: str) -> Sweep:
     """The sweep of a YAML text; what it leaves out is as shipped.
 
     Args:
-        text: Of the file.
-        where: Its name, for errors.
+        text: Content of the file.
+        where: Name of the file, for errors.
 
     Raises:
         ConfigError: naming the key that is unknown or wrong.
