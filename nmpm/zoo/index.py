@@ -50,9 +50,8 @@ def write_index(root: Path) -> Path:
 def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None, failures: str | None = None) -> None:
     """Rewrite what is derived from an entry's card and weights: lifecycle, README and chart.
 
-    A golden rollout is added where the card has none; an existing one is kept, as replacing it would hide a
-    change of the results. The card is
-    written after each measure.
+    A golden rollout is added where the card has none; an existing one is kept, as replacing it would hide a change
+    of the results. The card is written after each measure.
 
     Args:
         folder: Of the entry.

@@ -40,8 +40,8 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
     """The simulator of the scenes, if it is known, and its twin; the models; the trivial predictors.
 
     A model of other scenes is rebuilt over these, with grid cells of the size it was trained with, see
-    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: its error
-    is an estimate of the simulator's own.
+    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: its error is
+    an estimate of the simulator's own.
 
     Args:
         scenes: What is predicted.
