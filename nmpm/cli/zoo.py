@@ -153,7 +153,7 @@ def _verify(chosen: argparse.Namespace) -> int:
 def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ConfigError
-    from nmpm.zoo.index import refresh, state_failures, write_index
+    from nmpm.zoo.index import refresh, write_index
     from nmpm.zoo.registry import Zoo
 
     if chosen.data is not None and chosen.name is None:
@@ -162,9 +162,7 @@ def _refresh(chosen: argparse.Namespace) -> None:
         raise ConfigError("--failures is about one model: give the model's NAME too.")
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
-        if chosen.failures is not None:
-            state_failures(Zoo.folder(name, root), chosen.failures)
-        refresh(Zoo.folder(name, root), chosen.measure, chosen.data)
+        refresh(Zoo.folder(name, root), chosen.measure, chosen.data, chosen.failures)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from nmpm._support.messages import suggestion
 from nmpm.data.catalog import catalog, dataset_folder, describe, ensure, find_simulated
-from nmpm.data.generate import SimulationRequest, generate
+from nmpm.data.generate import generate
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError
 from nmpm.evaluation.trade.scenes import Scenes, read_scenes
 from nmpm.sim import load_preset
