@@ -20,6 +20,7 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.profilers import SimpleProfiler
 
+from nmpm._support.messages import counted
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.processors import UNet
 from nmpm.training import EmulatorModule
@@ -107,7 +108,8 @@ def main() -> None:
         sources = [{"path": arguments.path, "family": arguments.family, "gravity": arguments.gravity}]
     else:
         sources = [{"name": arguments.name}, {"name": arguments.name, "source": "simulate"}]
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
+    processor = f"CPU, {counted(torch.get_num_threads(), 'thread')}"
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else processor
     rows = [measure(TrajectoryDataModule(**source, **common), arguments.steps) for source in sources]
     sys.stdout.write(f"{device}; batch {BATCH}, {FRAMES} x {UNROLL} frames, {arguments.steps} steps\n")
     for row in rows:

@@ -21,6 +21,7 @@ import torch
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import DEVICES, find_device
+from nmpm._support.messages import counted
 from nmpm.errors import ConfigError
 from nmpm.evaluation.machine import Action, Clock, describe_device, peak_bytes, wall_clock
 
@@ -181,7 +182,7 @@ def measure_limits(device: torch.device, threads: int) -> dict[str, float]:
 
 def describe_machine(device: torch.device, threads: int) -> str:
     """Processor or GPU, threads, and torch's version."""
-    parts = [describe_device(device), *([f"{threads} threads"] if device.type == "cpu" else [])]
+    parts = [describe_device(device), *([counted(threads, "thread")] if device.type == "cpu" else [])]
     return ", ".join([*parts, f"torch {torch.__version__}"])
 
 

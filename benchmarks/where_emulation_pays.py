@@ -38,6 +38,7 @@ from rolling import roll_to_end
 from timing import Spread, clock_for, make_parser, time_alternating, write_json
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.messages import counted
 from nmpm._support.shipped import find_config
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
@@ -231,7 +232,7 @@ def draw(axes: Axes, name: str, cases: Sequence[Case]) -> None:
     for substeps in (1, 10, 100):
         times = [1e3 * substeps * case.substep.median for case in cases]
         axes.plot(counts, times, "--", color="0.6", linewidth=1)
-        axes.annotate(f"{substeps} substep{'s' * (substeps > 1)}", (counts[-1], times[-1]), fontsize=7, ha="right")
+        axes.annotate(counted(substeps, "substep"), (counts[-1], times[-1]), fontsize=7, ha="right")
     shipped = [1e3 * case.substeps * case.substep.median for case in cases]
     axes.plot(counts, shipped, "s-", label=f"simulator, {cases[0].substeps} substeps")
     axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ms per frame", title=f"{name}: {cases[0].solver}")

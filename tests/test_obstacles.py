@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
-from nmpm.obstacles import Disc, Polygon, Ramp
+from nmpm.obstacles import Box, Disc, Polygon, Ramp, Sphere
 from nmpm.sim.mpm.ramps import Ramp as SimulatedRamp
 
 SQUARE = [(0.2, 0.3), (0.6, 0.3), (0.6, 0.5), (0.2, 0.5)]
@@ -150,9 +150,52 @@ def test_particles_of_a_polygon_follow_every_affine_motion_of_its_corners():
     torch.testing.assert_close(moved, particles @ motion + 1.0)
 
 
+def test_spheres_have_one_particle_per_spacing_cubed_and_no_particle_outside():
+    centre = torch.tensor([0.5, 0.4, 0.6], dtype=torch.float64)
+    particles = Sphere(centre, 0.1).particles(0.01)
+    distance = (particles - centre).norm(dim=-1)
+    assert len(particles) == round(4 / 3 * math.pi * 1000)
+    assert distance.max() < 0.1
+    assert (distance < 0.05).sum() == pytest.approx(len(particles) / 8, rel=0.01)
+    torch.testing.assert_close(particles.mean(0), centre, atol=1e-3, rtol=0)
+    assert torch.cdist(particles, particles).fill_diagonal_(1).amin() > 0.003
+
+
+def test_boxes_are_filled_with_a_lattice_that_turns_with_them():
+    turn = (0.0, 0.0, math.pi / 2)
+    flat, turned = (Box((0.5, 0.4, 0.6), (0.2, 0.1, 0.06), each).particles(0.02) for each in ((0.0, 0.0, 0.0), turn))
+    assert len(flat) == 10 * 5 * 3
+    assert (flat.amax(0) - flat.amin(0)).tolist() == pytest.approx([0.18, 0.08, 0.04])
+    assert (turned.amax(0) - turned.amin(0)).tolist() == pytest.approx([0.08, 0.18, 0.04])
+
+
+def test_distances_from_a_box_turned_about_one_axis_are_those_from_the_ramp_of_its_section():
+    points = torch.rand(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    tall = Box((0.5, 0.4, 0.5), (0.3, 0.1, 20.0), (0.0, 0.0, 0.7))
+    torch.testing.assert_close(tall.distance(points), Ramp((0.5, 0.4), 0.3, 0.1, 0.7).distance(points[:, :2]))
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters"),
+    [
+        (lambda *given: Box(given[:3], given[3:6], given[6:]), (0.5, 0.4, 0.6, 0.3, 0.2, 0.1, 0.4, -0.3, 0.0)),
+        (lambda *given: Sphere(given[:3], given[3]), (0.5, 0.4, 0.6, 0.21)),
+    ],
+)
+def test_gradients_in_space_are_those_of_finite_differences(make, parameters):
+    points = torch.rand(100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    values = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in parameters]
+    assert torch.autograd.gradcheck(lambda *given: make(*given).distance(points), values)
+    assert torch.autograd.gradcheck(lambda *given: make(*given).particles(0.067), values)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Sphere((0.5, 0.5), 0.1).distance(torch.zeros(1, 3)), "centre = .*three numbers"),
+        (lambda: Sphere((0.5, 0.5, 0.5), 0.0).distance(torch.zeros(1, 3)), "radius = 0"),
+        (lambda: Box((0.5, 0.5, 0.5), (0.1, -0.1, 0.1)).distance(torch.zeros(1, 3)), "side = -0.1"),
+        (lambda: Box((0.5, 0.5, 0.5), (0.1, 0.1, 0.1), (math.nan, 0.0, 0.0)).particles(0.1), "rotation = .*finite"),
         (lambda: Disc((0.5, 0.5), 0.0).particles(0.01), "radius = 0"),
         (lambda: Ramp((0.5, 0.5), float("nan"), 0.1, 0.0).particles(0.01), "side = nan"),
         (lambda: Disc((0.5, 0.5), 0.1).particles(0.0), "spacing = 0"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from nmpm._support.messages import one_line
+from nmpm._support.messages import counted, one_line
 from nmpm.errors import ConfigError
 
 DEVICES = ("auto", "cpu", "cuda", "mps")
@@ -45,8 +45,13 @@ def device_name(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "cpu":
-        return f"{processor_name()}, {torch.get_num_threads()} threads"
+        return f"{processor_name()}, {counted(torch.get_num_threads(), 'thread')}"
     return device.type
+
+
+def same_hardware(one: str, other: str) -> bool:
+    """Whether two results of `device_name` name the same; earlier versions of it wrote "1 threads"."""
+    return one.replace(", 1 threads", ", 1 thread") == other.replace(", 1 threads", ", 1 thread")
 
 
 def processor_name() -> str:

@@ -1,4 +1,4 @@
-"""Text for error messages."""
+"""Text for messages and tables."""
 
 from __future__ import annotations
 
@@ -10,6 +10,11 @@ def one_line(text: object, limit: int = 200) -> str:
     """The text without line breaks, cut to `limit` characters."""
     joined = " ".join(str(text).split())
     return joined if len(joined) <= limit else f"{joined[: limit - 1]}…"
+
+
+def counted(count: int, noun: str) -> str:
+    """The number with the noun, such as "1 thread" or "2 threads"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

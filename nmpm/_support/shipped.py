@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from nmpm._support.messages import suggestion
 from nmpm.errors import ConfigError
 
 PACKAGE = Path(__file__).parents[1]
@@ -44,6 +45,8 @@ def find_config(name: str) -> Path:
         return given
     if name in config_names():
         return shipped_folder("configs") / name
+    names = config_names()
     raise ConfigError(
-        f"--config {name}: there is no such file here, and the shipped configurations are {', '.join(config_names())}."
+        f"--config {name}: there is no such file here, and the shipped configurations are"
+        f" {', '.join(names)}.{suggestion(name, names)}"
     )

@@ -30,7 +30,8 @@ COMMANDS = {
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]
 
-Emulators of particle simulations on a grid: train them, evaluate them by rollouts, use pretrained ones.
+Emulators of particle simulations on a grid: train them, evaluate them by rollouts, use pretrained
+ones.
 
 commands:
 {commands}
@@ -38,7 +39,7 @@ commands:
 first steps:
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --config goop.yaml --ckpt_path last go on after an interruption
-  nmpm inspect FOLDER                          summarise recorded data of any format that convert reads
+  nmpm inspect FOLDER                          summarise recorded data of any format known
   nmpm fit --config waterdrop.yaml --data.path FOLDER
                                                train on recorded data
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
@@ -48,17 +49,23 @@ first steps:
   nmpm compare waterramps --data waterdrop-xl  does a model hold for other scenes than its own?
   nmpm trade goop                              what accuracy costs in time: model or simulator?
 
-Add --help to any command for its options; fit --help_all lists every one, fit --print_config a whole configuration.
-A --config that is not a file in the working directory is looked up among the shipped ones: {configs}.
+Add --help to any command for its options and examples; nmpm --version prints the version.
+A --config that is not a file in the working directory is looked up among the shipped ones:
+{configs}.
 """
 
 
 def usage() -> str:
     """The top-level help."""
+    import textwrap
+
     from nmpm._support.shipped import config_names
 
     lines = [f"  {name:<10} {summary}" for name, (_, summary) in COMMANDS.items()]
-    return USAGE.format(commands="\n".join(lines), configs=", ".join(config_names()))
+    configs = textwrap.fill(
+        ", ".join(config_names()), 98, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
+    )
+    return USAGE.format(commands="\n".join(lines), configs=configs)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

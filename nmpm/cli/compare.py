@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import MODEL, add_device_option, check_at_least, check_device, check_folder
 
 if TYPE_CHECKING:
@@ -21,10 +22,10 @@ and what its own results are uncertain by."""
 
 _EXAMPLES = """\
 examples:
-  nmpm compare waterramps waterdrop --data waterdrop-xl    does a model hold for four times as many particles?
-  nmpm compare waterramps --data waterramps --wider 2      ... in a domain twice as wide?
-  nmpm compare goop runs/mine --data goop --scenes 30      your own model beside the zoo's
-  nmpm compare runs/a runs/b --data FOLDER                 on recorded data in native layout
+  nmpm compare waterramps waterdrop --data waterdrop-xl   for four times as many particles?
+  nmpm compare waterramps --data waterramps --wider 2     ... in a domain twice as wide?
+  nmpm compare goop runs/mine --data goop --scenes 30     your own model beside the zoo's
+  nmpm compare runs/a runs/b --data FOLDER                on recorded data in native layout
 
 It prints a table, and writes to the folder of --out: compare.json (all figures, of every scene), errors.png (error
 against frames), frames.png (the first scene's splash and last frame, side by side), and points/, which holds every
@@ -60,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="nmpm compare",
         description=DESCRIPTION,
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("models", nargs="+", metavar="MODEL", help=MODEL)
     parser.add_argument(
@@ -86,13 +87,12 @@ def _models(names: list[str]) -> dict[str, Emulator]:
 
 def _measure(candidates: list[Candidate], scenes: Scenes, out: Path) -> list[Outcome]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from nmpm._support.progress import terminal_progress
     from nmpm.evaluation.compare import compare, count_steps
     from nmpm.evaluation.trade import Store
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task("compare", total=count_steps(candidates, scenes))
         return compare(candidates, scenes, Store(out), lambda what: progress.update(task, advance=1, description=what))
 

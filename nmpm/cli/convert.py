@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import add_data_options, check_folder, data_options, new_ids
 
 _DESCRIPTION = """\
@@ -23,7 +24,7 @@ examples:
   nmpm convert datasets/WaterRamps water                 DeepMind's TFRecords
   nmpm convert flume/test.npz flume --types 1=debris --bounds 0.02:1,0:0.2
   nmpm convert heated-channel channel --family jax-sph --boundary periodic,wall
-  nmpm convert ramps ramps-for-lagrangebench --ids 5=0,3=1      0 fluid and 1 wall, as LagrangeBench numbers them
+  nmpm convert ramps ramps-for-lagrangebench --ids 5=0,3=1   LagrangeBench: 0 fluid, 1 wall
 """
 
 
@@ -36,7 +37,7 @@ def run(words: list[str]) -> None:
         prog="nmpm convert",
         description=_DESCRIPTION.format(formats="\n".join(f"  {f.name:<{width}}  {f.summary}" for f in FORMATS)),
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("source", type=Path, help="file or folder to read")
     parser.add_argument("destination", type=Path, help="folder to write; must not exist yet, or be empty")

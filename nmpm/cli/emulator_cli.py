@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import operator
-import os
 import shlex
-import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from jsonargparse import set_parsing_settings
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -22,8 +15,6 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.devices import device_name
-from nmpm._support.plugins import load_plugins
-from nmpm.cli.console import quiet_lightning
 from nmpm.cli.options import check_folder
 from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
@@ -36,9 +27,9 @@ from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
+from nmpm.training.compatibility import check_same_recipe
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.parts import check_same_recipe
 from nmpm.training.run_folder import RunFolder
 from nmpm.zoo.registry import load_model
 
@@ -54,9 +45,9 @@ class EmulatorCLI(LightningCLI):
     """Links what the model needs from the data and the other way round, and ends a fit with a test.
 
     Args:
-        words: The command as the user gave it.
-        locks: Takes the descriptor of the run folder's lock. (Callbacks that copy the module copy this object too, so
-            it must not hold what cannot be copied.)
+        words: The command line as the user gave it.
+        locks: A list that the descriptor of the run folder's lock is appended to. (Callbacks that copy the module copy
+            this object too, so it must not hold what cannot be copied.)
         options: Of LightningCLI.
     """
 
@@ -85,7 +76,7 @@ class EmulatorCLI(LightningCLI):
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
     def _model_scene(self, scene: Scene) -> Scene:
-        """The data's scene; with the fields of the checkpoint that is to be judged, which the data may lack."""
+        """The data's scene, with fields of the checkpoint under evaluation that the data lack."""
         config = self.config[self.subcommand]
         if self.subcommand == "fit" or not config["ckpt_path"]:
             return scene
@@ -100,7 +91,7 @@ class EmulatorCLI(LightningCLI):
         """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder.
 
         Raises:
-            ConfigError: if a model that was not trained is to be judged, or the learning rate is not positive.
+            ConfigError: if an untrained model would be evaluated, or the learning rate is not positive.
         """
         config = self.config[self.subcommand]
         config["weights_only"] = True
@@ -157,7 +148,7 @@ class EmulatorCLI(LightningCLI):
         return Path(config["dirpath"]) / f"{config['filename']}{ModelCheckpoint.FILE_EXTENSION}"
 
     def before_fit(self) -> None:
-        """Refuse, before data are simulated, what cannot be trained, and lock the run's folder.
+        """Check, before data are simulated, that the training can run, and lock the run's folder.
 
         Raises:
             ConfigError: if the training has no end, another process trains in the folder, it holds a run that is not
@@ -255,47 +246,6 @@ class EmulatorCLI(LightningCLI):
             checkpoint.best_model_path, checkpoint.best_model_score = str(path), score
 
 
-def run_command(words: list[str], found: list[str]) -> int:
-    """Run a training command.
-
-    Args:
-        words: As the user gave it.
-        found: The same with the configuration files' paths.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        UsageError: for an option or key that cannot be.
-        ConfigError: if Lightning refuses the configuration.
-        KeyboardInterrupt: at SIGINT and SIGTERM, saying how to go on.
-    """
-    load_plugins()
-    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
-    sys.argv = [sys.argv[0], *found]
-    locks: list[int] = []
-    try:
-        with quiet_lightning(), _treat_sigterm_like_sigint():
-            EmulatorCLI(
-                words,
-                locks,
-                seed_everything_default=0,
-                parser_kwargs={"parser_mode": "omegaconf+"},
-                save_config_kwargs={"overwrite": True},
-            )
-    except MisconfigurationException as error:
-        raise ConfigError(" ".join(str(error).split())) from error
-    except SystemExit as ended:
-        if isinstance(ended.__context__, KeyboardInterrupt):  # Lightning's answer to it
-            raise ended.__context__ from None
-        raise
-    finally:
-        for descriptor in locks:
-            os.close(descriptor)
-    return 0
-
-
 def resuming_command(words: list[str]) -> str:
     """The command that goes on from the last checkpoint of one that was interrupted."""
     kept = [word for word in words if not word.startswith("--ckpt_path=")]
@@ -303,16 +253,3 @@ def resuming_command(words: list[str]) -> str:
         at = kept.index("--ckpt_path")
         del kept[at : at + 2]
     return shlex.join(["nmpm", *kept, "--ckpt_path", "last"])
-
-
-@contextmanager
-def _treat_sigterm_like_sigint() -> Iterator[None]:
-    """Turn SIGTERM into KeyboardInterrupt, as SIGINT is."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, former)

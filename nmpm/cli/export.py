@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import add_device_option, add_model_options, check_device, check_output
 from nmpm.errors import ConfigError, DataError
 
@@ -18,6 +19,15 @@ DESCRIPTION = """Write a trained model as a file that runs without nmpm: ONNX, f
 a package of AOTInductor (.pt2), machine code for the device that --device names, for torch in Python or C++. The
 numbers of scenes and particles stay open. The file's metadata describe its inputs and outputs with their units. After
 writing, its outputs are compared with the model's; if they differ, the file is deleted."""
+
+_EXAMPLES = """\
+examples:
+  nmpm export goop                              goop.onnx: one step, particles to particles
+  nmpm export goop --processor --out net.onnx   only the network
+  nmpm export waterramps --solid                what it sees of obstacles, once per scene
+  nmpm export runs/goop --format pt2 --device cuda
+"""
+
 TOLERANCE = 1e-3
 """Largest difference, in cells, that a file may have from its model over one call."""
 
@@ -39,7 +49,9 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="nmpm export", description=DESCRIPTION)
+    parser = argparse.ArgumentParser(
+        prog="nmpm export", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
+    )
     add_model_options(parser)
     add_device_option(parser)
     parser.add_argument("--format", choices=["onnx", "pt2"], default="onnx", help="of the file (default: onnx)")
@@ -65,7 +77,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _export(chosen: argparse.Namespace, out: Path) -> None:
+    from rich.console import Console
+
     from nmpm._support.devices import find_device
+    from nmpm._support.progress import terminal_progress
     from nmpm.zoo import export, load_model
 
     model = load_model(chosen.model, root=chosen.root)
@@ -73,8 +88,11 @@ def _export(chosen: argparse.Namespace, out: Path) -> None:
     kinds: Mapping[str, type[Part]] = {kind.__name__: kind for kind in (export.Step, export.Network, export.Solid)}
     part = kinds[chosen.part](emulator).to(find_device(chosen.device))
     form = export.FORMATS[chosen.format]
-    form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
-    difference = form.difference(part, out, batch=1, count=300)
+    with terminal_progress(Console(stderr=True)) as progress:
+        task = progress.add_task(f"Writing {out.name}", total=2)
+        form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
+        progress.update(task, completed=1, description=f"Comparing {out.name} with the model")
+        difference = form.difference(part, out, batch=1, count=300)
     if not difference <= TOLERANCE:
         out.unlink()
         raise DataError(

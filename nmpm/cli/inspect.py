@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import add_data_options, check_at_least, check_picture, data_options
 from nmpm.errors import ConfigError, DataError, NmpmError
 
@@ -37,7 +38,7 @@ def run(words: list[str]) -> None:
         prog="nmpm inspect",
         description="Summarise a dataset on one screen, list suspicious values, and draw its first trajectory.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
     parser.add_argument("--format", metavar="NAME", help="format of the dataset (default: detected)")
@@ -90,7 +91,7 @@ def _origin(path: Path, format_name: str | None, options: Options, native: Path)
     from nmpm.data.inspection.tolerance import convert_readable
     from nmpm.data.loading.sources import FolderSource
 
-    path = path.parent if path.suffix == ".h5" and path.is_file() else path
+    path = _dataset_of(path)
     changed = options.types or options.static is not None or options.dt is not None
     if split_paths(path) and not changed and format_name is None:
         return _native_origin(path, options), []
@@ -101,6 +102,27 @@ def _origin(path: Path, format_name: str | None, options: Options, native: Path)
         return FolderSource(native), []
     except DataError as error:
         return FolderSource(native), convert_readable(path, native, format_name, options) or [str(error)]
+
+
+def _dataset_of(path: Path) -> Path:
+    """The folder of the dataset that an HDF5 file is a part of; other paths as they are.
+
+    Raises:
+        DataError: if the file cannot be read, or is not a part of a dataset, as a rollout.
+    """
+    if path.suffix != ".h5" or not path.is_file():
+        return path
+    from nmpm.data.convert import FORMATS
+    from nmpm.data.format import Split, split_paths
+
+    splits = [split.name for split in split_paths(path.parent).values()]
+    if path.name in splits or (not splits and any(kind.recognises(path.parent) for kind in FORMATS)):
+        return path.parent
+    Split(path)
+    raise DataError(
+        f"{path}: it is not a split of a dataset, which are train.h5, valid.h5 and test.h5 beside a metadata.json. To"
+        f" look at its trajectories: nmpm view {path}, or nmpm render {path}."
+    )
 
 
 def _converted(path: Path, options: Options) -> tuple[FolderSource, list[str]]:

@@ -122,7 +122,7 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--dt", type=float, help="seconds between stored frames")
     group.add_argument("--gravity", metavar="X,Y[,Z]", help="acceleration in length/s², e.g. 0,-9.81")
     group.add_argument("--boundary", metavar="KIND,...", help='"wall" or "periodic" per axis, e.g. periodic,wall')
-    group.add_argument("--fields", metavar="NAME,...", help="fields that models are told of, e.g. temperature")
+    group.add_argument("--fields", metavar="NAME,...", help="fields that are inputs of models, e.g. temperature")
 
 
 def data_options(chosen: argparse.Namespace) -> Options:

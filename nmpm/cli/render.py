@@ -6,14 +6,25 @@ import argparse
 import sys
 from pathlib import Path
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import check_input
 from nmpm.errors import ConfigError
+
+_EXAMPLES = """\
+examples:
+  nmpm render out.h5                        a rollout of nmpm rollout: out.png and out.gif
+  nmpm render out.h5 --mp4 --out splash     splash.png and splash.mp4
+  nmpm render data/test.h5 --trajectory 7   a recorded trajectory: data/test.png and data/test.gif
+"""
 
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["render", "out.h5"]."""
     parser = argparse.ArgumentParser(
-        prog="nmpm render", description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4."
+        prog="nmpm render",
+        description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4.",
+        epilog=_EXAMPLES,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
     parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: 0, the first)")

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import (
     add_device_option,
     add_model_options,
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """\
 examples:
-  nmpm rollout goop --frames 400 --out out.h5            a model of the zoo, from thrown blocks of particles
-  nmpm rollout runs/goop --data test.h5 --trajectory 3   the best checkpoint of a run, from a recorded start
+  nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
+  nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
   nmpm rollout runs/goop/checkpoints/last.ckpt --device auto
 """
 
@@ -40,7 +41,10 @@ def run(words: list[str]) -> None:
     given = chosen.data is not None
     state = _recorded_state(model, chosen.data, chosen.trajectory) if given else _thrown_state(model, chosen)
     _write(model, state, chosen)
-    sys.stdout.write(f"wrote {chosen.frames + 2} frames of {state.position.shape[1]} particles to {chosen.out}\n")
+    particles = state.position.shape[1]
+    frames = f"2 frames of the start and {chosen.frames} predicted"
+    sys.stdout.write(f"wrote {frames}, of {particles} particles, to {chosen.out}\n")
+    sys.stdout.write(f"to look at them: nmpm view {chosen.out}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -48,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="nmpm rollout",
         description="Roll a trained model out, from thrown blocks of particles or from a recorded trajectory.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     add_model_options(parser)
     add_device_option(parser)
@@ -117,8 +121,8 @@ def _family(model: Pretrained) -> str | None:
 def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
     """Predict, and write the two frames of the start and the prediction, with what is needed to draw them."""
     from rich.console import Console
-    from rich.progress import track
 
+    from nmpm._support.progress import terminal_progress
     from nmpm.data.format import write_split
     from nmpm.data.predictions import predicted_trajectory
     from nmpm.emulator import Rollout, stream_rollout
@@ -127,10 +131,8 @@ def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> N
     count, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
     bundles = stream_rollout(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
     # On the CPU, as a device may have less memory than a long rollout needs.
-    shown = track(
-        bundles, "rollout", count, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
-    )
-    rollout = Rollout.join([bundle.cpu() for bundle in shown])
+    with terminal_progress(Console(stderr=True)) as progress:
+        rollout = Rollout.join([bundle.cpu() for bundle in progress.track(bundles, count, description="rollout")])
     origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
     start = state.to("cpu")
     predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields)

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import check_at_least, check_folder, check_picture
 
 if TYPE_CHECKING:
@@ -19,12 +20,12 @@ _INTERRUPTED = 130  # as shells report SIGINT
 
 _EXAMPLES = """\
 examples:
-  nmpm simulate --list                                   the shipped scenes
-  nmpm simulate waterramps --preview ramps.png           draw one trajectory, write no data
+  nmpm simulate --list                               the shipped scenes
+  nmpm simulate waterramps --preview ramps.png       draw one trajectory, write no data
   nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
-  nmpm simulate waterramps --shard 2/8 --out ramps       a task of a job array; the last of 8 completes the folder
-  nmpm simulate my-scene.yaml --out mine                 your own scene: start from a copy of a shipped one
-  nmpm simulate goop --show > my-scene.yaml              such a copy, with comments
+  nmpm simulate waterramps --shard 2/8 --out ramps   one of 8 jobs; the last completes the folder
+  nmpm simulate my-scene.yaml --out mine             your own scene, from a copy of a shipped one
+  nmpm simulate goop --show > my-scene.yaml          such a copy, with comments
 
 The same preset, seed and numbers give the same data. After an interruption the same call resumes. The metadata state
 that the data are simulated by nmpm.
@@ -41,7 +42,7 @@ def run(words: list[str]) -> None:
         prog="nmpm simulate",
         description="Simulate a dataset of a shipped scene or your own, ready for training.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("name", nargs="?", help="a shipped scene, or a YAML file")
     parser.add_argument("--list", action="store_true", help="list the shipped scenes")
@@ -150,12 +151,12 @@ def _show(name: str) -> None:
 def _preview(preset: Preset, seed: int, path: Path) -> None:
     import numpy as np
     from rich.console import Console
-    from rich.progress import Progress
 
+    from nmpm._support.progress import terminal_progress
     from nmpm.sim.preset import BOUNDARY
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
-    with Progress(console=Console(stderr=True)) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
         trajectory = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
     moving, scene = trajectory.particle_type != BOUNDARY, preset.scene

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import (
     add_device_option,
     add_model_options,
@@ -24,6 +25,14 @@ DESCRIPTION = """Test a trained model at the extremes: long rollouts, settling, 
 other boxes and grids, precision, sensitivity, obstacles that training never showed, non-finite input. Prints one line
 per test: pass or fail by a stated invariant, with what was measured. Errors are against the simulator that made the
 training data, where there is one. Exits with 1 if a line fails."""
+
+_EXAMPLES = """\
+examples:
+  nmpm stress goop                          all tests, in minutes
+  nmpm stress goop --groups long settling   some of them
+  nmpm stress runs/goop --free              a run's best checkpoint, without constraints
+  nmpm stress goop --full --report stress   as zoo cards quote it, with a table and a picture
+"""
 
 
 def run(words: list[str]) -> None:
@@ -46,14 +55,22 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="nmpm stress", description=DESCRIPTION)
+    parser = argparse.ArgumentParser(
+        prog="nmpm stress", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
+    )
     add_model_options(parser)
     add_device_option(parser)
     add_runtime_option(parser)
     parser.add_argument("--full", action="store_true", help="longer and larger, as zoo cards quote (default: minutes)")
     parser.add_argument("--preset", help="simulator of its scenes (default: of the training data; none if recorded)")
     parser.add_argument("--free", action="store_true", help="without the model's constraints: the network alone")
-    parser.add_argument("--groups", nargs="+", metavar="GROUP", help="only these groups of tests")
+    parser.add_argument(
+        "--groups",
+        nargs="+",
+        metavar="GROUP",
+        help="only these, of long, settling, speeds, counts, sizes, precision, sensitivity, obstacles, poison, free"
+        " (default: all)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the scenes (default: 0)")
     parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
     parser.add_argument(
@@ -79,19 +96,12 @@ def _subject(chosen: argparse.Namespace) -> Subject:
 
 def _run_groups(subject: Subject, size: Size, groups: list[str], quiet: bool) -> list[Line]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+    from nmpm._support.progress import terminal_progress
     from nmpm.evaluation.stress import GROUPS, battery
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )
     lines: list[Line] = []
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
+    with terminal_progress(Console(stderr=True, quiet=quiet)) as progress:
         task = progress.add_task("stress", total=len(groups))
         for name in groups:
             progress.update(task, description=name)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import MODEL, add_device_option, check_at_least, check_device, check_folder, check_input
 from nmpm.errors import ConfigError
 
@@ -22,11 +23,13 @@ a budget of milliseconds per frame, be it an emulator or not."""
 
 _EXAMPLES = """\
 examples:
-  nmpm trade goop                                    the zoo's models of goop beside its simulator
-  nmpm trade goop --models goop runs/a runs/b        models of your own, by name, run, checkpoint or entry's folder
-  nmpm trade goop --models goop runs/gns/minutes-10  beside a particle-graph network, see benchmarks/gns.py
-  nmpm trade FOLDER --models runs/mine               recorded data in native layout: without a simulator
-  nmpm trade --print_config > sweep.yaml             what is measured; edit, then: nmpm trade goop --config sweep.yaml
+  nmpm trade goop                               the zoo's models of goop beside its simulator
+  nmpm trade goop --models goop runs/a runs/b   models of your own beside it
+  nmpm trade goop --models goop runs/gns/minutes-10
+                                                a particle-graph network, see benchmarks/gns.py
+  nmpm trade FOLDER --models runs/mine          recorded data in native layout: without a simulator
+  nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
+  nmpm trade goop --config sweep.yaml
 
 It writes to the folder of --out: trade.csv (one row for each choice and error), trade.png, trade.html (an interactive
 page, self-contained), and points/, which holds every measurement: the same command goes on after an interruption, and
@@ -65,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="nmpm trade",
         description=DESCRIPTION,
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("dataset", nargs="?", help="an embedded dataset (goop, …), or a folder in native layout")
     parser.add_argument(
@@ -128,18 +131,11 @@ def _graph_folders(names: list[str]) -> dict[str, TrainedGraph]:
 
 def _measure(choices: list[Choice], scenes: Scenes, sweep: Sweep, out: Path, keep: bool) -> list[Point]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from nmpm._support.progress import terminal_progress
     from nmpm.evaluation.trade import Store, count_steps, measure
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True, refresh_per_second=1) as progress:
+    with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task("trade", total=count_steps(choices, scenes, sweep))
         return measure(
             choices, scenes, sweep, Store(out, keep),

@@ -26,7 +26,7 @@ def run(words: list[str]) -> int:
     found = with_shipped_configs(["--help" if word == "--help_all" else word for word in words])
     try:
         check_command(found)
-        from nmpm.cli.emulator_cli import run_command
+        from nmpm.cli.run_training import run_command
 
         return run_command(words, found)
     except UsageError as error:

@@ -14,13 +14,17 @@ from nmpm.cli.early_checks import SIGNATURES, argument_names, class_definition
 
 LINKED = {"model": {"scene", "recipe"}, "data": {"horizon"}}
 """Arguments that the command line takes from elsewhere."""
-INDENT, WIDTH = 30, 118
+INDENT, WIDTH = 30, 100
 
 _TEXT = """\
 usage: nmpm {command} --config FILE [--SECTION.KEY VALUE ...]
 
 {summary}
-Options replace what the configuration says, and later --config files what earlier ones say.
+Options replace what the configuration says, and later --config files what earlier ones say. What
+none of them says has the default that --help_all shows.
+
+examples:
+{examples}
 
 options:
 {options}
@@ -34,14 +38,31 @@ options:
 --trainer.KEY, of Lightning's Trainer, such as:
 {trainer}
 
---checkpoint.KEY and --resume.KEY are of Lightning's ModelCheckpoint: which checkpoint is the best, and how often the
-one to resume from is written.
+--checkpoint.KEY and --resume.KEY are of Lightning's ModelCheckpoint: which checkpoint is the best,
+and how often the one to resume from is written.
 
 more:
-  nmpm {command} --help_all     every option with type and default; takes seconds
-  nmpm {command} --config goop.yaml --print_config     the whole configuration
-  nmpm {command} --model.processor.help nmpm.processors.UNet     options of a part
+  nmpm {command} --help_all                  every option with type and default; takes seconds
+  nmpm {command} --config goop.yaml --print_config
+      the whole configuration
+  nmpm {command} --model.processor.help nmpm.processors.UNet
+      options of a part
 """
+_EXAMPLES = {
+    "fit": """\
+  nmpm fit --config goop.yaml                           simulate data, train, test, draw
+  nmpm fit --config goop.yaml --ckpt_path last          go on after an interruption
+  nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
+  nmpm fit --config waterdrop.yaml --data.path FOLDER   train on recorded data""",
+    "validate": """\
+  nmpm validate --config goop.yaml --ckpt_path best     after nmpm fit --config goop.yaml""",
+    "test": """\
+  nmpm test --config goop.yaml --ckpt_path best         after nmpm fit --config goop.yaml
+  nmpm test --config goop.yaml --ckpt_path best --data.path FOLDER
+                                                        on other scenes""",
+    "predict": """\
+  nmpm predict --config goop.yaml --ckpt_path best      after nmpm fit --config goop.yaml""",
+}
 _OPTIONS = {
     "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
     "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, other commands judge it",
@@ -67,8 +88,8 @@ def training_help(command: str, summary: str) -> str:
         summary: What it does, in one sentence.
     """
     own = {group: "\n".join(_entries(dict(_described(group)))) for group in SIGNATURES}
-    options = "\n".join(_entries(_OPTIONS))
-    return _TEXT.format(command=command, summary=summary, options=options, trainer="\n".join(_entries(_TRAINER)), **own)
+    shared = {"options": "\n".join(_entries(_OPTIONS)), "trainer": "\n".join(_entries(_TRAINER))}
+    return _TEXT.format(command=command, summary=summary, examples=_EXAMPLES[command], **shared, **own)
 
 
 def _described(group: str) -> Iterator[tuple[str, str]]:

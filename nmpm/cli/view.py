@@ -6,13 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import check_at_least, check_input
 
 _EXAMPLES = """\
 examples:
-  nmpm view out.h5                                   a rollout of nmpm rollout: writes out.html
-  nmpm view out.h5 data/test.h5 --truth-trajectory 3 beside the recording that it started from, with its error
-  nmpm view data/test.h5 --trajectory 7 --every 2    a recorded trajectory, every second frame
+  nmpm view out.h5                                     a rollout of nmpm rollout: writes out.html
+  nmpm view out.h5 data/test.h5 --truth-trajectory 3   beside what it started from, with its error
+  nmpm view data/test.h5 --trajectory 7 --every 2      a recorded trajectory, every second frame
 
 The page needs no network and no nmpm: send it to anybody. Space plays, ? shows the keys.
 """
@@ -24,7 +25,7 @@ def run(words: list[str]) -> None:
         prog="nmpm view",
         description="Write a self-contained HTML page that plays a trajectory, or two beside each other.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
     parser.add_argument("truth", type=Path, nargs="?", help="HDF5 file of what FILE should be; errors are against it")

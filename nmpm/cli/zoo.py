@@ -8,29 +8,63 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import add_device_option, check_device
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
 
+_EXAMPLES = """\
+examples:
+  nmpm zoo list                            names, states, errors and data
+  nmpm zoo card goop                       scene, recipe, errors, times and origin of one
+  nmpm zoo verify goop                     are the card's figures true here?
+  nmpm zoo add runs/goop goop/mine --about "goop with a longer training"
+  nmpm zoo push goop/mine me/goop          upload it, for nmpm zoo pull me/goop@main
+"""
+
 
 def run(words: list[str]) -> int | None:
     """Run a zoo command, e.g. ["zoo", "list"]; the exit status."""
-    parser = argparse.ArgumentParser(prog="nmpm zoo", description="The pretrained models.")
+    parser = _parser()
+    if not words[1:]:
+        parser.print_help(sys.stderr)
+        return 2
+    chosen = parser.parse_args(words[1:])
+    actions: dict[str, Callable[[argparse.Namespace], int | None]] = {
+        "list": _list,
+        "card": _card,
+        "add": _add,
+        "verify": _verify,
+        "refresh": _refresh,
+        "push": _push,
+        "pull": _pull,
+    }
+    return actions[chosen.command](chosen)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nmpm zoo", description="The pretrained models.", epilog=_EXAMPLES, formatter_class=HelpFormatter
+    )
     parser.add_argument("--root", type=Path, help=_ROOT)
-    commands = parser.add_subparsers(dest="command", required=True)
-    listing = commands.add_parser("list", help="names, data and full-rollout errors of the models")
-    card = commands.add_parser("card", help="everything known of one model")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add_command(name: str, about: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
+
+    listing = add_command("list", "names, data and full-rollout errors of the models")
+    card = add_command("card", "everything known of one model")
     card.add_argument("name")
-    add = commands.add_parser("add", help="make an entry of your own zoo, or of --root, from a finished run")
+    add = add_command("add", "make an entry of your own zoo, or of --root, from a finished run")
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="name of the new model, e.g. goop/mine")
     add.add_argument("--about", default="", help="description of the data and their origin, for the card")
-    verify = commands.add_parser("verify", help="measure the figures of cards again; 1 if one is not confirmed")
+    verify = add_command("verify", "measure the figures of cards again; 1 if one is not confirmed")
     verify.add_argument("name", nargs="?", help="(default: every model)")
     verify.add_argument("--full", action="store_true", help="all test scenes to their end (default: a few, 100 frames)")
     verify.add_argument("--data", type=Path, metavar="FOLDER", help="test data, of models of recorded data")
     add_device_option(verify)
-    refresh = commands.add_parser("refresh", help="write READMEs, charts and the table of --root's models again")
+    refresh = add_command("refresh", "write READMEs, charts and the table of --root's models again")
     refresh.add_argument("name", nargs="?", help="(default: every model)")
     refresh.add_argument(
         "--measure",
@@ -44,26 +78,16 @@ def run(words: list[str]) -> int | None:
     refresh.add_argument(
         "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
     )
-    push = commands.add_parser("push", help="upload a model to the Hugging Face hub")
+    push = add_command("push", "upload a model to the Hugging Face hub")
     push.add_argument("name")
     push.add_argument("repository", help="owner/repository, created if missing")
     push.add_argument("--private", action="store_true", help="of a new repository")
-    pull = commands.add_parser("pull", help="download a model of the Hugging Face hub")
+    pull = add_command("pull", "download a model of the Hugging Face hub")
     pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
     pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
     for command in (listing, card, add, verify, refresh, push, pull):
         command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
-    chosen = parser.parse_args(words[1:])
-    actions: dict[str, Callable[[argparse.Namespace], int | None]] = {
-        "list": _list,
-        "card": _card,
-        "add": _add,
-        "verify": _verify,
-        "refresh": _refresh,
-        "push": _push,
-        "pull": _pull,
-    }
-    return actions[chosen.command](chosen)
+    return parser
 
 
 def _list(chosen: argparse.Namespace) -> None:
@@ -129,7 +153,7 @@ def _verify(chosen: argparse.Namespace) -> int:
 def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ConfigError
-    from nmpm.zoo.index import refresh, state_failures, write_index
+    from nmpm.zoo.index import refresh, write_index
     from nmpm.zoo.registry import Zoo
 
     if chosen.data is not None and chosen.name is None:
@@ -138,9 +162,7 @@ def _refresh(chosen: argparse.Namespace) -> None:
         raise ConfigError("--failures is about one model: give the model's NAME too.")
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
-        if chosen.failures is not None:
-            state_failures(Zoo.folder(name, root), chosen.failures)
-        refresh(Zoo.folder(name, root), chosen.measure, chosen.data)
+        refresh(Zoo.folder(name, root), chosen.measure, chosen.data, chosen.failures)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 
 

@@ -15,7 +15,8 @@ from types import MappingProxyType
 
 from nmpm._support.shipped import user_home
 from nmpm.data.format import METADATA_FILE, read_metadata
-from nmpm.data.generate import SimulationRequest, generate
+from nmpm.data.generate import generate
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.sim import load_preset, preset_names

@@ -64,8 +64,8 @@ class TrajectoryDataModule(LightningDataModule):
         gravity: Acceleration in length/s² per axis, where recorded data do not state it.
         boundary: "wall" or "periodic" per axis, instead of that in the metadata of recorded data.
         bounds: (lower, upper) per axis, likewise.
-        fields: Names of fields that the model is told of, such as [temperature], instead of those that the metadata of
-            recorded data declare; [] for none. Those that evolve are predicted.
+        fields: Names of fields that are inputs of the model, such as [temperature], instead of those that the metadata
+            of recorded data declare; [] for none. Those that evolve are predicted.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.

@@ -1,8 +1,8 @@
 """Fields of a dataset: further numbers by name that each trajectory stores beside its positions.
 
 A field is an HDF5 dataset of the trajectory's group, of shape (T, N), one number for each particle in each frame; or
-(N,), one for each particle; or (), one for the trajectory, which may be an attribute instead. Models are told of those
-that the metadata's `fields` or `data.fields` name and that differ anywhere in the dataset.
+(N,), one for each particle; or (), one for the trajectory, which may be an attribute instead. Inputs of models
+are those that the metadata's `fields` or `data.fields` name and that differ anywhere in the dataset.
 """
 
 from __future__ import annotations

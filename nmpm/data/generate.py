@@ -18,9 +18,7 @@ import shutil
 import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.version import __version__
@@ -38,8 +36,9 @@ from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, 
 from nmpm.data.progress import progress_bar
 from nmpm.data.seeds import DRAWS, seed_of_draw, simulate_first_stable
 from nmpm.data.shard import Shard
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.data.statistics import MotionStatistics
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
 
@@ -47,60 +46,6 @@ _REQUEST = "request.json"
 _KEY = "simulation"
 
 _log = logging.getLogger(__name__)
-
-
-def _is_valid_counts(counts: object) -> bool:
-    """Whether these are valid numbers of trajectories for all splits."""
-    if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):
-        return False
-    return all(isinstance(number, int) and number >= 0 for number in counts.values())
-
-
-@dataclass(frozen=True)
-class SimulationRequest:
-    """Everything that determines a simulated dataset.
-
-    Args:
-        preset: The family of scenes.
-        counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
-        seed: The seeds of all trajectories are derived from it.
-        redrawn: By split and index, the trajectories whose first seeds were unstable, and how many were. Known once
-            they are simulated.
-
-    Raises:
-        ConfigError: if a split is unknown or missing, all are empty, or a number is negative.
-    """
-
-    preset: Preset
-    counts: Mapping[str, int]
-    seed: int = 0
-    redrawn: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if not _is_valid_counts(self.counts) or not self.splits or self.seed < 0:
-            raise ConfigError(
-                f"counts = {self.counts}, seed = {self.seed}: give the number of trajectories in each of "
-                f"{', '.join(SPLITS)}, as in {{train: 3, valid: 1, test: 1}}, at least 1 in all; neither they nor the "
-                "seed may be negative."
-            )
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        """Names of the splits that have trajectories."""
-        return tuple(split for split in SPLITS if self.counts[split])
-
-    def to_dict(self) -> dict[str, Any]:
-        """The request as plain lists, strings and numbers, without what is known only once it is simulated."""
-        counts = {split: self.counts[split] for split in SPLITS}
-        return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": self.preset.revision}
-
-    def place(self, split: str, index: int) -> tuple[int, int, int]:
-        """What the seeds of one trajectory are derived from; independent of the counts."""
-        return self.seed, SPLITS.index(split), index
-
-    def trajectory_seed(self, split: str, index: int) -> int:
-        """Seed of one trajectory."""
-        return seed_of_draw(self.place(split, index), self.redrawn.get(split, {}).get(str(index), 0))
 
 
 def generate(
@@ -152,9 +97,9 @@ def generate_shard(
             return 0
         with lock_folder(folder / PARTS):
             _prepare_parts(request, folder)
-        _simulate_parts(request, folder, shard.select(_trajectories(request)), workers or os.cpu_count() or 1)
+        _simulate_parts(request, folder, shard.select(request.trajectories), workers or os.cpu_count() or 1)
         # While the lock is held nobody assembles: the last shard to come here finds all parts.
-        missing = len(_missing(folder, _trajectories(request)))
+        missing = len(_missing(folder, request.trajectories))
     if missing == 0:
         generate(preset, folder, counts, seed, workers)
     return missing
@@ -165,7 +110,7 @@ def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
         return
     _prepare_parts(request, folder)
     _remove_stale_files(folder)
-    _simulate_parts(request, folder, _trajectories(request), workers)
+    _simulate_parts(request, folder, request.trajectories, workers)
     for split in request.splits:
         _assemble(request, folder, split)
     metadata = preset_metadata(request.preset)
@@ -182,7 +127,7 @@ def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
 def _is_complete(request: SimulationRequest, folder: Path) -> bool:
     if not (folder / METADATA_FILE).is_file():
         return False
-    _check_same(request, read_metadata(folder).extra.get(_KEY), folder)
+    request.check_same(read_metadata(folder).extra.get(_KEY), folder)
     return True
 
 
@@ -190,7 +135,7 @@ def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
     """Writes the request beside the parts, or checks that existing parts belong to the same request."""
     path = folder / PARTS / _REQUEST
     if path.is_file():
-        _check_same(request, json.loads(path.read_text(encoding="utf-8")), folder)
+        request.check_same(json.loads(path.read_text(encoding="utf-8")), folder)
         return
     foreign = [f"{split}.h5" for split in SPLITS if (folder / f"{split}.h5").exists()]
     if foreign:
@@ -199,31 +144,10 @@ def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
         temporary.write_text(json.dumps(request.to_dict(), indent=1), encoding="utf-8")
 
 
-def _check_same(request: SimulationRequest, found: Any, folder: Path) -> None:
-    asked = json.loads(json.dumps(request.to_dict()))
-    found = found if isinstance(found, dict) else {}
-    differing = [key for key in asked if found.get(key) != asked[key]]
-    if differing:
-        what = "; ".join(_difference(key, found.get(key), asked[key]) for key in differing)
-        raise DataError(f"{folder}: has other data than requested: {what}. Choose another folder, or delete this one.")
-
-
-def _difference(key: str, found: Any, asked: Any) -> str:
-    if isinstance(asked, dict) and isinstance(found, dict):
-        inner = [name for name in asked if found.get(name) != asked[name]]
-        return ", ".join(_difference(f"{key}.{name}", found.get(name), asked[name]) for name in inner)
-    return f"{key} is {found}, requested {asked}"
-
-
 def _remove_stale_files(folder: Path) -> None:
     """Removes files that killed processes left incomplete; the lock guarantees that no other process is writing."""
     for stale in [*folder.glob(".*.part*"), *(folder / PARTS).glob(".*.part*")]:
         stale.unlink(missing_ok=True)
-
-
-def _trajectories(request: SimulationRequest) -> list[tuple[str, int]]:
-    """Split and index of every trajectory."""
-    return [(split, index) for split in request.splits for index in range(request.counts[split])]
 
 
 def _missing(folder: Path, wanted: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
@@ -259,7 +183,7 @@ def _simulate_part(
         if interrupted.is_set():
             raise CancelledError
 
-    run = simulate_first_stable(request.preset, request.place(split, index), stop_if_interrupted)
+    run = simulate_first_stable(request.preset, request.entropy(split, index), stop_if_interrupted)
     write_part(part_path(folder, split, index), run)
 
 
@@ -279,8 +203,8 @@ def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[st
     for split in request.splits:
         stored = Split(folder / f"{split}.h5")
         for index in range(len(stored)):
-            place, seed = request.place(split, index), int(stored.attributes(index)["seed"])
-            draw = next(draw for draw in range(DRAWS) if seed_of_draw(place, draw) == seed)
+            entropy, seed = request.entropy(split, index), int(stored.attributes(index)["seed"])
+            draw = next(draw for draw in range(DRAWS) if seed_of_draw(entropy, draw) == seed)
             if draw:
                 found.setdefault(split, {})[str(index)] = draw
     return found

@@ -56,7 +56,7 @@ class Metadata:
         gravity: Acceleration in length/s² per axis, or None where unknown.
         particle_volume: Volume of a particle in length ** dim, or None where unknown.
         densities: Mass density of materials in kg / length ** dim, by name; empty where unknown.
-        fields: Names of the fields that every trajectory has, which models are told of.
+        fields: Names of the fields that every trajectory has, which are inputs of models.
         extra: Every other key of the file, unchanged.
     """
 

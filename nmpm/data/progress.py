@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
+
+from nmpm._support.progress import lacks_widgets, progress_columns
 
 
 @contextmanager
@@ -18,10 +20,7 @@ def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Callab
         total: Number of steps; None where it is unknown.
         done: Steps that are done already.
     """
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    console = Console(stderr=True)
+    with Progress(*progress_columns(), console=console, disable=lacks_widgets(console)) as progress:
         task = progress.add_task(what, total=total, completed=done)
         yield lambda: progress.advance(task)

@@ -1,4 +1,4 @@
-"""Seeds of simulated trajectories, and the ones that take the place of seeds whose simulations become unstable."""
+"""Seeds of simulated trajectories, and their replacements where a simulation becomes unstable."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nmpm.sim import Preset
 from nmpm.sim.trajectory import Progress, SimulatedTrajectory
 
 DRAWS = 5
-"""Seeds tried for one trajectory; a preset that is unstable as often in a row is at fault, not the seed."""
+"""Seeds tried for one trajectory; if all are unstable, the preset is at fault."""
 
 _log = logging.getLogger(__name__)
 
@@ -25,28 +25,28 @@ def derive_seed(*entropy: int) -> int:
     return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def seed_of_draw(place: tuple[int, ...], draw: int) -> int:
-    """The seed of a trajectory after `draw` others turned out unstable.
+def seed_of_draw(entropy: tuple[int, ...], draw: int) -> int:
+    """The seed of a trajectory after `draw` seeds before it were unstable.
 
     Args:
-        place: The dataset's seed and what tells the trajectory from the dataset's others.
+        entropy: Numbers that identify the trajectory: the dataset's seed, and its split and index or the like.
         draw: 0 for the first seed.
     """
-    return derive_seed(*place, draw) if draw else derive_seed(*place)
+    return derive_seed(*entropy, draw) if draw else derive_seed(*entropy)
 
 
-def try_seeds(place: tuple[int, ...], simulate: Callable[[int], Simulated]) -> Simulated:
-    """What is simulated from the first of a trajectory's seeds that stays stable; a warning names each that does not.
+def try_seeds(entropy: tuple[int, ...], simulate: Callable[[int], Simulated]) -> Simulated:
+    """The simulation from the first stable seed of a trajectory; logs a warning for each unstable one.
 
     Args:
-        place: As for `seed_of_draw`.
+        entropy: As for `seed_of_draw`.
         simulate: Simulates from a seed.
 
     Raises:
         UnstableError: if none of `DRAWS` seeds stays stable.
     """
     for draw in range(DRAWS):
-        seed = seed_of_draw(place, draw)
+        seed = seed_of_draw(entropy, draw)
         try:
             return simulate(seed)
         except UnstableError as error:
@@ -56,7 +56,7 @@ def try_seeds(place: tuple[int, ...], simulate: Callable[[int], Simulated]) -> S
 
 
 def simulate_first_stable(
-    preset: Preset, place: tuple[int, ...], progress: Progress | None = None
+    preset: Preset, entropy: tuple[int, ...], progress: Progress | None = None
 ) -> SimulatedTrajectory:
     """A preset's trajectory, see `try_seeds`; `progress` is called after each frame.
 
@@ -64,4 +64,4 @@ def simulate_first_stable(
         UnstableError: if no seed stays stable.
         ConfigError: if no initial state fits into the box.
     """
-    return try_seeds(place, lambda seed: preset.simulate(seed, progress))
+    return try_seeds(entropy, lambda seed: preset.simulate(seed, progress))

@@ -41,14 +41,18 @@ def sample_bodies(scenes: Sequence[Sequence[Body]], scene: Scene, grid: Grid) ->
         grid: What the model rasterises onto.
 
     Returns:
-        (K, 2) points in domain length, of all scenes together; (B, K) shares of a particle's volume, differentiable
+        (K, D) points in domain length, of all scenes together; (B, K) shares of a particle's volume, differentiable
         with respect to the bodies' parameters. Both float64, on the CPU.
 
     Raises:
-        ConfigError: if the scene is not in two dimensions, or a body is impossible or outside of the domain.
+        ConfigError: if a body has another number of dimensions than the scene, is impossible, or outside of the domain.
     """
-    if grid.dim != 2:
-        raise ConfigError(f"Bodies are obstacles in two dimensions; this model's scenes have {grid.dim}.")
+    for body in (body for bodies in scenes for body in bodies):
+        if body.dim != grid.dim:
+            raise ConfigError(
+                f"{type(body).__name__} is a body in {body.dim} dimensions, and this model's scenes have {grid.dim}:"
+                " Ramp, Disc and Polygon are for two, Box and Sphere for three."
+            )
     points = lattice(grid, SAMPLES)
     solid = torch.stack([_union(bodies, points, grid) for bodies in scenes])
     near = (solid.detach() > 0).any(0)

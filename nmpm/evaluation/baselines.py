@@ -1,4 +1,4 @@
-"""Trivial predictors: what an emulator must beat for its error to mean something."""
+"""Trivial predictors: an emulator shows skill where its error is below theirs."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def free_fall(scene: Scene, particles: Particles, frames: int) -> Tensor:
 def _stop_at_walls(path: Tensor, low: float, high: float) -> Tensor:
     """A path (B, T, N) held at the first bound it reaches; at the lower one if it reaches both at once."""
     frames = torch.arange(path.shape[1], device=path.device).view(1, -1, 1)
-    below, above = _first(path <= low, frames), _first(path >= high, frames)
+    below, above = _first_frame_where(path <= low, frames), _first_frame_where(path >= high, frames)
     held = torch.where(below <= above, torch.full_like(path[:, :1], low), high)
     return torch.where(frames >= torch.minimum(below, above), held, path)
 
 
-def _first(found: Tensor, frames: Tensor) -> Tensor:
-    """(B, 1, N): the first of the frames (1, T, 1) at which something (B, T, N) is found; T where it never is."""
+def _first_frame_where(found: Tensor, frames: Tensor) -> Tensor:
+    """(B, 1, N): the first of the frames (1, T, 1) at which `found` (B, T, N) holds; T where it never does."""
     return torch.where(found, frames, found.shape[1]).amin(1, keepdim=True)

@@ -1,4 +1,4 @@
-"""What means over a few test scenes are uncertain by: the percentile bootstrap over scenes."""
+"""Uncertainty of means over a few test scenes: the percentile bootstrap over scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LEVELS = (2.5, 97.5)
 
 
 def resampled_means(errors: Floats, seed: int = 0, resamples: int = RESAMPLES) -> Floats:
-    """Mean errors (R, P) in resamples of S scenes, from the errors (P, S) of P points; the same seed, the same bits."""
+    """Mean errors (R, P) in resamples of S scenes, from the errors (P, S) of P points; deterministic for a seed."""
     scenes = errors.shape[1]
     chosen = np.random.default_rng(seed).integers(0, scenes, (resamples, scenes))
     weights = np.stack([np.bincount(row, minlength=scenes) for row in chosen]) / scenes

@@ -33,7 +33,7 @@ def wall_clock() -> float:
 
 
 def clock_for(device: torch.device, threads: int) -> tuple[str, Clock]:
-    """What a computation is timed by, and its name.
+    """The name of the clock that a computation is timed by, and the clock.
 
     One thread of a CPU by its CPU time, which other programs disturb less; everything else by wall time.
     """
@@ -43,7 +43,7 @@ def clock_for(device: torch.device, threads: int) -> tuple[str, Clock]:
 
 
 def peak_bytes(action: Action, device: torch.device) -> float:
-    """Most memory that an action holds at a time, beyond what was held before it.
+    """Peak memory of an action, beyond what was allocated before it, in bytes.
 
     On CUDA that of torch's tensors, on the CPU that of the process. NaN where there is no such counter: on MPS, and on
     systems other than Linux.

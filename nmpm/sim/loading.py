@@ -11,6 +11,7 @@ import omegaconf
 import yaml
 from omegaconf import OmegaConf
 
+from nmpm._support.messages import one_line, suggestion
 from nmpm.errors import ConfigError
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset
@@ -34,7 +35,9 @@ def load_preset(name_or_path: str | Path) -> Preset:
     text = preset_text(name_or_path)
     try:
         return preset_from_dict(OmegaConf.to_container(OmegaConf.create(text), resolve=True))
-    except (yaml.YAMLError, omegaconf.errors.OmegaConfBaseException, ConfigError) as error:
+    except yaml.YAMLError as error:
+        raise ConfigError(f"Preset {name_or_path}: it is not YAML ({one_line(error)}).") from error
+    except (omegaconf.errors.OmegaConfBaseException, ConfigError) as error:
         raise ConfigError(f"Preset {name_or_path}: {error}") from error
 
 
@@ -48,8 +51,11 @@ def preset_text(name_or_path: str | Path) -> str:
     if str(name_or_path) not in preset_names():
         path = Path(name_or_path)
     if not path.is_file():
-        known = ", ".join(preset_names())
-        raise ConfigError(f"There is no preset or file {name_or_path}; shipped presets: {known}.")
+        names = preset_names()
+        raise ConfigError(
+            f"There is no preset or file {name_or_path}; shipped presets: {', '.join(names)}."
+            + suggestion(str(name_or_path), names)
+        )
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:

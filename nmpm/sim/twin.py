@@ -1,4 +1,4 @@
-"""The twin: a simulator with other time steps, whose distance from it is what it is itself uncertain about."""
+"""The twin: the simulator with other time steps; the distance of the two estimates the simulator's own error."""
 
 from __future__ import annotations
 

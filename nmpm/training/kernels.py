@@ -51,7 +51,7 @@ class PositionErrors(torch.autograd.Function):
 
         def follow(b: int) -> None:
             arrays = as_array(predicted[b]), as_array(target[b]), as_array(mask[b])
-            square_slopes(*arrays, ctx.spacing, ctx.frames, pull[b], found[b])
+            square_gradients(*arrays, ctx.spacing, ctx.frames, pull[b], found[b])
 
         for_each(follow, len(found), torch.get_num_threads())
         return torch.from_numpy(found), None, None, None, None
@@ -132,7 +132,7 @@ def sum_squares(predicted: Any, target: Any, mask: Any, spacing: Any, frames: An
 
 
 @jit
-def square_slopes(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, slope: Any, found: Any) -> Any:
+def square_gradients(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, slope: Any, found: Any) -> Any:
     """Fill in `found` (T, N, D), the gradient with respect to `predicted`, from `slope` (T / frames,); see above."""
     scale = 2 / (frames * predicted.shape[2] * np.float64(mask.sum()))
     for frame in range(len(predicted)):

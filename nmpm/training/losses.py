@@ -130,7 +130,7 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
         grid: Gives the cells' size.
         frames: m; T is a multiple of it.
     """
-    if _kernels_take(predicted, target, grid):
+    if _kernels_support(predicted, target, grid):
         from nmpm.training.kernels import PositionErrors
 
         errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
@@ -169,7 +169,7 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
         A number; NaN if there is no real particle.
     """
     fraction = scene.particle_volume / grid.cell_volume
-    count = _kernel_counts if _kernels_take(predicted, target, grid) else _counts
+    count = _kernel_counts if _kernels_support(predicted, target, grid) else _counts
     found, true = (fraction * count(grid.to_cells(frames), window, scene, grid) for frames in (predicted, target))
     particles = window.mask.sum() * predicted.shape[1]
     return (found - true).square().sum() / (2 * fraction * particles)
@@ -191,7 +191,7 @@ def _kernel_counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> T
     return counts
 
 
-def _kernels_take(predicted: Tensor, target: Tensor, grid: Grid) -> bool:
+def _kernels_support(predicted: Tensor, target: Tensor, grid: Grid) -> bool:
     """Whether the kernels can compute the error: with gradients with respect to the prediction alone."""
     fixed = not target.requires_grad and not torch.compiler.is_compiling()
     return fixed and grid.dim == 2 and kernels_take(predicted, target)  # see `Plan.trains`

@@ -31,15 +31,15 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import check_mirrors, mirror_windows
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.losses import FieldError, TrainingError
-from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
-from nmpm.training.parts import (
+from nmpm.training.compatibility import (
     adopt_optimizer_arguments,
     changed_arguments,
     check_same_optimizer,
     check_same_recipe,
     check_same_scene,
 )
+from nmpm.training.losses import FieldError, TrainingError
+from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
 from nmpm.training.schedules import Schedule
 
 CALIBRATION_BATCHES = 4

@@ -79,7 +79,7 @@ class RunFolder:
         if not path.is_file():
             others = ", ".join(str(file) for file in sorted(path.parent.glob("*.ckpt"))) or "none"
             raise ConfigError(
-                f"--ckpt_path {given}: there is no {path}; checkpoints there: {others}. Leave the option out to start"
-                " a new run."
+                f"--ckpt_path {given}: there is no {path}; checkpoints there: {others}. To start a new run, call"
+                " nmpm fit without the option."
             )
         return path

@@ -1,6 +1,6 @@
 """Pictures of particle trajectories: snapshots (PNG) and animations (GIF, MP4), drawn from NumPy arrays.
 
-Usage::
+Usage:
 
     trajectories = LabelledTrajectories({"simulation": truth, "prediction": rollout}, material, bounds=bounds, dt=dt)
     write_snapshots(trajectories, "rollout.png")

@@ -9,6 +9,8 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import Progress
 
+from nmpm._support.progress import progress_columns
+
 DELAY = 2.0
 """Seconds before the bar appears."""
 
@@ -18,7 +20,7 @@ Item = TypeVar("Item")
 def with_progress_bar(items: Iterable[Item], total: int, description: str) -> Iterator[Item]:
     """Yields the items, with a progress bar on the terminal (standard error) after `DELAY` seconds."""
     console = Console(stderr=True)
-    progress = Progress(console=console, transient=True)
+    progress = Progress(*progress_columns(), console=console, transient=True)
     task = progress.add_task(description, total=total)
     start = time.monotonic()
     visible = False

@@ -1,4 +1,4 @@
-"""Emulators from recipes that others wrote: bounded in size before anything is allocated."""
+"""Emulators from untrusted recipes: their size is checked before anything is allocated."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_recipe(plain: Mapping[str, Any]) -> EmulatorRecipe:
 
 
 def build(recipe: EmulatorRecipe) -> Emulator:
-    """The emulator of a recipe, while the size of its network is watched."""
+    """The emulator of a recipe; raises as `bounded_network` where its network is too large."""
     with bounded_network():
         return recipe.build()
 

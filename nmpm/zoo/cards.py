@@ -116,12 +116,12 @@ def _twin_lines(card: Mapping[str, Any]) -> list[str]:
 
 
 def _failure_lines(card: Mapping[str, Any]) -> list[str]:
-    """What a person saw to be wrong in the pictures."""
+    """Failures that a person saw in the pictures."""
     return [f"Known failures: {card['failures']}", ""] if card.get("failures") else []
 
 
 def _goal_lines(card: Mapping[str, Any]) -> list[str]:
-    """What the full-rollout error was meant to be."""
+    """The goal for the full-rollout error, and whether it is reached."""
     goal = card.get("goal")
     if goal is None:
         return []
@@ -177,7 +177,7 @@ def _speed_lines(card: Mapping[str, Any]) -> list[str]:
 
 
 def _lifecycle_lines(card: Mapping[str, Any]) -> list[str]:
-    """What keeps a model from being relied on."""
+    """Why a model is a preview or superseded."""
     texts = {
         "preview": f"**Preview**: its full-rollout error is not {FACTOR:g} times lower than a trivial predictor's.",
         "superseded": f"**Superseded** by `{card.get('superseded_by')}`.",

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nmpm._support.devices import same_hardware
 from nmpm.errors import ZooError
 
 
@@ -62,7 +63,8 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
 def stated_milliseconds(card: Mapping[str, Any], hardware: str) -> float | None:
     """The time per frame that a card states for a hardware; None where it states none."""
     entries: Sequence[Mapping[str, Any]] = card.get("speed") or ()
-    return next((float(entry["ms_per_frame"]) for entry in entries if entry.get("hardware") == hardware), None)
+    own = [entry for entry in entries if same_hardware(str(entry.get("hardware")), hardware)]
+    return float(own[0]["ms_per_frame"]) if own else None
 
 
 def _measured(cards: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:

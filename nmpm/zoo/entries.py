@@ -25,7 +25,7 @@ REAL = frozenset({torch.float16, torch.bfloat16, torch.float32, torch.float64})
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """What an entry's card says.
+    """The content of an entry's card.
 
     Raises:
         ZooError: if it is missing or damaged.

@@ -1,4 +1,4 @@
-"""A short rollout that an entry's card states, to notice that weights, statistics or code have changed."""
+"""A short rollout stored on an entry's card, which detects changes of weights, statistics or code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nmpm.zoo.pretrained import Pretrained
 FRAMES = 32
 COUNT = 300
 PROBES = 8
-"""Particles whose last positions are stated."""
+"""Number of particles whose last positions are stored."""
 TOLERANCE = 1e-3
 """Largest distance from a stated position, in cells: other processors and versions of torch round differently."""
 

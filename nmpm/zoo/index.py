@@ -1,4 +1,4 @@
-"""The table of all models of a zoo, and entries brought up to date with the code that writes cards."""
+"""Writes the table of a zoo's models, and rewrites cards, READMEs and charts of its entries."""
 
 from __future__ import annotations
 
@@ -47,16 +47,19 @@ def write_index(root: Path) -> Path:
     return path
 
 
-def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None) -> None:
-    """Write again what is derived from an entry's card and weights: lifecycle, README and chart.
+def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None, failures: str | None = None) -> None:
+    """Rewrite what is derived from an entry's card and weights: lifecycle, README and chart.
 
-    A golden rollout is added where the card has none; one that there is stays, as it would hide a change. The card is
-    written after each measure.
+    A golden rollout is added where the card has none; an existing one is kept, as replacing it would hide a change
+    of the results. The card is written after each measure.
 
     Args:
         folder: Of the entry.
         measures: What to measure for the card, of `nmpm.zoo.measures.MEASURES`.
         data: Folder of the dataset, which spares the simulation of the test scenes; needed for recorded data.
+        failures: What the entry's pictures show to be wrong in its rollouts, in sentences, for the card; empty to state
+            nothing, None to leave what the card states. New weights make a new card, without it: their pictures have
+            to be looked at again.
 
     Raises:
         ZooError: if a file is missing or damaged, or a measure is unknown.
@@ -69,26 +72,13 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
     card = {"format": CARD_FORMAT} | read_card(folder)
     card |= {"lifecycle": lifecycle(card)}
     card.setdefault("golden", golden_rollout(model.emulator))
+    if failures is not None:
+        card.pop("failures", None)
+        card |= {"failures": " ".join(failures.split())} if failures.strip() else {}
     write_card(folder, card)
     for name in measures:
         card |= MEASURES[name](model, folder, data)
         write_card(folder, card)
-
-
-def state_failures(folder: Path, text: str) -> None:
-    """Write on an entry's card what its pictures show to be wrong in its rollouts.
-
-    New weights make a new card, without it: their pictures have to be looked at again.
-
-    Args:
-        folder: Of the entry.
-        text: In sentences; empty if nothing is known.
-
-    Raises:
-        ZooError: if the card is missing or damaged.
-    """
-    card = {key: value for key, value in read_card(folder).items() if key != "failures"}
-    write_card(folder, card | ({"failures": " ".join(text.split())} if text.strip() else {}))
 
 
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""How far a model of the zoo is to be relied on, decided by its card's figures."""
+"""The lifecycle of a zoo model (active, preview or superseded), derived from its card's figures."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Pretrained:
             dtype: Of positions, velocities and gravity; float64 for domains far from the origin.
             fields: Of `scene.fields`, by name: a number for all particles, (N,) or (B, N); (B,) of those that each
                 scene has one of. One that is left out has its mean over the training data.
-            bodies: Obstacles of `nmpm.obstacles`, in two dimensions: a list for all scenes, or a list for each of B. To
+            bodies: Obstacles of `nmpm.obstacles`, of D dimensions: a list for all scenes, or a list for each of B. To
                 their parameters, such as angles and sizes, gradients flow.
 
         Returns:

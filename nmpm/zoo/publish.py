@@ -21,6 +21,7 @@ from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module
 from nmpm.zoo.cards import readme, stress_digest
 from nmpm.zoo.charts import write_chart
+from nmpm.zoo.entries import CARD
 from nmpm.zoo.golden import golden_rollout
 from nmpm.zoo.index import write_index
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
@@ -59,12 +60,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
 def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
     """Like `add`, in place of the entry `root/name` where there is one."""
     target = _writable_zoo(root) / check_name(name)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".replaced-", dir=root) as old:
-        _publish(run, name, Path(old) / "new", about)
-        if target.exists():
-            os.replace(target, Path(old) / "old")
-        os.replace(Path(old) / "new", target)
+    _publish(run, name, target, about)
     write_index(root)
     return target
 
@@ -117,19 +113,22 @@ def _writable_zoo(zoo: Path) -> Path:
 
 
 def _write(target: Path, weights: bytes, texts: Mapping[str, str], files: Sequence[Path]) -> None:
+    """Write an entry's folder, in place of a former one; variants, which lie within it, stay."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=".adding-", dir=target.parent))
-    try:
-        (part / "model.safetensors").write_bytes(weights)
+    with tempfile.TemporaryDirectory(prefix=".adding-", dir=target.parent) as folder:
+        new, former = Path(folder) / "new", Path(folder) / "former"
+        new.mkdir()
+        (new / "model.safetensors").write_bytes(weights)
         for name, text in texts.items():
-            (part / name).write_text(text, encoding="utf-8")
+            (new / name).write_text(text, encoding="utf-8")
         for file in files:
-            shutil.copyfile(file, part / file.name)
-        write_chart(part)
-        part.chmod(0o755)
-        os.replace(part, target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+            shutil.copyfile(file, new / file.name)
+        write_chart(new)
+        for card in target.glob(f"*/{CARD}"):
+            shutil.copytree(card.parent, new / card.parent.name)
+        if target.exists():
+            os.replace(target, former)
+        os.replace(new, target)
 
 
 def _card(name: str, about: str, figures: Mapping[str, Any], emulator: Emulator) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Models of one's own trainings: checkpoints, with a card of what their run says."""
+"""Models of one's own trainings: checkpoints, with a card made from the run's report."""
 
 from __future__ import annotations
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from nmpm.data.format import Split, Trajectory, read_metadata, split_paths
-from nmpm.data.generate import SimulationRequest, preset_metadata
+from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader, SplitRecordings
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names

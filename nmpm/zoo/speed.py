@@ -6,7 +6,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from nmpm._support.devices import device_name
+from nmpm._support.devices import device_name, same_hardware
 from nmpm.emulator import rollout
 from nmpm.evaluation.machine import peak_bytes, wall_clock
 from nmpm.particles import Particles
@@ -20,7 +20,8 @@ PARTICLES = 1000
 def speed_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
     """The key `speed` of a card: what `measure_speed` finds, beside what is known of other hardware."""
     found = measure_speed(model)
-    others = [entry for entry in model.card.get("speed", []) if entry["hardware"] != found["hardware"]]
+    known = model.card.get("speed", [])
+    others = [entry for entry in known if not same_hardware(entry["hardware"], found["hardware"])]
     return {"speed": [*others, found]}
 
 

@@ -7,7 +7,7 @@ from tests.evaluation.trade.made_up import tiny_emulator, tiny_scenes
 def test_help_teaches(capsys):
     with pytest.raises(SystemExit):
         main(["compare", "--help"])
-    out = capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
     for word in ("--data waterdrop-xl", "--wider 2", "runs/mine", "frames.png", "measures only what is new"):
         assert word in out
 

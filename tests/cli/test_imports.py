@@ -69,6 +69,6 @@ def test_the_names_that_are_checked_early_are_those_of_the_parts():
 
 
 def test_simulators_and_numba_are_imported_for_simulated_data_alone():
-    script = "import sys; import nmpm.cli.emulator_cli; print(sorted({'numba', 'nmpm.sim'} & set(sys.modules)))"
+    script = "import sys; import nmpm.cli.run_training; print(sorted({'numba', 'nmpm.sim'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -13,7 +13,7 @@ def test_the_shipped_sweep_is_printed(capsys):
 def test_help_teaches(capsys):
     with pytest.raises(SystemExit):
         main(["trade", "--help"])
-    out = capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
     for word in ("runs/a", "--print_config", "goes on after an interruption", "trade.html"):
         assert word in out
 

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.generate import SimulationRequest, generate
+from nmpm.data.generate import generate
 from nmpm.data.seeds import seed_of_draw
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import MpmPreset, load_preset
 

@@ -12,7 +12,7 @@ from nmpm.emulator.bodies import SAMPLES, sample_bodies, solid_share
 from nmpm.emulator.constraints import Constraints
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.obstacles import Body, Disc, Polygon, Ramp
+from nmpm.obstacles import Body, Box, Disc, Polygon, Ramp, Sphere
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
 from nmpm.scene import Scene
@@ -40,7 +40,7 @@ def emulator(scene: Scene = SCENE, **constraints) -> Emulator:
 def state(model: Emulator, *scenes: list[Body]) -> Particles:
     """In float64, with the bodies of each scene."""
     scenes = scenes or ([],)
-    particles = cloud(SCENE, 12, batch=len(scenes))
+    particles = cloud(model.scene, 12, batch=len(scenes))
     points, share = sample_bodies(scenes, model.scene, model.grid)
     given = {name: getattr(particles, name).double() for name in ("position", "velocity", "gravity")}
     return dataclasses.replace(
@@ -180,10 +180,66 @@ def test_bodies_that_no_cell_would_see_are_refused(bodies, message):
         sample_bodies([bodies], SCENE, Grid.of(SCENE, 32))
 
 
-def test_bodies_have_two_dimensions():
-    scene = box(3, obstacles=True)
-    with pytest.raises(ConfigError, match="two dimensions"):
-        sample_bodies([[Disc((0.5, 0.5), 0.1)]], scene, Grid.of(scene, 8))
+@pytest.mark.parametrize(("dim", "body"), [(3, Disc((0.5, 0.5), 0.1)), (2, Sphere((0.5, 0.5, 0.5), 0.1))])
+def test_bodies_have_the_dimensions_of_the_scene(dim, body):
+    scene = box(dim, obstacles=True)
+    with pytest.raises(ConfigError, match=f"and this model's scenes have {dim}: Ramp, Disc and Polygon are for two"):
+        sample_bodies([[body]], scene, Grid.of(scene, 8))
+
+
+SPACE = {
+    "box": (
+        lambda *given: Box(given[:3], given[3:6], given[6:]),
+        (0.5, 0.45, 0.5, 0.4, 0.3, 0.2, 0.3, -0.2, 0.1),
+        0.4 * 0.3 * 0.2,
+    ),
+    "sphere": (lambda *given: Sphere(given[:3], given[3]), (0.5, 0.45, 0.5, 0.2), 4 / 3 * math.pi * 0.2**3),
+}
+every_body_in_space = pytest.mark.parametrize(("make", "parameters", "volume"), SPACE.values(), ids=SPACE)
+
+
+def model_in_space(**constraints) -> Emulator:
+    torch.manual_seed(0)
+    recipe = EmulatorRecipe(
+        box(3, obstacles=True), 12, frames=2, processor=UNet(4, 1), constraints=Constraints(**constraints)
+    )
+    return recipe.build().double().eval().requires_grad_(False)
+
+
+@every_body_in_space
+def test_the_cells_hold_the_volume_of_a_body_in_space(make, parameters, volume):
+    model = model_in_space()
+    field = (model.solid(state(model, [make(*parameters)])) - model.walls)[0, 0]
+    assert float(field.sum()) * model.grid.cell_volume == pytest.approx(volume, rel=0.03)
+    assert float(field.max()) == pytest.approx(1.0)
+
+
+@every_body_in_space
+def test_gradients_of_bodies_in_space_are_those_of_finite_differences(make, parameters, volume):
+    """Through p2g, the network and several bundles, without the constraints, which have kinks."""
+    model = model_in_space(solids=False)
+    weight = torch.randn(12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+    def loss(*given: torch.Tensor) -> torch.Tensor:
+        end = differentiable_rollout(model, state(model, [make(*given)]), FRAMES)[:, -1]
+        return 1e4 * (end * weight).sum()
+
+    values = leaves(parameters)
+    assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-6, rtol=2e-3)
+    for slope in torch.autograd.grad(loss(*values), values):
+        assert slope.abs() > 1e-4  # far above the tolerance
+
+
+def test_particles_in_space_come_to_rest_on_a_box_and_not_in_it():
+    model = model_in_space()
+    own = state(model, [Box((0.5, 0.5, 0.3), (0.6, 0.6, 0.2))])
+    above = own.position.clone()
+    above[..., 2] = 0.45
+    fast = torch.zeros_like(above)
+    fast[..., 2] = -0.03
+    moved = dataclasses.replace(own, position=above, velocity=fast)
+    end = differentiable_rollout(model, moved, 10)[:, -1]
+    assert end[..., 2].min() > 0.38
 
 
 def test_a_points_volume_is_its_part_of_a_cell():

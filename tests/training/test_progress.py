@@ -100,3 +100,14 @@ def test_a_terminal_without_a_width_shows_the_line_nevertheless(make_dataset, tm
         written = os.read(controller, 65536).decode()
     os.close(controller)
     assert "step 2/2" in written
+
+
+def test_an_evaluation_in_a_file_ends_its_line_and_says_what_is_left(capsys):
+    progress = Progress()
+    progress._bar = progress._open("testing", 2)
+    progress._count_batch()
+    progress._count_batch()
+    progress._close()
+    said = capsys.readouterr().out
+    assert said.endswith("\n")
+    assert "testing 2/2, 00:00 left" in said

@@ -10,12 +10,15 @@ from nmpm.training.callbacks.report import ReportWriter
 def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
-    assert "threads" in device_name(torch.device("cpu"))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    assert device_name(torch.device("cpu")).endswith(", 2 threads")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    assert device_name(torch.device("cpu")).endswith(", 1 thread")
     assert device_name(torch.device("cuda", 1)) == "GPU of cuda:1"
     assert device_name(torch.device("mps")) == "mps"
 
 
-@pytest.mark.parametrize(("device", "name"), [("cpu", "threads"), ("cuda:0", "GPU of cuda:0")])
+@pytest.mark.parametrize(("device", "name"), [("cpu", "thread"), ("cuda:0", "GPU of cuda:0")])
 def test_a_report_names_the_device_that_the_trainer_used(monkeypatch, device, name):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")

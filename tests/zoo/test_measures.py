@@ -93,3 +93,10 @@ def test_known_failures_are_on_the_card_until_they_are_taken_back(goop, capsys):
     assert "Known failures" not in (goop / "README.md").read_text()
     assert main(["zoo", "refresh", "--root", str(goop.parent), "--failures", "Dust."]) == 1
     assert "give the model's NAME too" in capsys.readouterr().err
+
+
+def test_a_refresh_with_failures_writes_the_entry_once(goop, monkeypatch):
+    written = []
+    monkeypatch.setattr("nmpm.zoo.index.write_chart", written.append)
+    refresh(goop, failures="Splashes become dust.")
+    assert written == [goop]

@@ -251,7 +251,19 @@ def test_hours_of_the_entry_count_and_its_error_is_to_be_improved(tmp_path, seco
     history = History(Dataset("small", "goop.yaml", 2.0), folder, Extension(hours=1.0, gain=0.03, limit=4.0), entry)
     assert history.next_round() == following
     if hours is not None:
-        assert history.length(len(errors) + 1) == hours
+        assert history.hours_of(len(errors) + 1) == hours
+
+
+def test_planned_hours_read_the_card_of_the_entry_once(tmp_path, monkeypatch):
+    entry = tmp_path / "small"
+    entry.mkdir()
+    card = {"training": {"seconds": 1800, "steps": 7}, "curve": [[900.0, 5, 0.2]]}
+    read = []
+    monkeypatch.setattr("nmpm.zoo.queue.published.read_yaml", lambda path: read.append(path) or card)
+    (entry / "card.yaml").touch()
+    history = History(Dataset("small", "goop.yaml", 2.0), tmp_path / "runs", Extension(hours=1.0), entry)
+    assert history.planned_hours(3) == 0.5 + 1.5 + 1.0 + 1.0
+    assert read == [entry / "card.yaml"]
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from nmpm.evaluation.bootstrap import interval
 from nmpm.sim import load_preset
 from nmpm.sim.twin import twin_of
 from nmpm.zoo import Zoo
+from nmpm.zoo.choice import stated_milliseconds
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.lifecycle import lifecycle
@@ -177,6 +178,13 @@ def variants(root, small, write_entry) -> Path:
 )
 def test_a_variant_is_chosen_by_name_error_or_time(variants, limits, chosen):
     assert Zoo.load("pond", variants, **limits).card["test"] == Zoo.card(f"pond/{chosen}", variants)["test"]
+
+
+def test_times_of_cards_of_earlier_versions_count_for_the_same_processor():
+    card = {"speed": [{"hardware": "AMD EPYC, 1 threads", "ms_per_frame": 2.0}]}
+    assert stated_milliseconds(card, "AMD EPYC, 1 thread") == 2.0
+    assert stated_milliseconds(card, "AMD EPYC, 11 threads") is None
+    assert stated_milliseconds({"speed": [{"ms_per_frame": 2.0}]}, "AMD EPYC, 1 thread") is None
 
 
 def test_limits_that_no_variant_keeps_or_no_card_states_are_named(variants):

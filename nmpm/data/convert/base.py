@@ -29,7 +29,7 @@ class Options:
         dt: Time between stored frames, in seconds.
         gravity: Acceleration in length/s² per axis.
         periodic: Whether each axis is periodic.
-        fields: Names of fields that models are told of.
+        fields: Names of the fields that are inputs of models.
     """
 
     family: str | None = None

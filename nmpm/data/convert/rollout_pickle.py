@@ -22,7 +22,7 @@ class RolloutPickle(DatasetFormat):
     """A `rollout_*.pkl` of DeepMind's code or its PyTorch successors, or a folder of them."""
 
     name: ClassVar[str] = "rollout-pickle"
-    summary: ClassVar[str] = "rollouts as DeepMind's code pickles them (initial_positions, ground_truth_rollout, …)"
+    summary: ClassVar[str] = "rollouts as DeepMind's code pickles them (ground_truth_rollout, …)"
 
     def recognises(self, path: Path) -> bool:
         return bool(_files(path))

@@ -1,4 +1,4 @@
-"""What an inspection says of the fields that trajectories store, and of the channels that they make."""
+"""Summary of the fields that trajectories store, and of the input channels that they make."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class FieldSurvey:
         return tuple(name for name, facts in self.facts.items() if facts.kind != "constant")
 
     def channels(self, materials: Sequence[str]) -> dict[str, str]:
-        """For each field a phrase that says how it differs, and which channels of the materials that makes."""
+        """For each field a phrase: how it varies, and the input channels that it makes with these materials."""
         return {name: self._describe(name, facts, materials) for name, facts in self.facts.items()}
 
     def _describe(self, name: str, facts: FieldFacts, materials: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ import torch
 from nmpm.data.loading.background import run_in_thread
 from nmpm.data.loading.padded_batch import PaddedRecordings
 from nmpm.data.loading.recording import Recording
-from nmpm.data.loading.window_plan import MOTION, WindowPlan
+from nmpm.data.loading.window_plan import Drawn, WindowPlan
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
@@ -54,7 +54,7 @@ class MotionSampler:
         self.windows = [(index, start) for index, distance in distances.items() for start in range(len(distance))]
         self.cumulative = np.cumsum(np.concatenate(list(distances.values())))
 
-    def window_at(self, quantile: float) -> tuple[int, int]:
+    def window_at(self, quantile: float) -> Drawn:
         """The window (trajectory, first frame) at a quantile in [0, 1) of the summed distance.
 
         Any window where nothing moves.
@@ -89,7 +89,7 @@ class _BufferContents:
         """Number of particles of a trajectory."""
         return self.recordings[trajectory].frames.shape[1]
 
-    def gather(self, drawn: Sequence[tuple[int, int]], length: int, particles: int) -> Window:
+    def gather(self, drawn: Sequence[Drawn], length: int, particles: int) -> Window:
         """The windows, padded to a number of particles."""
         row = {trajectory: row for row, trajectory in enumerate(self.recordings)}
         trajectories, starts = zip(*drawn, strict=True)
@@ -142,14 +142,18 @@ class TrajectoryBuffer:
             finally:
                 upcoming.cancel()
 
-    def _deal(self, bucket: range, contents: _BufferContents, rank: int, world: int) -> list[list[tuple[int, int]]]:
+    def _deal(self, bucket: range, contents: _BufferContents, rank: int, world: int) -> list[list[Drawn]]:
         """The windows of each of a bucket's batches, of all ranks that share the buffer."""
         together = len(self.plan.drawing_ranks(rank, world)) == world
         own = (0, 1) if together else (rank, world)
-        drawn: list[tuple[int, int]] = []
+        drawn: list[Drawn] = []
         for index in bucket:
-            step = self._emphasise(self.plan.draw(index, rank, world), contents.motion, index, *own)
-            drawn += self.plan.open(step, index, *own)
+            windows = self.plan.draw(index, rank, world)
+            if contents.motion is not None:
+                windows = self.plan.emphasise(windows, contents.motion.window_at, index, *own)
+            if self.plan.openings:
+                windows = self.plan.move_to_openings(windows, index, *own)
+            drawn += windows
         return self.plan.deal(bucket, drawn, [contents.size(trajectory) for trajectory, _ in drawn])
 
     def _load(self, members: Sequence[int], previous: _BufferContents | None) -> _BufferContents:
@@ -165,21 +169,3 @@ class TrajectoryBuffer:
         recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}
         motion = MotionSampler(recordings, self.plan.length) if self.plan.emphasis else None
         return _BufferContents(padded.to(self.device), recordings, motion)
-
-    def _emphasise(
-        self, drawn: list[tuple[int, int]], motion: MotionSampler | None, index: int, rank: int, world: int
-    ) -> list[tuple[int, int]]:
-        """Replaces a share of the windows by others that are drawn in proportion to motion.
-
-        Random numbers are drawn for the batches of all ranks, as a single process with one large batch would, and each
-        rank uses its own slice of them.
-        """
-        if motion is None:
-            return drawn
-        rng = np.random.default_rng((self.plan.seed, MOTION, index, 0))
-        replaced = rng.random(len(drawn) * world) < self.plan.emphasis
-        first = rank * len(drawn)
-        own = replaced[first : first + len(drawn)]
-        before = int(replaced[:first].sum())
-        quantiles = iter(rng.random(before + int(own.sum()))[before:])
-        return [motion.window_at(next(quantiles)) if swap else w for swap, w in zip(own, drawn, strict=True)]

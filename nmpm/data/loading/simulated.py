@@ -44,8 +44,8 @@ class SimulatedRecordings:
         Raises:
             ConfigError: if the simulation fails from several seeds in a row; names preset and seed.
         """
-        place = (self.seed, _STREAM, index)
-        run = simulate_first_stable(self.preset, place, progress=lambda _: raise_if_abandoned())
+        entropy = (self.seed, _STREAM, index)
+        run = simulate_first_stable(self.preset, entropy, progress=lambda _: raise_if_abandoned())
         trajectory = Trajectory(run.position, run.particle_type, run.attributes)
         return self.reader.recording(trajectory, f"{self.preset.name}, simulated trajectory {index}")
 

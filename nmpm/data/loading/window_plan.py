@@ -15,7 +15,7 @@ window is drawn as often as without; only its company changes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self, TypeVar
@@ -25,8 +25,10 @@ import numpy as np
 from nmpm.errors import ConfigError
 
 T = TypeVar("T")
+Drawn = tuple[int, int]
+"""A window: index of its trajectory, and its first frame there."""
 
-_TRAJECTORIES, _WINDOWS, MOTION, _BUCKETS, _OPENINGS = 0, 1, 2, 3, 4  # separate the streams of random numbers
+_TRAJECTORIES, _WINDOWS, _MOTION, _BUCKETS, _OPENINGS = 0, 1, 2, 3, 4  # separate the streams of random numbers
 
 OPENING = 16
 """Frames that count as the opening of a trajectory."""
@@ -117,16 +119,16 @@ class WindowPlan:
         buffers, turn = divmod(since - left, per_buffer)
         return self.start.buffer + 1 + buffers, turn * stride
 
-    def batch(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
+    def batch(self, index: int, rank: int, world: int) -> list[Drawn]:
         """The windows of a batch before buckets are dealt, each as (trajectory index, first frame)."""
         return self._draw(index, rank, world, self._offset(rank), self.batch_size)
 
-    def draw(self, index: int, rank: int, world: int) -> list[tuple[int, int]]:
+    def draw(self, index: int, rank: int, world: int) -> list[Drawn]:
         """As `batch`, of all ranks that share a rank's buffer, one after the other."""
         ranks = self.drawing_ranks(rank, world)
         return self._draw(index, rank, world, self._offset(ranks.start), self.batch_size * len(ranks))
 
-    def _draw(self, index: int, rank: int, world: int, offset: int, number: int) -> list[tuple[int, int]]:
+    def _draw(self, index: int, rank: int, world: int, offset: int, number: int) -> list[Drawn]:
         buffer, drawn = self.locate(index, world)
         members = self.members(buffer, rank, world)
         ends = np.cumsum([self.windows(trajectory) for trajectory in members])
@@ -139,20 +141,29 @@ class WindowPlan:
             for owner, window in zip(owners, chosen, strict=True)
         ]
 
-    def open(self, drawn: Sequence[tuple[int, int]], index: int, rank: int, world: int) -> list[tuple[int, int]]:
-        """The windows of a rank's batch, a share of them moved to the openings of their trajectories.
+    def emphasise(
+        self, drawn: Sequence[Drawn], window_at: Callable[[float], Drawn], index: int, rank: int, world: int
+    ) -> list[Drawn]:
+        """The windows of a rank's batch, a share of them replaced by `window_at` of random quantiles in [0, 1)."""
+        rng = np.random.default_rng((self.seed, _MOTION, index, 0))
 
-        Random numbers are drawn for the batches of all ranks, as a single process with one large batch would.
-        """
-        if not self.openings:
-            return list(drawn)
+        def draw_quantiles(count: int) -> np.ndarray:
+            replaced = rng.random(count) < self.emphasis
+            quantiles = np.full(count, np.nan)
+            quantiles[replaced] = rng.random(int(replaced.sum()))
+            return quantiles
+
+        quantiles = _draw_for_rank(draw_quantiles, len(drawn), rank, world)
+        return [w if np.isnan(quantile) else window_at(quantile) for w, quantile in zip(drawn, quantiles, strict=True)]
+
+    def move_to_openings(self, drawn: Sequence[Drawn], index: int, rank: int, world: int) -> list[Drawn]:
+        """The windows of a rank's batch, a share of them moved to the openings of their trajectories."""
         rng = np.random.default_rng((self.seed, _OPENINGS, index, 0))
-        moved = rng.random(len(drawn) * world) < self.openings
-        firsts = rng.integers(0, OPENING, len(drawn) * world)
-        own = slice(rank * len(drawn), (rank + 1) * len(drawn))
+        moved = _draw_for_rank(lambda count: rng.random(count) < self.openings, len(drawn), rank, world)
+        firsts = _draw_for_rank(lambda count: rng.integers(0, OPENING, count), len(drawn), rank, world)
         return [
             (trajectory, min(int(first), self.windows(trajectory) - 1) if move else frame)
-            for (trajectory, frame), move, first in zip(drawn, moved[own], firsts[own], strict=True)
+            for (trajectory, frame), move, first in zip(drawn, moved, firsts, strict=True)
         ]
 
     def bucket_of(self, index: int, world: int) -> range:
@@ -249,6 +260,18 @@ class EndlessWindowPlan(WindowPlan):
 
     def _offset(self, rank: int) -> int:  # noqa: ARG002
         return 0
+
+
+def _draw_for_rank(draw: Callable[[int], np.ndarray], count: int, rank: int, world: int) -> np.ndarray:
+    """A rank's slice of random numbers that are drawn for all ranks, as a single process with one large batch would.
+
+    Args:
+        draw: Draws so many numbers.
+        count: Numbers of a rank.
+        rank: The rank.
+        world: Number of ranks.
+    """
+    return draw(count * world)[rank * count : (rank + 1) * count]
 
 
 @lru_cache(maxsize=8)

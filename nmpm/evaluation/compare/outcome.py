@@ -1,4 +1,4 @@
-"""What was measured of one predictor."""
+"""The measurements of one predictor."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class Outcome:
 
     @property
     def name(self) -> str:
-        """Of the predictor."""
+        """Name of the predictor."""
         return self.candidate.choice.name
 
     @property
     def kind(self) -> Kind:
-        """Of the predictor."""
+        """Kind of the predictor."""
         return self.candidate.choice.kind
 
     @property

@@ -1,4 +1,4 @@
-"""What is compared: models taken to the scenes of a dataset, its simulator, and trivial predictors."""
+"""The predictors of a comparison: the simulator and its twin, models rebuilt over the scenes, trivial predictors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from nmpm.sim.twin import twin_of
 
 @dataclass(frozen=True)
 class Candidate:
-    """Something that predicts scenes, and how far from its own scenes they are.
+    """A predictor, and the facts in which the scenes differ from those of its training.
 
     Args:
-        choice: What predicts.
-        differing: Facts of the scenes that are not those of the model's training, by name; empty at home, and for all
-            that is not trained.
+        choice: The predictor.
+        differing: Names of the facts in which the scenes differ from those of the model's training; empty where none
+            does, and for predictors that are not trained.
     """
 
     choice: Choice
@@ -32,7 +32,7 @@ class Candidate:
 
     @property
     def reproduces(self) -> bool:
-        """Whether it made the scenes, so that it has no error: the simulator as shipped."""
+        """Whether it is the simulator that made the scenes, as shipped, whose error is 0."""
         return self.choice.kind is Kind.SIMULATOR
 
 
@@ -40,8 +40,8 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
     """The simulator of the scenes, if it is known, and its twin; the models; the trivial predictors.
 
     A model of other scenes is rebuilt over these, with grid cells of the size it was trained with, see
-    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: what its own results are
-    uncertain by.
+    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: its error is
+    an estimate of the simulator's own.
 
     Args:
         scenes: What is predicted.

@@ -47,7 +47,7 @@ class TrainedGraph:
 
     @property
     def label(self) -> str:
-        """Its name in charts, which says whether it has converged."""
+        """Its name in charts; "not converged" is part of it where that is so."""
         return f"GNS, {self.minutes:.3g} min of training" + ("" if self.converged else ", not converged")
 
 

@@ -1,4 +1,4 @@
-"""Which particles see each other."""
+"""Radius graphs: edges between neighbouring particles."""
 
 from __future__ import annotations
 

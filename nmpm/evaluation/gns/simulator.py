@@ -52,7 +52,7 @@ class GraphRecipe:
 
     @property
     def radius(self) -> float:
-        """Of the graph, in domain length."""
+        """Radius of the graph, in domain length."""
         return self.reach * self.scene.particle_spacing
 
     @property
@@ -86,7 +86,7 @@ class GraphRecipe:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What does not move with the particles of one scene.
+    """The inputs of a scene that stay the same over a rollout.
 
     Args:
         material: (N,) int64.

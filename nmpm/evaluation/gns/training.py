@@ -89,7 +89,7 @@ def window_at(recording: Recording, frame: int, history: int) -> GraphWindow:
 
 
 def draw_window(recordings: Sequence[Recording], history: int, generator: torch.Generator) -> GraphWindow:
-    """A window of any recording and frame, all frames alike."""
+    """A window of any recording and frame, all frames equally likely."""
     recording = recordings[int(torch.randint(len(recordings), (), generator=generator))]
     last = len(recording.frames) - 1
     return window_at(recording, int(torch.randint(1, last, (), generator=generator)), history)

@@ -1,4 +1,4 @@
-"""What constraints hide: lines that a constraint makes pass whatever the network predicts, measured without it."""
+"""Tests without constraints: those that a constraint makes pass whatever the network predicts."""
 
 from __future__ import annotations
 

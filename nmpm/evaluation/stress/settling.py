@@ -1,4 +1,4 @@
-"""Settling: from ordinary starts to well past rest, does the material stand as high as in the simulator?"""
+"""Settling: the shape of the material once it is at rest, beside the simulator's from the same initial states."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _NEEDS = f"height, occupied cells and crowding within {MAX_DEVIATION:.0%} of the
 def settling(subject: Subject, size: Size) -> Iterator[Line]:
     """Shape beside the simulator's at the same frames, with constraints and without.
 
-    Constraints freeze what they take for resting, so that measuring only what rests would test them, not the network.
-    The simulator's own scatter, its twin's shape beside its own, stands beside each figure.
+    Constraints freeze particles that hardly move, so that a test of resting material alone would test them, not the
+    network. Each figure is reported beside that of the simulator's twin, which shows the simulator's own scatter.
     """
     if subject.preset is None or not subject.emulator.scene.gravity_known:
         yield Line(_GROUP, "shape beside the simulator: there is none, or gravity is unknown", None, {})

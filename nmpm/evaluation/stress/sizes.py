@@ -1,4 +1,4 @@
-"""Size and symmetry: wider boxes, other grids, and what turns, mirrors and shifts of the scene do to a rollout."""
+"""Size and symmetry: wider boxes, other grids, and rollouts of rotated, mirrored and shifted scenes."""
 
 from __future__ import annotations
 

@@ -22,9 +22,9 @@ _GROUP = "fast and slow"
 def speeds(subject: Subject, size: Size) -> Iterator[Line]:
     """Initial speeds and gravity times a factor, beside the simulator where there is one that stays stable."""
     for factor in SPEEDS:
-        yield _line(subject, f"initial speed × {factor:g}", _with_speed(subject, factor, size))
+        yield _line(subject, f"initial speed × {factor:g}", _changed_window(subject, size, speed=factor))
     for factor in GRAVITIES:
-        yield _line(subject, f"gravity × {factor:g}", _with_gravity(subject, factor, size))
+        yield _line(subject, f"gravity × {factor:g}", _changed_window(subject, size, gravity=factor))
 
 
 def compare_window(subject: Subject, window: Window) -> tuple[Trace, dict[str, float]]:
@@ -49,17 +49,11 @@ def _line(subject: Subject, name: str, window: Window) -> Line:
     return Line(_GROUP, name, trace.valid, figures, INVARIANTS)
 
 
-def _with_speed(subject: Subject, factor: float, size: Size) -> Window:
+def _changed_window(subject: Subject, size: Size, *, speed: float = 1.0, gravity: float = 1.0) -> Window:
+    """Scenes with initial speeds and gravity times a factor: simulated, or two frames and nothing to compare with."""
     if subject.preset is not None:
         with suppress(UnstableError):
-            return simulate_window(subject, subject.preset.varied(speed=factor), size.scenes, size.compared)
+            changed = subject.preset.varied(speed=speed, gravity=gravity)
+            return simulate_window(subject, changed, size.scenes, size.compared)
     state = subject.starts(size.scenes)
-    return Window.of(state.with_motion(state.position, factor * state.velocity))
-
-
-def _with_gravity(subject: Subject, factor: float, size: Size) -> Window:
-    if subject.preset is not None:
-        with suppress(UnstableError):
-            return simulate_window(subject, subject.preset.varied(gravity=factor), size.scenes, size.compared)
-    state = subject.starts(size.scenes)
-    return Window.of(dataclasses.replace(state, gravity=factor * state.gravity))
+    return Window.of(dataclasses.replace(state, velocity=speed * state.velocity, gravity=gravity * state.gravity))

@@ -30,7 +30,7 @@ class Subject:
         emulator: In evaluation mode, on the device that the battery runs on.
         horizon: Frames that its training unrolled.
         preset: The simulator of its training data; None where they were recorded.
-        seed: Decides the scenes.
+        seed: Of the scenes.
     """
 
     name: str
@@ -56,8 +56,8 @@ class Subject:
         few = max(1, min(1000, int(0.1 * scene.volume / scene.particle_volume)))
         return thrown_blocks(scene, count=few, seed=self.seed).to(self.device)
 
-    def places(self, count: int) -> list[tuple[int, int, int]]:
-        """What the seeds of scenes that no dataset holds are derived from, see `nmpm.data.seeds`."""
+    def entropies(self, count: int) -> list[tuple[int, int, int]]:
+        """Numbers that the seeds of scenes outside of any dataset are derived from, see `nmpm.data.seeds`."""
         return [(self.seed, _STREAM, index) for index in range(count)]
 
     def with_emulator(self, emulator: Emulator) -> Subject:
@@ -77,7 +77,9 @@ def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -
     Raises:
         UnstableError: if the simulator does not stay stable from several seeds in a row.
     """
-    recordings = [recording for place in subject.places(count) for recording in _record(preset, place, frames, ())]
+    recordings = [
+        recording for entropy in subject.entropies(count) for recording in _record(preset, entropy, frames, ())
+    ]
     return collate(recordings, preset.scene).to(subject.device)
 
 
@@ -92,14 +94,14 @@ def simulate_beside(
 ) -> Iterator[list[Window]]:
     """The scenes of `simulate_window` one by one, each as the preset and as others simulate it.
 
-    A scene from which any of them does not stay stable makes room for another.
+    A scene in which any of them becomes unstable is replaced by another.
     """
-    for place in subject.places(count):
-        recordings = _record(preset, place, frames, others)
+    for entropy in subject.entropies(count):
+        recordings = _record(preset, entropy, frames, others)
         yield [collate([recording], preset.scene).to(subject.device) for recording in recordings]
 
 
-def _record(preset: Preset, place: tuple[int, ...], frames: int, others: Sequence[Preset]) -> list[Recording]:
+def _record(preset: Preset, entropy: tuple[int, ...], frames: int, others: Sequence[Preset]) -> list[Recording]:
     """One scene as the preset and others simulate it, from the first seed with which all stay stable."""
     reader = RecordingReader(preset_metadata(preset), preset.scene)
 
@@ -111,4 +113,4 @@ def _record(preset: Preset, place: tuple[int, ...], frames: int, others: Sequenc
             found.append(reader.recording(stored, f"{preset.name}, seed {seed}"))
         return found
 
-    return try_seeds(place, simulate)
+    return try_seeds(entropy, simulate)

@@ -147,7 +147,7 @@ def rms_distance(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor
 
 
 def filled_volume(emulator: Emulator, start: Particles, position: Tensor) -> Tensor:
-    """(B,) volume of what the particles fill over their own volume: less than at the start where they clump.
+    """(B,) volume that the particles occupy over the sum of their own; it falls where they clump.
 
     A cell counts with the share of it that particles fill, and a crowded one as full.
     """

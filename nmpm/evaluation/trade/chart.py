@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.messages import counted
 from nmpm.evaluation.trade.choice import Kind
 from nmpm.evaluation.trade.frontier import Standing, describe_measure, standings
 from nmpm.evaluation.trade.labels import Box, boxes_along, boxes_around, choose_boxes
@@ -85,7 +86,7 @@ def _draw_points(axes: Any, points: Sequence[Point], where: Mapping[str, Standin
 
 
 def _draw_exact(axes: Any, point: Point) -> Any:
-    """A vertical line, as an error of 0 is nowhere on a logarithmic axis; returns its text."""
+    """A vertical line, as a logarithmic axis has no place for an error of 0; returns its text."""
     colour = _MARKERS[point.kind]["color"]
     axes.axvline(point.milliseconds, color=colour, lw=1)
     return axes.annotate(
@@ -99,7 +100,7 @@ def _describe(axes: Any, shown: Sequence[Point], measure: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     one = shown[0].times if shown else None
-    machine = "" if one is None else f"; {one.hardware}, {shown[0].threads} thread, {one.clock}"
+    machine = "" if one is None else f"; {one.hardware}, {counted(shown[0].threads, 'thread')}, {one.clock}"
     axes.set(
         xscale="log", yscale="log", xlabel=f"milliseconds per frame, one scene at a time{machine}",
         ylabel=describe_measure(measure),

@@ -1,4 +1,4 @@
-"""The contract of choices: anything that rolls scenes out."""
+"""The interface of choices: whatever predicts scenes in a comparison of time and error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CPU = torch.device("cpu")
 
 
 class Kind(StrEnum):
-    """What a choice is; floors are drawn beside the others and never advised."""
+    """The kind of a choice; floors are drawn beside the others and never advised."""
 
     MODEL = "model"
     GRAPH = "graph"
@@ -34,11 +34,11 @@ class Choice(ABC):
     """One way of predicting scenes, at one setting.
 
     Args:
-        kind: What it is.
+        kind: Kind of predictor.
         name: Unique among the choices that are compared.
-        settings: What was chosen, by column of the table.
+        settings: Its settings, by column of the table.
         batch: Scenes predicted at once when it is timed; predictions do not depend on it.
-        threads: Of torch, when it is timed.
+        threads: Threads of torch when it is timed.
         device: Where it computes.
     """
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from nmpm._support.messages import suggestion
 from nmpm.data.catalog import catalog, dataset_folder, describe, ensure, find_simulated
-from nmpm.data.generate import SimulationRequest, generate
+from nmpm.data.generate import generate
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError
 from nmpm.evaluation.trade.scenes import Scenes, read_scenes
 from nmpm.sim import load_preset
@@ -26,7 +28,10 @@ def find_scenes(dataset: str, count: int) -> Scenes:
         folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
         return read_scenes(dataset, folder, count)
     if not Path(dataset).is_dir():
-        raise ConfigError(f"{dataset} is neither a folder nor an embedded dataset: {', '.join(catalog())}.")
+        known = ", ".join(catalog())
+        raise ConfigError(
+            f"{dataset} is neither a folder nor an embedded dataset: {known}.{suggestion(dataset, catalog())}"
+        )
     return read_scenes(Path(dataset).name, Path(dataset), count)
 
 

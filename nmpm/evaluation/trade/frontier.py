@@ -32,18 +32,18 @@ POOLS: Mapping[str, Callable[[Point], bool]] = MappingProxyType(
         "no simulator": lambda point: point.kind is not Kind.SIMULATOR,
     }
 )
-"""What a user has to choose from, by name: where data were recorded there is no simulator."""
+"""Which points a user can choose from, by name: recorded data come without a simulator."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a point stands in one error.
+    """A point's mean error with its interval, and its membership in the Pareto set.
 
     Args:
         mean: Over scenes.
         low, high: Bootstrap interval of 95%.
         member: Whether it is in the Pareto set: of one scene at a time if its batch is 1, else of all choices.
-        probability: Of that, under resampling of the scenes.
+        probability: Share of resamples of the scenes in which it is a member.
     """
 
     mean: float
@@ -55,12 +55,12 @@ class Standing:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to run from a budget on, up to that of the next advice.
+    """What to run for budgets from `milliseconds` up to that of the next advice.
 
     Args:
         milliseconds: Smallest budget per frame for which it holds.
-        name: The choice; empty where nothing is fast enough.
-        sentence: It in words.
+        name: Name of the choice; empty where nothing is fast enough.
+        sentence: The advice in words.
     """
 
     milliseconds: float
@@ -74,7 +74,7 @@ def describe_measure(name: str) -> str:
 
 
 def standings(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str, Standing]:
-    """Where each point stands that has the error in all scenes, by name."""
+    """The standing of each point that has the error in all scenes, by name."""
     known = [point for point in points if math.isfinite(point.mean(measure))]
     if not known:
         return {}

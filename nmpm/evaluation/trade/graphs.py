@@ -21,7 +21,7 @@ class GraphChoice(Choice):
         name: Unique among the choices.
         graph: The simulator and its training.
         settings: What was chosen.
-        threads: Of torch, when it is timed.
+        threads: Threads of torch when it is timed.
     """
 
     name: str

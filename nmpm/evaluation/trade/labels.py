@@ -1,4 +1,4 @@
-"""Places of names in a picture: of the boxes that each name may have, those that cover the least, in pixels."""
+"""Label placement in a picture: of each name's candidate boxes, the one that overlaps the least, in pixels."""
 
 from __future__ import annotations
 

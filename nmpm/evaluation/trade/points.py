@@ -1,4 +1,4 @@
-"""Points of the trade: what each choice costs in time and has in errors."""
+"""Points of the trade: time and errors of each choice."""
 
 from __future__ import annotations
 

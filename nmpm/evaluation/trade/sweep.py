@@ -13,6 +13,7 @@ from types import MappingProxyType
 import torch
 import yaml
 
+from nmpm._support.messages import counted
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.evaluation.gns import TrainedGraph
@@ -36,15 +37,15 @@ from nmpm.sim.config import from_section, section_entries
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """Settings of every model, all combinations of them.
+    """Settings of every model; all combinations of them are measured.
 
     Args:
-        precision: Of the network, see `models.PRECISIONS`.
+        precision: Precisions of the network, see `models.PRECISIONS`.
         constraints: "held" and "free", see `models.CONSTRAINTS`.
-        cells: Times as many grid cells along each axis as in training.
+        cells: Factors on the number of grid cells along each axis, relative to training.
         runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
-        batch: Scenes at once.
-        threads: Of torch.
+        batch: Batch sizes, in scenes.
+        threads: Numbers of torch's threads.
     """
 
     precision: tuple[str, ...] = ("float32", "bfloat16")
@@ -60,7 +61,7 @@ class SimulatorSettings:
     """Settings of the simulator.
 
     Args:
-        coarser: Times as wide cells (SPH: particles); 1 is as shipped.
+        coarser: Factors on the width of cells (SPH: on the spacing of particles); 1 is as shipped.
         substeps: Shares of the shipped number of substeps, which a coarser simulation divides by its factor. Those that
             turn out unstable are reported as such; `Preset.stable_substeps` is measured too.
     """
@@ -71,11 +72,11 @@ class SimulatorSettings:
 
 @dataclass(frozen=True)
 class Floors:
-    """What accuracy means at best.
+    """Limits of accuracy: errors of the simulator compared with itself.
 
     Args:
         nudge: Noise on the initial positions, as a share of the domain's longest side; 0 for none.
-        twin: The simulator with so large a share of its substeps; 0 for none.
+        twin: Share of the simulator's substeps that its twin takes; 0 for no twin.
     """
 
     nudge: float = 1e-6
@@ -144,8 +145,8 @@ def read_sweep(text: str, where: str) -> Sweep:
     """The sweep of a YAML text; what it leaves out is as shipped.
 
     Args:
-        text: Of the file.
-        where: Its name, for errors.
+        text: Content of the file.
+        where: Name of the file, for errors.
 
     Raises:
         ConfigError: naming the key that is unknown or wrong.
@@ -222,7 +223,7 @@ def _with_substeps(preset: Preset, substeps: int) -> Preset | None:
 
 def _simulator_name(factor: int, substeps: int) -> str:
     coarse = "" if factor == 1 else f"1/{factor} resolution, "
-    return f"simulator, {coarse}{substeps} substep{'s' * (substeps > 1)}"
+    return f"simulator, {coarse}{counted(substeps, 'substep')}"
 
 
 def _simulator_settings(factor: int, substeps: int) -> dict[str, str | int | float]:
@@ -253,7 +254,7 @@ def _models(settings: ModelSettings, name: str, emulator: Emulator, device: torc
                 f"{cells:g} × cells": cells != 1,
                 runtime: runtime != settings.runtime[0],
                 f"batch {batch}": batch != 1,
-                f"{threads} threads": threads != settings.threads[0],
+                counted(threads, "thread"): threads != settings.threads[0],
             }
             yield ModelChoice(
                 name=", ".join([name, *(part for part, shown in parts.items() if shown)]),

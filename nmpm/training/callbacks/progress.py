@@ -134,13 +134,14 @@ class Progress(ProgressBar):
         bar.update(0)
 
     def _open(self, what: str, total: float, keep: bool = False) -> Tqdm:
-        form = "{percentage:3.0f}% |{bar:20}| {desc}" if keep else "{desc} {n_fmt}/{total_fmt}"
-        pause = 0.2 if sys.stdout.isatty() else LOG_FILE_SECONDS
+        form = "{percentage:3.0f}% |{bar:20}| {desc}" if keep else "{desc} {n_fmt}/{total_fmt}, {remaining} left"
+        terminal = sys.stdout.isatty()
+        pause = 0.2 if terminal else LOG_FILE_SECONDS
         columns, rows = _missing_size()
         return Tqdm(
             desc=what,
             total=total,
-            leave=keep,
+            leave=keep or not terminal,  # a file keeps what is written: what follows starts a line of its own
             bar_format=form,
             file=sys.stdout,
             disable=not self._enabled,

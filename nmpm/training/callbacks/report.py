@@ -195,7 +195,8 @@ def _logged(trainer: Trainer, prefix: str) -> dict[str, float]:
 
 def _print_table(what: str, errors: Mapping[str, float]) -> None:
     names = figure_names(errors)
-    table = Table(title=f"{what} error ×10⁻³ (MSE in length², EMD in length)")
+    units = "MSE in length², EMD in length" if any(name.startswith("emd") for name in names) else "MSE in length²"
+    table = Table(title=f"{what} error ×10⁻³ ({units})")
     table.add_column("predictor")
     for name in names:
         table.add_column(name, justify="right")

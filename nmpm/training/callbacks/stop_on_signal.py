@@ -1,4 +1,4 @@
-"""Stop a training at Ctrl-C or SIGTERM without losing a step."""
+"""Stop a training at Ctrl-C or SIGTERM, with a checkpoint of its last step."""
 
 from __future__ import annotations
 

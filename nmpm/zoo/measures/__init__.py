@@ -1,4 +1,4 @@
-"""What `nmpm zoo refresh --measure` adds to cards, one measure per file.
+"""The measures that `nmpm zoo refresh --measure` adds to cards, one per file.
 
 A measure takes a model, its entry's folder and the folder of its data, or None to simulate its test scenes from their
 seeds; it returns the keys of the card that it replaces, and may write pictures into the entry's folder. Times are

@@ -1,4 +1,4 @@
-"""What the simulator of a model's data is itself uncertain about: its test scenes, simulated again.
+"""Uncertainty of the simulator itself: the test scenes simulated again, with other substeps or nudged positions.
 
 The *twin* has other time steps; the *floor*, which no prediction gets below, starts from positions that differ by 10⁻⁶
 of the domain.

@@ -1,1 +1,1 @@
-"""The training of the whole zoo: what to train, how far it is, and when a dataset stops. Used by `zoo/train.py`."""
+"""Training of the whole zoo, used by `zoo/train.py`: the queue, its progress, and when a dataset's training stops."""

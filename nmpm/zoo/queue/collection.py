@@ -12,7 +12,7 @@ from typing import Any
 from nmpm._support.atomic import atomic_write
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
-from nmpm.data.generate import SimulationRequest
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ZooError
 from nmpm.zoo.entries import load_entry, read_card
 from nmpm.zoo.index import refresh, write_card, write_index
@@ -102,12 +102,12 @@ def _request(dataset: Dataset) -> tuple[str, SimulationRequest]:
 
 def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
     """The report of a test with the time, steps and curve of all trainings before it."""
-    parts = history.parts
+    stages = history.stages
     best = history.best() or history.trainings[-1]
-    until = parts[: parts.index(best) + 1]
+    until = stages[: stages.index(best) + 1]
     training = report["training"] | {
-        "steps": sum(part.steps() for part in until),
-        "seconds": round(sum(part.seconds() for part in until), 1),
+        "steps": sum(stage.steps() for stage in until),
+        "seconds": round(sum(stage.seconds() for stage in until), 1),
         "precision": best.precision(),
     }
     return report | {"training": training, "curve": history.curve()}

@@ -16,7 +16,7 @@ from nmpm.errors import ConfigError
 from nmpm.zoo.registry import check_name
 
 OPEN = "???"
-"""What a configuration says instead of a value that is to be given."""
+"""Placeholder in a configuration for a value that the user has to give."""
 VALIDATIONS = 30
 """Validations in a training: points of the curve on the card."""
 
@@ -48,7 +48,7 @@ class Dataset:
         hours: Of the first training.
         publish: Whether its model goes into the zoo.
         options: Further values of the configuration, by dotted keys.
-        about: What the card says of the data, beside their name.
+        about: Description of the data on the card, beside their name.
         goal: What the full-rollout MSE on the test split is meant to be, in domain length squared; for the card.
         start: Another dataset of the queue, whose best weights the first training starts from, at the extension's rate.
     """
@@ -157,12 +157,12 @@ class Plan:
 
 
 def new_training(dataset: Dataset) -> list[str]:
-    """The words of `nmpm fit` for a training from random weights, without its folder and device."""
+    """The arguments of `nmpm` for a training from random weights, without its folder and device."""
     return _words(dataset.config, dataset.hours, dataset.options)
 
 
 def continued_training(dataset: Dataset, hours: float, rate: float, best: Path) -> list[str]:
-    """The words of `nmpm fit` for a training from the weights of a checkpoint, at `rate` times the learning rate."""
+    """The arguments of `nmpm` for a training from the weights of a checkpoint, at `rate` times the learning rate."""
     start = {"model.optimizer.init_args.lr": rate * dataset.learning_rate(), "start_from": str(best)}
     return _words(dataset.config, hours, {**dataset.options, **start})
 

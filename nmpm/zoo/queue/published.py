@@ -1,10 +1,11 @@
-"""What an entry of the zoo brings into further trainings of its dataset: its weights, and what they took."""
+"""Entries of the zoo that further trainings start from: weights, validation curve, hours and steps of training."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,39 +20,40 @@ class Published:
 
     Args:
         folder: With its card, configuration and weights.
+        card: The content of its card.
     """
 
     folder: Path
+    card: Mapping[str, Any] = field(compare=False, repr=False)
 
     @classmethod
     def find(cls, folder: Path) -> Published | None:
         """The entry in a folder whose card has a curve to go on with; None where there is none."""
-        entry = cls(folder)
-        return entry if (folder / CARD).is_file() and entry.curve() else None
+        if not (folder / CARD).is_file():
+            return None
+        entry = cls(folder, read_yaml(folder / CARD))
+        return entry if entry.curve() else None
 
     def copy_to(self, folder: Path) -> Published:
-        """Copy it, so that a later entry in its place does not change what trainings started from."""
+        """Copy the entry, so that trainings keep their starting point when the zoo's entry is replaced."""
         part = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)
         shutil.copytree(self.folder, part)
         os.replace(part, folder)
-        return Published(folder)
+        return Published(folder, read_yaml(folder / CARD))
 
     def curve(self) -> list[list[float]]:
         """Seconds of training, steps and MSE of each validation."""
-        return [list(point) for point in self._card().get("curve", [])]
+        return [list(point) for point in self.card.get("curve", [])]
 
     def error(self) -> float:
         """The lowest validation MSE."""
         return min(float(point[2]) for point in self.curve())
 
     def seconds(self) -> float:
-        """Of training."""
-        return float(self._card().get("training", {}).get("seconds", 0.0))
+        """Seconds of training."""
+        return float(self.card.get("training", {}).get("seconds", 0.0))
 
     def steps(self) -> int:
-        """Of training."""
-        return int(self._card().get("training", {}).get("steps", 0))
-
-    def _card(self) -> dict[str, Any]:
-        return read_yaml(self.folder / CARD)
+        """Steps of training."""
+        return int(self.card.get("training", {}).get("steps", 0))

@@ -1,4 +1,4 @@
-"""How far the trainings of a dataset are, read from their folders alone, so that a process may die at any time."""
+"""Progress of the trainings of a dataset, read from their folders alone: a process may be killed at any time."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class Training:
         return self.folder / BEST
 
     def start(self, words: list[str]) -> None:
-        """Write down its command and its configuration, which later changes of the shipped one do not touch."""
+        """Write its command, and a copy of its configuration, so that changes of the shipped one do not reach it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(find_config(words[words.index("--config") + 1]), self.folder / CONFIG)
         with atomic_write(self.folder / WORDS) as part:
             part.write_text(json.dumps(words, indent=1), encoding="utf-8")
 
     def command(self) -> list[str]:
-        """The words of `nmpm fit` that start it or go on with it."""
+        """The arguments of `nmpm` that start it or go on with it."""
         words = [*self._words(), "--trainer.default_root_dir", str(self.folder)]
         if (self.folder / LAST).is_file():
             return [*words, "--ckpt_path", "last"]
@@ -61,7 +61,7 @@ class Training:
         return words
 
     def test_command(self, folder: Path) -> list[str]:
-        """The words of `nmpm test` for the best weights, a copy of which lies in another folder.
+        """The arguments of `nmpm` that test the best weights, of which another folder has a copy.
 
         In float32, as `Zoo.load` runs them.
         """
@@ -82,17 +82,17 @@ class Training:
         return min((point[2] for point in self.curve()), default=float("inf"))
 
     def seconds(self) -> float:
-        """Of training so far, as of its last checkpoint."""
+        """Seconds of training so far, as of its last checkpoint."""
         record = self._record()
         return float(record.get("training", record).get("seconds", record.get("trained_seconds", 0.0)))
 
     def steps(self) -> int:
-        """Of training so far, as of its last checkpoint."""
+        """Steps of training so far, as of its last checkpoint."""
         record = self._record()
         return int(record.get("training", record).get("steps", record.get("trained_steps", 0)))
 
     def precision(self) -> str:
-        """Of the training, as its command or else its configuration states it."""
+        """Precision of the training, as its command or else its configuration states it."""
         words = self._words()
         if "--trainer.precision" in words:
             return words[words.index("--trainer.precision") + 1]
@@ -143,17 +143,18 @@ class History:
         return found
 
     @property
-    def before(self) -> Published | None:
-        """The entry that the first training goes on from, or would; None where it starts from random weights."""
+    def starting_entry(self) -> Published | None:
+        """The entry that the first training goes on from; None where it starts from random weights."""
         copy = Published.find(self.folder / COPY)
         if copy is not None or self.entry is None or self.dataset.start or self.trainings:
             return copy
         return Published.find(self.entry)
 
     @property
-    def parts(self) -> list[Published | Training]:
-        """The entry before the trainings, where there is one, and the trainings."""
-        return [*([] if self.before is None else [self.before]), *self.trainings]
+    def stages(self) -> list[Published | Training]:
+        """The entry that the first training goes on from, where there is one, and the trainings."""
+        entry = self.starting_entry
+        return [*([] if entry is None else [entry]), *self.trainings]
 
     def best(self) -> Training | None:
         """The training of the lowest validation error; None before the first validation."""
@@ -165,34 +166,39 @@ class History:
         trainings = self.trainings
         if trainings and not trainings[-1].finished:
             return len(trainings)
-        return None if (trainings or self.before) and self.stops() else len(trainings) + 1
+        return None if (trainings or self.starting_entry) and self.stops() else len(trainings) + 1
 
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
         trainings, extension = self.trainings, self.extension
-        if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.length(len(trainings) + 1) <= 0:
+        if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.hours_of(len(trainings) + 1) <= 0:
             return True
-        errors = [part.error() for part in self.parts]
+        errors = [stage.error() for stage in self.stages]
         return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
 
-    def length(self, number: int) -> float:
+    def hours_of(self, number: int) -> float:
         """Hours of the training of that number: what the dataset still lacks, else those of an extension."""
-        if number > 1:
-            return self.extension.hours
-        done = 0.0 if self.before is None else self.before.seconds() / 3600
-        return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
+        return self.extension.hours if number > 1 else self._hours_of_first(self._hours_of_entry())
 
     def planned_hours(self, count: int) -> float:
-        """Hours of so many trainings, and of the entry before them."""
-        before = 0.0 if self.before is None else self.before.seconds() / 3600
-        return before + sum(self.length(number) for number in range(1, count + 1))
+        """Hours of so many trainings, at least one, and of the entry that the first one goes on from."""
+        done = self._hours_of_entry()
+        return done + self._hours_of_first(done) + (count - 1) * self.extension.hours
+
+    def _hours_of_entry(self) -> float:
+        entry = self.starting_entry
+        return 0.0 if entry is None else entry.seconds() / 3600
+
+    def _hours_of_first(self, done: float) -> float:
+        """Hours of the first training, after so many hours of the entry that it goes on from."""
+        return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
 
     def open(self, number: int) -> Training:
         """The training of that number, started if it has not been."""
         trainings = self.trainings
         if number <= len(trainings):
             return trainings[number - 1]
-        training, hours, weights = Training(self.folder / str(number)), self.length(number), self._weights()
+        training, hours, weights = Training(self.folder / str(number)), self.hours_of(number), self._weights()
         training.start(
             new_training(self.dataset)
             if weights is None
@@ -202,17 +208,17 @@ class History:
 
     def _weights(self) -> Path | None:
         """What the next training starts from: the best weights so far; None for random ones."""
-        best, before = self.best(), self.before
-        if before is not None and before.folder != self.folder / COPY:
-            before = before.copy_to(self.folder / COPY)
-        if before is not None and (best is None or before.error() <= best.error()):
-            return before.folder
+        best, entry = self.best(), self.starting_entry
+        if entry is not None and entry.folder != self.folder / COPY:
+            entry = entry.copy_to(self.folder / COPY)
+        if entry is not None and (best is None or entry.error() <= best.error()):
+            return entry.folder
         if best is None and self.dataset.start and not self.trainings:
             best = self._origin().best()
         return None if best is None else best.best
 
     def waits_for(self) -> str:
-        """What must be there before the first training, in words; empty where nothing is missing."""
+        """What the first training waits for, in words: data or another training; empty where nothing is missing."""
         if self.dataset.lacks_data:
             return f"--data {self.dataset.name}=FOLDER"
         origin = self._origin().trainings
@@ -228,7 +234,7 @@ class History:
         count = max(len(trainings), 1)
         finished = trainings[-1].finished if trainings else self.next_round() is None
         done = trainings[-1].seconds() / 3600 if trainings else 0.0
-        left = 0.0 if finished else max(self.length(count) - done, 0.0)
+        left = 0.0 if finished else max(self.hours_of(count) - done, 0.0)
         if self.next_round() is None or extension.hours <= 0:
             return left, left
         return left, left + max(extension.limit - self.planned_hours(count), 0.0)
@@ -237,7 +243,7 @@ class History:
         """Seconds, steps and validation MSE over all trainings, one after the other."""
         points: list[list[float]] = []
         seconds, steps = 0.0, 0
-        for part in self.parts:
-            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in part.curve()]
-            seconds, steps = seconds + part.seconds(), steps + part.steps()
+        for stage in self.stages:
+            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in stage.curve()]
+            seconds, steps = seconds + stage.seconds(), steps + stage.steps()
         return points

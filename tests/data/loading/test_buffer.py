@@ -236,8 +236,8 @@ def test_with_emphasis_ranks_together_have_the_batch_of_one_process(make_dataset
 def test_openings_move_windows_to_the_first_frames_of_their_trajectories():
     plan = WindowPlan(frames=(60, 40, 10), length=8, batch_size=1000, buffer_size=3, passes=100, seed=0)
     plain = plan.batch(0, 0, 1)
-    half, whole = (dataclasses.replace(plan, openings=share).open(plain, 0, 0, 1) for share in (0.5, 1.0))
-    assert plan.open(plain, 0, 0, 1) == plain
+    half, whole = (dataclasses.replace(plan, openings=share).move_to_openings(plain, 0, 0, 1) for share in (0.5, 1.0))
+    assert plan.move_to_openings(plain, 0, 0, 1) == plain
     assert [trajectory for trajectory, _ in whole] == [trajectory for trajectory, _ in plain]
     for trajectory, limit in enumerate((OPENING, OPENING, 3)):
         assert {first for own, first in whole if own == trajectory} == set(range(limit))

@@ -121,8 +121,8 @@ def test_scenes_one_by_one_are_those_of_a_window():
 
 def test_scenes_in_which_a_simulator_is_unstable_make_room_for_others(monkeypatch):
     subject = goop()
-    place, simulate_from = subject.places(2)[1], MpmPreset.simulate_from
-    bad = subject.preset.draw(seed_of_draw(place, 0)).position
+    entropy, simulate_from = subject.entropies(2)[1], MpmPreset.simulate_from
+    bad = subject.preset.draw(seed_of_draw(entropy, 0)).position
     twin = twin_of(subject.preset)
 
     def blows_up(preset, start, frames, progress=None):
@@ -134,7 +134,7 @@ def test_scenes_in_which_a_simulator_is_unstable_make_room_for_others(monkeypatc
     monkeypatch.setattr(MpmPreset, "simulate_from", blows_up)
     first, second = (truth for truth, _ in simulate_beside(subject, subject.preset, 2, 5, [twin]))
     assert torch.equal(first.initial.position[0], usual.initial.position[0, : first.initial.position.shape[1]])
-    expected = subject.preset.draw(seed_of_draw(place, 1)).position
+    expected = subject.preset.draw(seed_of_draw(entropy, 1)).position
     assert len(expected) == int(second.mask.sum())
 
 

@@ -1,0 +1,72 @@
+"""Runs LightningCLI: plugins, signals, the exit status, and the release of the run folder's lock."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from jsonargparse import set_parsing_settings
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+
+from nmpm._support.plugins import load_plugins
+from nmpm.cli.console import quiet_lightning
+from nmpm.cli.emulator_cli import EmulatorCLI
+from nmpm.errors import ConfigError
+
+
+def run_command(words: list[str], found: list[str]) -> int:
+    """Run a training command.
+
+    Args:
+        words: As the user gave it.
+        found: The same with the configuration files' paths.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        UsageError: for an option or key that cannot be.
+        ConfigError: if Lightning refuses the configuration.
+        KeyboardInterrupt: at SIGINT and SIGTERM, saying how to go on.
+    """
+    load_plugins()
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
+    sys.argv = [sys.argv[0], *found]
+    locks: list[int] = []
+    try:
+        with quiet_lightning(), _treat_sigterm_like_sigint():
+            EmulatorCLI(
+                words,
+                locks,
+                seed_everything_default=0,
+                parser_kwargs={"parser_mode": "omegaconf+"},
+                save_config_kwargs={"overwrite": True},
+            )
+    except MisconfigurationException as error:
+        raise ConfigError(" ".join(str(error).split())) from error
+    except SystemExit as ended:
+        if isinstance(ended.__context__, KeyboardInterrupt):  # Lightning's answer to it
+            raise ended.__context__ from None
+        raise
+    finally:
+        for descriptor in locks:
+            os.close(descriptor)
+    return 0
+
+
+@contextmanager
+def _treat_sigterm_like_sigint() -> Iterator[None]:
+    """Turn SIGTERM into KeyboardInterrupt, as SIGINT is."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)

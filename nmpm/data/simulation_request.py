@@ -1,0 +1,95 @@
+"""The request for a simulated dataset: its preset, the numbers of trajectories, and the seed of each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nmpm.data.format import SPLITS
+from nmpm.data.seeds import seed_of_draw
+from nmpm.errors import ConfigError, DataError
+from nmpm.sim import Preset
+
+
+@dataclass(frozen=True)
+class SimulationRequest:
+    """Everything that determines a simulated dataset.
+
+    Args:
+        preset: The family of scenes.
+        counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
+        seed: The seeds of all trajectories are derived from it.
+        redrawn: By split and index, the trajectories whose first seeds were unstable, and how many were. Known once
+            they are simulated.
+
+    Raises:
+        ConfigError: if a split is unknown or missing, all are empty, or a number is negative.
+    """
+
+    preset: Preset
+    counts: Mapping[str, int]
+    seed: int = 0
+    redrawn: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not _is_valid_counts(self.counts) or not self.splits or self.seed < 0:
+            raise ConfigError(
+                f"counts = {self.counts}, seed = {self.seed}: give the number of trajectories in each of "
+                f"{', '.join(SPLITS)}, as in {{train: 3, valid: 1, test: 1}}, at least 1 in all; neither they nor the "
+                "seed may be negative."
+            )
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """Names of the splits that have trajectories."""
+        return tuple(split for split in SPLITS if self.counts[split])
+
+    @property
+    def trajectories(self) -> list[tuple[str, int]]:
+        """Split and index of every trajectory."""
+        return [(split, index) for split in self.splits for index in range(self.counts[split])]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The request as plain lists, strings and numbers, without what is known only once it is simulated."""
+        counts = {split: self.counts[split] for split in SPLITS}
+        return {"preset": self.preset.to_dict(), "counts": counts, "seed": self.seed, "revision": self.preset.revision}
+
+    def entropy(self, split: str, index: int) -> tuple[int, int, int]:
+        """The numbers that the seeds of a trajectory are derived from; independent of the counts."""
+        return self.seed, SPLITS.index(split), index
+
+    def trajectory_seed(self, split: str, index: int) -> int:
+        """Seed of one trajectory."""
+        return seed_of_draw(self.entropy(split, index), self.redrawn.get(split, {}).get(str(index), 0))
+
+    def check_same(self, stored: object, folder: Path) -> None:
+        """Compare it with the request that a folder's data were simulated by, as read from its JSON.
+
+        Raises:
+            DataError: naming what differs.
+        """
+        asked = json.loads(json.dumps(self.to_dict()))
+        found = stored if isinstance(stored, dict) else {}
+        differing = [key for key in asked if found.get(key) != asked[key]]
+        if differing:
+            what = "; ".join(_difference(key, found.get(key), asked[key]) for key in differing)
+            raise DataError(
+                f"{folder}: has other data than requested: {what}. Choose another folder, or delete this one."
+            )
+
+
+def _is_valid_counts(counts: object) -> bool:
+    """Whether these are valid numbers of trajectories for all splits."""
+    if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):
+        return False
+    return all(isinstance(number, int) and number >= 0 for number in counts.values())
+
+
+def _difference(key: str, found: Any, asked: Any) -> str:
+    if isinstance(asked, dict) and isinstance(found, dict):
+        inner = [name for name in asked if found.get(name) != asked[name]]
+        return ", ".join(_difference(f"{key}.{name}", found.get(name), asked[name]) for name in inner)
+    return f"{key} is {found}, requested {asked}"
