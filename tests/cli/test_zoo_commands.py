@@ -14,7 +14,7 @@ def home(tmp_path, monkeypatch):
 
 def copy(name, folder):
     folder.mkdir(parents=True)
-    for path in (shipped_folder("zoo") / name).iterdir():
+    for path in (shipped_folder("zoo") / name).glob("*.*"):
         (folder / path.name).write_bytes(path.read_bytes())
 
 

@@ -146,7 +146,7 @@ class TestZoo:
     def root(self, tmp_path) -> Path:
         target = tmp_path / "zoo" / "goop"
         target.mkdir(parents=True)
-        for path in (shipped_folder("zoo") / "goop").iterdir():
+        for path in (shipped_folder("zoo") / "goop").glob("*.*"):
             (target / path.name).write_bytes(path.read_bytes())
         return tmp_path / "zoo"
 

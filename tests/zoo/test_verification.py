@@ -72,7 +72,7 @@ def test_statistics_that_are_not_applied_and_layers_that_are_lost_are_noticed(ch
 def test_a_card_that_states_other_errors_fails_from_the_shell(tmp_path, capsys):
     copy = tmp_path / "zoo" / "goop"
     copy.mkdir(parents=True)
-    for path in (SHIPPED / "goop").iterdir():
+    for path in (SHIPPED / "goop").glob("*.*"):
         (copy / path.name).write_bytes(path.read_bytes())
     words = ["zoo", "--root", str(tmp_path / "zoo"), "verify", "goop"]
     assert main(words) == 0
