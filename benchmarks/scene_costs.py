@@ -45,6 +45,8 @@ ROLLOUT = 50
 LATE = 5
 """The scene of goop that is followed: it comes to rest late."""
 ERROR_FRAMES = {"goop": 399, "waterramps": 599, "channel": 599, "waterdrop3d": 799}
+ROUNDING = 1e-7
+"""Of the nudge, in domain length."""
 
 
 def build_goop(cells: int = 32) -> Emulator:
@@ -171,16 +173,17 @@ def sweep_rest(case: str, chosen: argparse.Namespace) -> Iterator[Row]:
 
 @torch.no_grad()
 def measure_errors(case: str, scenes: int) -> Row:
-    """Mean squared errors of full rollouts over fresh scenes, on and off."""
+    """Mean squared errors of full rollouts over fresh scenes, on, off, and off from positions nudged by rounding."""
     preset = load_preset("waterramps").widened(8) if case == "channel" else load_preset(case)
     emulator = Zoo.load(preset.name).emulator.over(preset.scene).requires_grad_(False)
     frames = ERROR_FRAMES[case]
-    errors: dict[str, list[float]] = {"on": [], "off": []}
+    errors: dict[str, list[float]] = {"on": [], "off": [], "nudged": []}
     for window in simulate_scenes(Subject(case, emulator, 32, preset), preset, scenes, frames):
         count = -(-frames // emulator.frames)
         paths = {
             "on": unroll(emulator, window.initial, count),
             "off": roll_out_plainly(emulator, window.initial, count),
+            "nudged": roll_out_plainly(emulator, nudge(window.initial), count),
         }
         for name, bundles in paths.items():
             errors[name].append(_error(torch.cat([bundle.position for bundle in bundles], 1), window.target))
@@ -188,6 +191,12 @@ def measure_errors(case: str, scenes: int) -> Row:
         sys.stdout.write(f"          {case:14}{latest}\n")
         sys.stdout.flush()
     return {"case": case, "scenes": scenes, **{name: statistics.mean(values) for name, values in errors.items()}}
+
+
+def nudge(particles: Particles) -> Particles:
+    """Particles moved by about as much as float32 rounds positions."""
+    noise = torch.randn(particles.position.shape, generator=torch.Generator().manual_seed(0))
+    return dataclasses.replace(particles, position=particles.position + ROUNDING * noise)
 
 
 def _error(path: Tensor, target: Tensor) -> float:
@@ -272,7 +281,8 @@ def main() -> None:
         if "errors" in chosen.sweeps and case in ERROR_FRAMES
     ]
     for row in errors:
-        sys.stdout.write(f"errors    {row['case']:14}{row['on']:.6g} on, {row['off']:.6g} off\n")
+        found = ", ".join(f"{row[name]:.6g} {name}" for name in ("on", "off", "nudged"))
+        sys.stdout.write(f"errors    {row['case']:14}{found}\n")
     write_json(chosen.json, {"times": rows, "errors": errors})
     if chosen.figure and rows:
         draw(rows, chosen.figure)
