@@ -148,8 +148,8 @@ def test_resumes_with_the_existing_parts(tmp_path, monkeypatch):
 
 
 UNSTABLE = {
-    SimulationRequest(TINY, COUNTS, 5).place("train", 1): 1,
-    SimulationRequest(TINY, COUNTS, 5).place("test", 0): 2,
+    SimulationRequest(TINY, COUNTS, 5).entropy("train", 1): 1,
+    SimulationRequest(TINY, COUNTS, 5).entropy("test", 0): 2,
 }
 """How many of a trajectory's first seeds blow up."""
 
