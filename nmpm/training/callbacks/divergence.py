@@ -52,14 +52,15 @@ class DivergenceGuard(Callback):
         if trainer.global_step % max(1, trainer.log_every_n_steps):  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         loss = outputs["loss"] if isinstance(outputs, dict) else outputs
-        broken = isinstance(loss, Tensor) and not bool(torch.isfinite(loss).all())
+        value = float(loss) if isinstance(loss, Tensor) else None
+        broken = value is not None and not math.isfinite(value)
         # All ranks stop together: one that raised alone would leave the others waiting in their next collective.
         if any_rank(broken, trainer.strategy.root_device):
             raise self._diverged_error(
-                trainer, f"the loss is {float(loss)}" if broken else "the loss of another rank is not finite"
+                trainer, f"the loss is {value}" if broken else "the loss of another rank is not finite"
             )
-        if isinstance(loss, Tensor):
-            self._follow(trainer, float(loss))
+        if value is not None:
+            self._follow(trainer, value)
 
     def on_save_checkpoint(
         self,
@@ -81,8 +82,7 @@ class DivergenceGuard(Callback):
         self._least = min(self._least, typical)
         if typical > MOST_RISE * self._least:
             self._warned = True
-            savers = [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]
-            best = [saver.best_model_path for saver in savers if saver.monitor is not None]
+            best = [saver.best_model_path for saver in _savers(trainer) if saver.monitor is not None]
             start = next((f" --start_from {path}" for path in best if path), "")
             rank_zero_warn(
                 f"At step {trainer.global_step} the loss is {typical / self._least:.0f} times its least (medians of"
@@ -97,13 +97,14 @@ class DivergenceGuard(Callback):
             raise self._diverged_error(trainer, f"the weights {broken or 'of another rank'} are not finite")
 
     def _diverged_error(self, trainer: Trainer, what: str) -> DivergedError:
-        good = [
-            Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}"
-            for saver in trainer.checkpoint_callbacks
-            if isinstance(saver, ModelCheckpoint)
-        ]
+        good = [Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}" for saver in _savers(trainer)]
         kept = [str(path) for path in good if path.is_file()]
         return DivergedError(
             f"The training has diverged: at step {trainer.global_step} {what}. Lower the learning rate, clip gradients"
             f" harder, or unroll fewer bundles. Good checkpoints: {', '.join(kept) or 'none was written yet'}."
         )
+
+
+def _savers(trainer: Trainer) -> list[ModelCheckpoint]:
+    """The callbacks that write checkpoints."""
+    return [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]
