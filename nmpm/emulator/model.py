@@ -8,30 +8,23 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from nmpm._support.collectives import normal_like
 from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection
 from nmpm.emulator.bundle import Bundle as Bundle
 from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
-from nmpm.emulator.departure import Departure
 from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.fused.views import Views
-from nmpm.emulator.outputs import with_output
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
-from nmpm.emulator.steps import FusedSteps, steps_for
+from nmpm.emulator.steps import steps_for
 from nmpm.emulator.windows import Windows
-from nmpm.emulator.windows.reads import check_reads
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -246,50 +239,8 @@ class Emulator(nn.Module):
         return self.runtime.bundle(self, particles, self.context(particles) if context is None else context)
 
     def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
-        """The bundle, operation by operation; only the network is left to the runtime."""
-        device = particles.position.device.type
-        steps = steps_for(self, self._plan, particles, context.solid)
-        if isinstance(steps, FusedSteps) and not torch.compiler.is_compiling():
-            return steps.predict(self, particles, context)
-        with _full_precision(device):
-            cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
-            normalised = self.normalise(state)
-            if self.training and self.recipe.grid_noise > 0:
-                normalised = normalised + self.recipe.grid_noise * normal_like(normalised)
-        own = particles
-
-        def find_path(output: Tensor, readable: Tensor | None) -> tuple[Departure, Tensor, Mapping[str, Tensor]]:
-            with _full_precision(device):
-                flows, scale = output[:, :, : self._flows], self.output_scale[:, : self._flows]
-                start = Departure(cells, velocity, gravity, own.material, own.mask, state, flows, scale, readable)
-                path = steps.path(start, context)
-                return start, path, self._evolve_fields(own, start, path, output) if self.scene.evolving else {}
-
-        start, path, evolved = with_output(self, state, normalised, context, find_path)
-        with _full_precision(device):
-            precision = particles.position.dtype
-            step = path[:, -1] - (path[:, -2] if self.frames > 1 else cells)
-            if self.constraints.density_cap and not self.training:
-                # Spreading is no motion of the material: the velocity is that of the path without it.
-                path = steps.uncrowded(start, path, context)
-            velocity = self.grid.to_displacement(step.to(precision))
-            return Bundle(steps.to_length(path, precision), velocity, evolved)  # the last use of the path's memory
-
-    def _evolve_fields(
-        self, particles: Particles, start: Departure, path: Tensor, output: Tensor
-    ) -> Mapping[str, Tensor]:
-        """The evolving fields along a path (B, m, N, D) in cells, (B, m, N) by name."""
-        if start.readable is not None:
-            check_reads(start.cells, path, start.mask, start.readable, self.grid)
-        places = torch.cat([start.cells.unsqueeze(1), path[:, :-1]], dim=1)
-        rates = output[:, :, self._flows :].to(self.precision) * self.output_scale[:, self._flows :]
-        gather = partial(self.advection.gather, material=particles.material)
-        return self.field_scales.evolve(particles, places, rates, gather)
-
-    @property
-    def _flows(self) -> int:
-        """Number of the output channels that are velocities."""
-        return len(self.scene.materials) * self.scene.dim
+        """The bundle, with only the network left to the runtime."""
+        return steps_for(self, self._plan, particles, context.solid).predict(self, particles, context)
 
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
@@ -298,9 +249,3 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
-
-
-def _full_precision(device: str) -> AbstractContextManager[object]:
-    """A context without autocast; entering one where none is on would cost as much as a small operation."""
-    on = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
-    return torch.autocast(device, enabled=False) if on else nullcontext()

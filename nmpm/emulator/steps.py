@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nmpm.emulator.departure import Departure
 from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.prediction import predict_bundle
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
 from nmpm.transfer.backends import kernels_take
@@ -31,6 +32,10 @@ class Steps(ABC):
     def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
         """What these steps prepare for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
         return None
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        """The next m frames of `emulator`, from these steps and its network."""
+        return predict_bundle(emulator, self, particles, context)
 
     @abstractmethod
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -110,7 +115,9 @@ class FusedSteps(Steps):
         return found
 
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        """The bundle of `emulator`, without operations of torch around the network; not in graphs being traced."""
+        """As `Steps.predict`; outside of graphs being traced, without operations of torch around the network."""
+        if torch.compiler.is_compiling():
+            return super().predict(emulator, particles, context)
         from nmpm.emulator.fused.direct import predict
 
         return predict(emulator, self.plan, particles, context)

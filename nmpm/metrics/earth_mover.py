@@ -6,20 +6,24 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
+from nmpm.errors import NmpmError
 from nmpm.metrics.base import RolloutMetric
 from nmpm.particles import Window
+
+_MOST_PIVOTS = 10**9  # of the network simplex: far more than it needs
 
 
 class EarthMover(RolloutMetric):
     """Exact earth mover's distance: the mean distance to the best one-to-one match, per material, every n-th frame.
 
     In domain length, averaged over the frames looked at, then over materials, then over trajectories. The cost is
-    Euclidean and the match exact (linear assignment), unlike the entropic approximations that papers often quote.
+    Euclidean and the match exact (network simplex of POT, Flamary et al. 2021), unlike the entropic approximations that
+    papers often quote.
 
     Args:
         every: Compute it at frames every, 2 every, …
@@ -53,12 +57,23 @@ class EarthMover(RolloutMetric):
 
 
 def earth_mover(ours: Tensor, theirs: Tensor) -> float:
-    """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size."""
-    values = []
-    for left, right in zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), strict=True):
-        cost = cdist(left, right)
-        values.append(cost[linear_sum_assignment(cost)].mean())
-    return float(np.mean(values))
+    """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size, in their length.
+
+    Memory grows with N²: 3 GB for 9,000 particles.
+    """
+    frames = zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), strict=True)
+    return float(np.mean([_match(cdist(left, right)) for left, right in frames]))
+
+
+def _match(cost: NDArray[np.float64]) -> float:
+    """The least mean cost of matching rows to columns of an (N, N) matrix one to one."""
+    from ot import emd2  # takes half a second to import
+
+    equal = np.full(len(cost), 1 / len(cost))
+    least, log = emd2(equal, equal, cost, numItermax=_MOST_PIVOTS, log=True)
+    if log["warning"] is not None:
+        raise NmpmError(f"The earth mover's distance of {len(cost)} particles was not found: {log['warning']}.")
+    return float(least)
 
 
 def earth_mover_of_materials(ours: Tensor, theirs: Tensor, material: Tensor, most: int | None = None) -> float:

@@ -1,6 +1,7 @@
 import pytest
 import torch
 from scenes import box, cloud
+from scipy.optimize import linear_sum_assignment
 
 from nmpm.evaluation.baselines import free_fall, still
 from nmpm.grid import Grid
@@ -48,6 +49,15 @@ def test_earth_mover_of_a_shift_is_its_length_and_ignores_order():
     moved = cloud_[:, torch.randperm(30)] + torch.tensor([0.3, 0.4])
     assert earth_mover(cloud_, cloud_[:, torch.randperm(30)]) == pytest.approx(0, abs=1e-12)
     assert earth_mover(cloud_, moved) == pytest.approx(0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize(("particles", "dimensions"), [(1, 2), (7, 3), (200, 2)])
+def test_earth_mover_is_the_cost_of_the_best_assignment(particles: int, dimensions: int):
+    generator = torch.Generator().manual_seed(particles)
+    ours, theirs = torch.rand(2, 3, particles, dimensions, generator=generator, dtype=torch.float64)
+    costs = torch.cdist(ours, theirs).numpy()
+    best = [cost[linear_sum_assignment(cost)].mean() for cost in costs]
+    assert earth_mover(ours, theirs) == pytest.approx(sum(best) / 3, rel=1e-9)
 
 
 def test_errors_are_those_of_float64_to_a_millionth():
