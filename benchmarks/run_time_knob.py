@@ -43,7 +43,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for name in chosen.models:
         model = load_model(name)
-        scenes = _scenes(str(model.preset), chosen.scenes)
+        scenes = find_scenes(str(model.preset), chosen.scenes)
         settings = [(1, model.emulator.frames), *((1, j) for j in chosen.commit if j < model.emulator.frames)]
         measure(name, model.emulator, scenes, settings + [(n, model.emulator.frames) for n in chosen.members])
 
@@ -104,7 +104,8 @@ def knob_rollout(emulators: Sequence[Emulator], particles: Particles, frames: in
     return torch.cat(parts, dim=1)[:, :frames]
 
 
-def _scenes(preset: str, count: int) -> Scenes:
+def find_scenes(preset: str, count: int) -> Scenes:
+    """The first test scenes of a preset, simulated on first use."""
     folder = find_simulated(preset, count) or ensure(preset, {"train": 0, "valid": 0, "test": count})
     return read_scenes(preset, folder, count)
 

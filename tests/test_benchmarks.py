@@ -32,8 +32,8 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
-    "generalisation", "gns", "hidden_state", "kills", "run_time_knob", "simulators", "stable_substeps", "stiffness",
-    "trades", "where_emulation_pays",
+    "generalisation", "gns", "hidden_state", "kills", "random_commits", "run_time_knob", "simulators",
+    "stable_substeps", "stiffness", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 

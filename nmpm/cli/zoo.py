@@ -16,7 +16,7 @@ _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmp
 _EXAMPLES = """\
 examples:
   nmpm zoo list                            names, states, errors and data
-  nmpm zoo card goop                       scene, recipe, errors, times and origin of one
+  nmpm zoo card goop                       errors, times, training and known failures of one
   nmpm zoo verify goop                     are the card's figures true here?
   nmpm zoo add runs/goop goop/mine --about "goop with a longer training"
   nmpm zoo push goop/mine me/goop          upload it, for nmpm zoo pull me/goop@main
@@ -53,8 +53,9 @@ def _parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
 
     listing = add_command("list", "names, data and full-rollout errors of the models")
-    card = add_command("card", "everything known of one model")
+    card = add_command("card", "errors, times, training and known failures of one model")
     card.add_argument("name")
+    card.add_argument("--yaml", action="store_true", help="everything known of it, for programs")
     add = add_command("add", "make an entry of your own zoo, or of --root, from a finished run")
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="name of the new model, e.g. goop/mine")
@@ -114,11 +115,35 @@ def _summary(card: Mapping[str, Any]) -> str:
 
 
 def _card(chosen: argparse.Namespace) -> None:
-    import yaml
-
+    from nmpm.errors import ZooError
+    from nmpm.zoo.cards import readme
     from nmpm.zoo.registry import Zoo
 
-    sys.stdout.write(yaml.safe_dump(Zoo.card(chosen.name, chosen.root), sort_keys=False, allow_unicode=True))
+    card = Zoo.card(chosen.name, chosen.root)
+    if chosen.yaml:
+        import yaml
+
+        sys.stdout.write(yaml.safe_dump(card, sort_keys=False, allow_unicode=True))
+        return
+    try:
+        text = readme(card)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ZooError(
+            f"The card of {chosen.name} is not complete ({error}): `nmpm zoo card {chosen.name} --yaml` shows what it"
+            " has."
+        ) from error
+    _show_markdown(text)
+
+
+def _show_markdown(text: str) -> None:
+    """Laid out for a terminal; as it is for a file or a pipe."""
+    if not sys.stdout.isatty():
+        sys.stdout.write(text)
+        return
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    Console().print(Markdown(text))
 
 
 def _add(chosen: argparse.Namespace) -> None:

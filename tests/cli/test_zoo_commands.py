@@ -1,4 +1,5 @@
 import pytest
+import yaml
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
@@ -32,8 +33,22 @@ def test_another_zoo_before_or_after_the_command(tmp_path, capsys):
     for words in (["--root", "other", "list"], ["list", "--root", "other"]):
         assert main(["zoo", *words]) == 0
         assert capsys.readouterr().out.count("\n") == 1
-    assert main(["zoo", "card", "goop", "--root", "other"]) == 0
+    assert main(["zoo", "card", "goop", "--root", "other", "--yaml"]) == 0
     assert "sha256" in capsys.readouterr().out
+
+
+def test_a_card_is_a_page_to_read_or_yaml_for_programs(home, capsys):
+    assert main(["zoo", "card", "goop"]) == 0
+    page = capsys.readouterr().out
+    assert page.startswith("# goop\n")
+    assert "| nothing moves |" in page
+    assert len(page.splitlines()) < 50
+    assert main(["zoo", "card", "goop", "--yaml"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out) == Zoo.card("goop")
+    (home / "zoo" / "bare").mkdir(parents=True)
+    (home / "zoo" / "bare" / "card.yaml").write_text("name: bare\n")
+    assert main(["zoo", "card", "bare"]) != 0
+    assert "`nmpm zoo card bare --yaml` shows what it has" in capsys.readouterr().err
 
 
 def test_a_damaged_card_does_not_hide_the_others(home, capsys):
