@@ -97,16 +97,20 @@ def _training_options(chosen: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Train twice, and print a table of each."""
+    """Train, and print a table of each model."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="of the zoo, with a configuration of the same name whose optimizer is SOAP")
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--scenes", type=int, default=8)
+    parser.add_argument("--quarters", type=int, nargs="+", default=QUARTERS, choices=QUARTERS, help="of m, to commit")
+    parser.add_argument("--beside-zoo", action="store_true", help="the zoo's weights instead of a training as shipped")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    scenes = find_scenes(str(Zoo.load(chosen.model).preset), chosen.scenes)
-    for title, quarters in (("as shipped", (4,)), ("random commits", QUARTERS)):
-        emulator = train(chosen.model, chosen.steps, quarters).emulator.eval()
+    pretrained = Zoo.load(chosen.model)
+    scenes = find_scenes(str(pretrained.preset), chosen.scenes)
+    shipped = pretrained.emulator if chosen.beside_zoo else train(chosen.model, chosen.steps, (4,)).emulator.eval()
+    drawn = train(chosen.model, chosen.steps, chosen.quarters).emulator.eval()
+    for title, emulator in (("as shipped", shipped), ("random commits", drawn)):
         settings = [(1, emulator.frames * part // 4) for part in reversed(QUARTERS)]
         measure(f"{chosen.model}, {title}, {chosen.steps} steps", emulator, scenes, settings)
 
