@@ -22,8 +22,10 @@ from nmpm.data.generate import generate
 from nmpm.emulator import EmulatorRecipe, rollout
 from nmpm.evaluation.gns import read_graph
 from nmpm.evaluation.trade import Kind, Scenes, make_choices, read_sweep
+from nmpm.particles import Window
 from nmpm.processors import Identity, UNet
 from nmpm.sim import load_preset
+from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
 
 ROOT = Path(__file__).parent.parent / "benchmarks"
@@ -357,6 +359,33 @@ def test_wide_scenes_hold_copies_of_a_narrow_one_side_by_side():
     assert np.allclose(wide.position[2 * count :] - start.position, [2 * width, 0])
     assert np.array_equal(wide.velocity[:count], wide.velocity[count : 2 * count])
     assert len(preset.widened(3).simulate_from(wide, 1).position) == 2  # the wide box holds them all
+
+
+def test_random_commits_start_bundles_within_the_one_before():
+    import random_commits as script
+
+    model = Zoo.load("goop")
+    state = model.example(count=100)
+    path = model.rollout(state, 32)
+    frames = torch.cat([(state.position - state.velocity).unsqueeze(1), state.position.unsqueeze(1), path], dim=1)
+    window = Window(frames, state.material, state.mask, state.obstacle, state.obstacle_mask, state.gravity)
+    bundle = model.emulator(state)
+    after = script.state_after(bundle, state, 8)
+    assert torch.equal(after.position, bundle.state_after(state).position)
+    assert torch.allclose(after.velocity, bundle.velocity, atol=1e-7)
+    first = script.state_after(bundle, state, 1)
+    assert torch.equal(first.velocity, bundle.position[:, 0] - state.position)
+    assert torch.equal(script.cut(window, 4, 8).initial.position, path[:, 3])
+    assert torch.equal(script.cut(window, 4, 8).target, path[:, 4:12])
+
+    recipe = model.emulator.recipe
+    own = {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)}
+    losses = []
+    for module in (EmulatorModule(**own, unroll=4), script.RandomCommits([8], **own, unroll=4)):
+        module.emulator.load_state_dict(model.emulator.state_dict())
+        module.log = lambda *_: None
+        losses.append(float(module.training_step(window, 0).detach()))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-4)
 
 
 # ---- time and error beside the simulator
