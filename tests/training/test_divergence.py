@@ -33,6 +33,7 @@ def test_a_loss_that_stays_high_is_told_once_with_the_best_checkpoint():
     text = str(told[0].message)
     assert "50 times its least" in text
     assert "start again --start_from run/checkpoints/best.ckpt with a lower model.optimizer.init_args.lr" in text
+    assert "or with fewer frames to backpropagate through" in text
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,8 @@ class DivergenceGuard(Callback):
             rank_zero_warn(
                 f"At step {trainer.global_step} the loss is {typical / self._least:.0f} times its least (medians of"
                 f" {RECENT} logged steps): the training seems to have diverged. Stop it, and start again{start} with a"
-                " lower model.optimizer.init_args.lr."
+                " lower model.optimizer.init_args.lr, or with fewer frames to backpropagate through (model.frames"
+                " times model.unroll): gradients through many frames of a turbulent flow explode."
             )
 
     def _check_weights(self, trainer: Trainer, weights: Iterable[tuple[str, Tensor]]) -> None:
