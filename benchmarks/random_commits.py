@@ -64,7 +64,7 @@ def cut(window: Window, first: int, frames: int) -> Window:
 
 
 def state_after(bundle: Bundle, before: Particles, commit: int) -> Particles:
-    """The state after so many frames of a bundle."""
+    """The state after so many frames of a bundle, of a scene without evolving fields."""
     position = bundle.position[:, commit - 1]
     earlier = bundle.position[:, commit - 2] if commit > 1 else before.position
     return before.with_motion(position, position - earlier)

@@ -27,7 +27,7 @@ ROLLED_OUT = ("10", "20")
 """Those that are rolled out; each takes ten minutes on 20 scenes."""
 MODELS: Mapping[str, Sequence[str]] = {
     "goop": ("goop", "goop/fast"),
-    "waterramps": ("waterramps", "waterdrop", "waterdrop-xl"),
+    "waterramps": ("waterramps", "waterramps/fast", "waterdrop", "waterdrop-xl"),
     "dambreak2d": ("dambreak2d",),
     "waterdrop-xl": ("waterdrop-xl", "waterramps", "waterdrop"),
 }
