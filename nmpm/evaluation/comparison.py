@@ -8,11 +8,10 @@ from torch import Tensor, nn
 
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall, still
+from nmpm.evaluation.figures import PREDICTORS
 from nmpm.metrics import MSE, FieldMSE, RolloutMetric
 from nmpm.particles import Window
 from nmpm.scene import Scene
-
-PREDICTORS = {"model": "model", "still": "nothing moves", "free_fall": "free fall, stopped at walls"}
 
 
 class Comparison(nn.Module):
@@ -84,19 +83,3 @@ class Comparison(nn.Module):
 
     def _by_predictor(self) -> list[tuple[str, list[RolloutMetric]]]:
         return [(kind, list(own)) for kind, own in self.metrics.items()]  # type: ignore[call-overload]  # (a ModuleList)
-
-
-def figure_names(figures: Mapping[str, float]) -> list[str]:
-    """Names of the model's figures: MSE at horizons in order, the full rollout's after them, then the rest."""
-    names = [name for name in figures if "/" not in name]
-    return sorted(names, key=lambda name: (not name.startswith("mse"), "@" not in name, _horizon(name)))
-
-
-def table_row(figures: Mapping[str, float], kind: str) -> list[str]:
-    """A predictor's figures ×10⁻³, in the order of `figure_names`; empty where it has none."""
-    prefix = "" if kind == "model" else f"{kind}/"
-    return [f"{1e3 * figures[prefix + n]:.4g}" if prefix + n in figures else "" for n in figure_names(figures)]
-
-
-def _horizon(name: str) -> int:
-    return int(name.partition("@")[2] or 0)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from nmpm.evaluation.bootstrap import interval
-from nmpm.evaluation.comparison import PREDICTORS, figure_names
+from nmpm.evaluation.figures import PREDICTORS, figure_names
 from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {

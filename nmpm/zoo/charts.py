@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import read_yaml
-from nmpm.evaluation.comparison import PREDICTORS
+from nmpm.evaluation.figures import PREDICTORS
 
 CHART = "chart.png"
 

@@ -21,7 +21,7 @@ from nmpm._support.collectives import all_gather
 from nmpm._support.devices import device_name
 from nmpm._support.version import __version__
 from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.evaluation.comparison import PREDICTORS, figure_names, table_row
+from nmpm.evaluation.figures import PREDICTORS, figure_names, table_row
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.training.module import EmulatorModule
