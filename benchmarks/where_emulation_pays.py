@@ -235,7 +235,10 @@ def draw(axes: Axes, name: str, cases: Sequence[Case]) -> None:
         axes.annotate(counted(substeps, "substep"), (counts[-1], times[-1]), fontsize=7, ha="right")
     shipped = [1e3 * case.substeps * case.substep.median for case in cases]
     axes.plot(counts, shipped, "s-", label=f"simulator, {cases[0].substeps} substeps")
-    axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ms per frame", title=f"{name}: {cases[0].solver}")
+    axes.set(xscale="log", yscale="log", xlabel="thousand particles", ylabel="ms per frame")
+    axes.set_title(f"{name}: {cases[0].solver}")
+    axes.set_xticks(counts, [f"{count / 1000:,.0f}" for count in counts])
+    axes.set_xticks([], minor=True)
     axes.legend(frameon=False, fontsize="small")
 
 
