@@ -50,6 +50,7 @@ from nmpm.errors import ZooError
 from nmpm.evaluation.machine import describe_device
 from nmpm.particles import Window
 from nmpm.sim import InitialState, Preset, load_preset
+from nmpm.sim.sph.obstacles import PolygonObstacle
 from nmpm.zoo import Zoo
 
 TRADE = Path(__file__).parent / "trade"
@@ -137,6 +138,8 @@ def side_by_side(preset: Preset, start: InitialState, times: int) -> InitialStat
 
 
 def _moved(obstacle: Any, shift: Any) -> Any:
+    if isinstance(obstacle, PolygonObstacle):
+        return dataclasses.replace(obstacle, corners=obstacle.corners + shift)
     x, y = obstacle.centre
     return dataclasses.replace(obstacle, centre=(x + shift[0], y + shift[1]))
 

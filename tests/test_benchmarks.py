@@ -361,6 +361,18 @@ def test_wide_scenes_hold_copies_of_a_narrow_one_side_by_side():
     assert len(preset.widened(3).simulate_from(wide, 1).position) == 2  # the wide box holds them all
 
 
+def test_polygons_move_with_their_scene():
+    import where_emulation_pays as script
+
+    preset = load_preset("wbcsph")
+    start = preset.draw(0)
+    wide = script.side_by_side(preset, start, 2)
+    width, count = preset.domain[0][1] - preset.domain[0][0], len(start.obstacles)
+    assert len(wide.obstacles) == 2 * count > 0
+    for own, copied in zip(start.obstacles, wide.obstacles[count:], strict=True):
+        assert np.allclose(copied.corners - own.corners, [width, 0])
+
+
 def test_random_commits_start_bundles_within_the_one_before():
     import random_commits as script
 
