@@ -57,7 +57,7 @@ TRADE = Path(__file__).parent / "trade"
 WIDTHS: Mapping[str, Sequence[int]] = {
     "goop": (1, 4, 16, 512),
     "waterramps": (1, 4, 16, 48),
-    "waterdrop3d": (1, 4, 16),
+    "waterdrop3d": (1, 4),
     "dambreak2d": (1, 4, 20),
     "wbcsph": (1, 3, 8),
 }
