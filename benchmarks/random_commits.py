@@ -19,7 +19,7 @@ from typing import Any
 import lightning
 import torch
 import yaml
-from run_time_knob import find_scenes, measure
+from run_time_knob import find_scenes, last_step, measure
 from torch import Tensor
 
 from nmpm._support.shipped import find_config
@@ -65,9 +65,8 @@ def cut(window: Window, first: int, frames: int) -> Window:
 
 def state_after(bundle: Bundle, before: Particles, commit: int) -> Particles:
     """The state after so many frames of a bundle, of a scene without evolving fields."""
-    position = bundle.position[:, commit - 1]
-    earlier = bundle.position[:, commit - 2] if commit > 1 else before.position
-    return before.with_motion(position, position - earlier)
+    path = bundle.position[:, :commit]
+    return before.with_motion(path[:, -1], last_step(path, before))
 
 
 def train(name: str, steps: int, quarters: Sequence[int]) -> EmulatorModule:

@@ -97,11 +97,16 @@ def knob_rollout(emulators: Sequence[Emulator], particles: Particles, frames: in
         if commit == emulators[0].frames:
             velocity = torch.stack([bundle.velocity for bundle in bundles]).mean(0)
         else:
-            velocity = path[:, -1] - (path[:, -2] if commit > 1 else particles.position)
+            velocity = last_step(path, particles)
         particles = particles.with_motion(path[:, -1], velocity)
         parts.append(path)
         made += commit
     return torch.cat(parts, dim=1)[:, :frames]
+
+
+def last_step(path: Tensor, particles: Particles) -> Tensor:
+    """(B, N, D) step to the last frame of a path (B, T, N, D), from the state before it where it has one frame."""
+    return path[:, -1] - (path[:, -2] if path.shape[1] > 1 else particles.position)
 
 
 def find_scenes(preset: str, count: int) -> Scenes:
