@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from numpy.typing import NDArray
 
@@ -17,6 +17,10 @@ class Obstacle(abc.ABC):
     @abc.abstractmethod
     def distance(self, points: Array) -> Array:
         """(K,) signed distance of points (K, D) from the surface, negative inside."""
+
+    @abc.abstractmethod
+    def moved(self, shift: Array) -> Self:
+        """The same body shifted by (D,), in length."""
 
 
 @dataclass(frozen=True)

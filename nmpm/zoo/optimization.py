@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator import Emulator
-from nmpm.emulator.runtimes import RUNTIMES, Eager
+from nmpm.emulator.runtimes import RUNTIMES, Eager, check_runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
@@ -34,6 +34,7 @@ def optimize(emulator: Emulator, runtime: str, make_example: Callable[[], Partic
         ConfigError: if there is no such runtime, it cannot run the model here, or its results differ from torch's. With
             "auto" the next runtime is tried instead.
     """
+    check_runtime(runtime, (AUTO, *RUNTIMES))
     names = list(RUNTIMES) if runtime == AUTO else [runtime]
     for name in names:
         try:

@@ -5,7 +5,7 @@ A runtime is added by one file and one line here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from nmpm._support.messages import one_line, suggestion
@@ -15,7 +15,7 @@ from nmpm.emulator.runtimes.eager import Eager
 from nmpm.emulator.runtimes.openvino import OpenVINO
 from nmpm.errors import ConfigError
 
-__all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "find_runtime"]
+__all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "check_runtime", "find_runtime"]
 
 RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType({kind.name: kind for kind in (CudaGraph, OpenVINO, Eager)})
 """Runtimes by name, the fastest first; the last one runs every network everywhere."""
@@ -27,9 +27,19 @@ def find_runtime(name: str) -> Runtime:
     Raises:
         ConfigError: if there is none of that name.
     """
-    if name not in RUNTIMES:
-        raise ConfigError(
-            f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(RUNTIMES)}."
-            f"{suggestion(name[:60], list(RUNTIMES))}"
-        )
+    check_runtime(name, RUNTIMES)
     return RUNTIMES[name]()
+
+
+def check_runtime(name: str, known: Iterable[str]) -> None:
+    """Check the name of a runtime.
+
+    Raises:
+        ConfigError: if it is not among those that are known, which are listed.
+    """
+    names = list(known)
+    if name not in names:
+        raise ConfigError(
+            f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(names)}."
+            f"{suggestion(name[:60], names)}"
+        )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -50,6 +51,11 @@ class Ramp(Obstacle):
         beyond = np.abs((points - np.array(self.centre)) @ self._axes.T) - self._half
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0.0))
+
+    def moved(self, shift: Array) -> Self:
+        """The same bar shifted by (2,), in length."""
+        x, y = self.centre
+        return replace(self, centre=(x + float(shift[0]), y + float(shift[1])))
 
     def particles(self, spacing: float) -> Array:
         """(M, 2) a lattice that fills the bar, parallel to its sides, about `spacing` apart."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,10 @@ class PolygonObstacle(Obstacle):
     def distance(self, points: Array) -> Array:
         """As the base class says, but to the nearest edge's line: too small beyond corners."""
         return -self.depth(points)
+
+    def moved(self, shift: Array) -> Self:
+        """The same polygon shifted by (2,), in length."""
+        return replace(self, corners=self.corners + shift)
 
 
 @dataclass(frozen=True)

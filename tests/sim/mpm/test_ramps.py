@@ -40,6 +40,13 @@ def test_distances_are_those_to_the_densely_sampled_outline(ramp, seed):
     np.testing.assert_array_equal(found < 0, inside)
 
 
+@given(ramp=ramps, shift=st.tuples(st.floats(-2, 2), st.floats(-2, 2)))
+@settings(max_examples=40, deadline=None)
+def test_a_moved_bar_is_as_far_from_moved_points(ramp, shift):
+    points = np.random.default_rng(0).uniform(0, 1, (50, 2))
+    np.testing.assert_allclose(ramp.moved(np.array(shift)).distance(points + shift), ramp.distance(points), atol=1e-12)
+
+
 @given(ramp=ramps, spacing=st.floats(0.004, 0.02))
 @settings(max_examples=40, deadline=None)
 def test_particles_fill_the_bar_evenly(ramp, spacing):

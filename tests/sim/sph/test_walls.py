@@ -82,3 +82,9 @@ def test_visible_particles_are_the_first_layer_and_the_obstacles():
     assert outside.sum() == 4 * 20 + 4
     assert np.all(SQUARE.depth(shown[~outside]) > 0)
     assert math.isclose(np.abs(shown[outside] - 0.5).max(), 0.525)
+
+
+def test_a_moved_polygon_is_as_far_from_moved_points():
+    triangle = PolygonObstacle(np.array([[0.0, 0.0], [0.4, 0.1], [0.1, 0.5]]))
+    points, shift = np.random.default_rng(0).uniform(-1, 1, (50, 2)), np.array([3.0, -0.5])
+    np.testing.assert_allclose(triangle.moved(shift).distance(points + shift), triangle.distance(points), atol=1e-12)
