@@ -227,9 +227,12 @@ class EmulatorCLI(LightningCLI):
         return f"{where}. Go on with: {resuming_command(self.words)}"
 
     def after_fit(self) -> None:
-        """Validate the last weights too, if no validation has, and test the best ones, once."""
+        """Validate the last weights too, if no validation has, and test the best ones, once.
+
+        Where validations are turned off, the last weights are tested.
+        """
         checkpoint = self.trainer.checkpoint_callback
-        if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor:
+        if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor and self.trainer.limit_val_batches:
             if self.model.validated_step < self.trainer.global_step:
                 self._validate_last_weights(checkpoint)
             # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.

@@ -84,6 +84,16 @@ def test_the_last_weights_are_validated_too(make_dataset):
     assert EmulatorModule.load_from_checkpoint("run/checkpoints/best.ckpt", weights_only=True).emulator.calibrated
 
 
+def test_without_validations_the_last_weights_are_tested(make_dataset):
+    data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
+    words = ["--config", "waterdrop.yaml", *TINY, *data, "--trainer.limit_val_batches", "0"]
+    words += ["--resume.every_n_train_steps", "2"]
+    assert main(["fit", *words]) == 0
+    ended = json.loads(Path("run/report.json").read_text())["test"]
+    assert main(["test", *words, "--ckpt_path", "last"]) == 0
+    assert json.loads(Path("run/report.json").read_text())["test"] == ended
+
+
 def test_the_test_that_ends_a_training_is_of_the_averaged_weights_of_the_best_checkpoint(make_dataset):
     """Loaded by Lightning into the trainer that has just trained, it would be of the raw ones."""
     data = [*TINY_GOOP, "--trainer.default_root_dir", "run"]
