@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.particles import Particles
@@ -26,9 +26,15 @@ def recomputing_unroll(emulator: Emulator, particles: Particles, bundles: int) -
     """
     context = emulator.context(particles)
     for _ in range(bundles):
-        bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
+        bundle = recomputed(emulator, particles, context)
         yield bundle
         particles = bundle.state_after(particles)
+
+
+def recomputed(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+    """A call of the emulator that keeps no activations: backward passes compute it again."""
+    bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
+    return bundle
 
 
 def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any
 
@@ -18,11 +18,11 @@ from torch import Tensor
 from nmpm._support.collectives import global_mean, normal_like, rank_slice
 from nmpm._support.digests import weights_digest
 from nmpm._support.specs import class_path
-from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Rollout, predict_rollout, unroll
+from nmpm.emulator import Emulator, EmulatorRecipe, Rollout, predict_rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network
 from nmpm.emulator.fields import warn_of_ignored
-from nmpm.emulator.gradients import recomputing_unroll
+from nmpm.emulator.gradients import recomputed
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
@@ -41,6 +41,7 @@ from nmpm.training.compatibility import (
 from nmpm.training.losses import FieldError, TrainingError
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
 from nmpm.training.schedules import Schedule
+from nmpm.training.unrolling import Discount, direct, unroll_training
 
 CALIBRATION_BATCHES = 4
 
@@ -52,6 +53,8 @@ class EmulatorModule(LightningModule):
         scene: The facts of the scenes; from the command line it comes from the data.
         unroll: K, calls that a training step backpropagates through; the training horizon is m K frames.
         unroll_growth: Share of the training, in [0, 1], over which the calls grow from 1 to K: early steps are cheap.
+        gradient_discount: In [0, 1], factor on gradients from each bundle to the one before: 1 is plain
+            backpropagation through time, 0 cuts it between bundles.
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error; 0 for none.
@@ -76,6 +79,7 @@ class EmulatorModule(LightningModule):
         scene: Scene,
         unroll: int = 2,
         unroll_growth: float = 0.0,
+        gradient_discount: float = 1.0,
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         density_weight: float = 4.0,
@@ -95,6 +99,7 @@ class EmulatorModule(LightningModule):
         if not 0 <= unroll_growth <= 1:
             raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
         self.unroll, self.unroll_growth = unroll, unroll_growth
+        self.discount = Discount(gradient_discount)
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         check_mirrors(scene, mirror)
@@ -108,6 +113,7 @@ class EmulatorModule(LightningModule):
         own = {
             "unroll": unroll,
             "unroll_growth": unroll_growth,
+            "gradient_discount": gradient_discount,
             "schedule": dataclasses.asdict(self.schedule),
             "density_weight": density_weight,
             "field_weight": field_weight,
@@ -221,7 +227,9 @@ class EmulatorModule(LightningModule):
         for axis in self.mirror:
             draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
             batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
-        bundles = self._unroll(self._add_position_noise(batch.initial), self.bundles(self._progress()))
+        particles, count = self._add_position_noise(batch.initial), self.bundles(self._progress())
+        call = recomputed if self.recompute else direct
+        bundles = unroll_training(self.emulator, particles, count, call, self.discount)
         error = self._error(Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles]), batch)
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged)
@@ -291,9 +299,6 @@ class EmulatorModule(LightningModule):
             return 1.0
         step = self.global_step
         return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
-
-    def _unroll(self, particles: Particles, count: int) -> Iterator[Bundle]:
-        return (recomputing_unroll if self.recompute else unroll)(self.emulator, particles, count)
 
     def _add_position_noise(self, particles: Particles) -> Particles:
         if self.position_noise <= 0:
