@@ -18,6 +18,7 @@ import torch
 from scenes import cloud
 
 from nmpm.data import catalog
+from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.generate import generate
 from nmpm.emulator import EmulatorRecipe, rollout
 from nmpm.evaluation.gns import read_graph
@@ -34,8 +35,8 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
-    "generalisation", "gns", "hidden_state", "kills", "random_commits", "run_time_knob", "simulators",
-    "stable_substeps", "stiffness", "trades", "where_emulation_pays",
+    "generalisation", "gns", "gradient_shares", "hidden_state", "kills", "random_commits", "run_time_knob",
+    "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -558,3 +559,29 @@ def test_times_are_per_frame_and_drawn_beside_those_of_simulators(tmp_path):
     assert (tmp_path / "times.png").stat().st_size > 0
     with pytest.raises(SystemExit, match="dambreak2d: only simulators of the material point method"):
         generalisation.load_mpm("dambreak2d")
+
+
+def test_a_gradients_parts_sum_to_it_and_the_first_is_what_is_left_when_cut(make_dataset):
+    import gradient_shares
+
+    data = TrajectoryDataModule(path=str(make_dataset(train=((12, 40),))), horizon=6, batch_size=1)
+    data.setup("fit")
+    torch.manual_seed(0)
+    module = EmulatorModule(data.scene, cells=8, frames=2, unroll=3, processor=UNet(width=4, depth=1, perceptron=(4,)))
+    window = next(iter(data.train_dataloader()))
+    found = gradient_shares.parts(module, window)
+    whole, cut = (gradient_shares.gradient(module, window, factor) for factor in (1.0, 0.0))
+    torch.testing.assert_close(found.sum(0), whole, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found[0], cut, rtol=1e-6, atol=1e-9)
+
+
+def test_equal_gradients_have_all_in_common_and_noise_has_nothing():
+    from gradient_shares import common_share
+
+    torch.manual_seed(0)
+    equal = torch.randn(1, 2, 1000).expand(8, -1, -1)
+    torch.testing.assert_close(common_share(equal), torch.ones(2))
+    noise = torch.randn(8, 2, 10_000)
+    assert common_share(noise).abs().max() < 0.02  # its standard deviation is 0.002
+    halves = torch.randn(1, 2, 10_000) + noise
+    torch.testing.assert_close(common_share(halves), torch.full((2,), 0.5), rtol=0, atol=0.05)

@@ -64,7 +64,7 @@ class Discount:
             raise ConfigError(f"model.gradient_discount = {self.factor} must be in [0, 1].")
 
     def __call__(self, particles: Particles) -> Particles:
-        """The same values; their gradients are multiplied by the factor."""
+        """The same values; their gradients are multiplied by the factor, and cut for 0."""
         if self.factor == 1:
             return particles
         moved = particles.with_motion(self._pass_on(particles.position), self._pass_on(particles.velocity))
@@ -72,6 +72,8 @@ class Discount:
         return moved.with_fields(fields) if fields else moved
 
     def _pass_on(self, values: Tensor) -> Tensor:
+        if self.factor == 0:
+            return values.detach()
         passed: Tensor = _Scale.apply(values, self.factor)  # type: ignore[no-untyped-call]  # (torch's stubs)
         return passed
 
@@ -84,5 +86,4 @@ class _Scale(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
-        # Beyond the range of float32 a gradient is no number any more: 0 · inf.
-        return ctx.factor * slope if ctx.factor else torch.zeros_like(slope), None
+        return ctx.factor * slope, None

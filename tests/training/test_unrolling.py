@@ -73,13 +73,11 @@ def test_recomputed_gradients_are_discounted_likewise(window):
     assert torch.equal(gradient(kept, batch), gradient(saved, batch))
 
 
-@pytest.mark.filterwarnings("error")
-def test_cut_gradients_stay_finite_where_later_ones_overflow(window):
+def test_cut_gradients_are_not_computed_at_all(window):
     batch, _ = window
     state = batch.initial.with_motion(batch.initial.position.clone().requires_grad_(), batch.initial.velocity)
-    handed_on = Discount(0.0)(state).position
-    handed_on.backward(torch.full_like(handed_on, float("inf")))
-    assert (state.position.grad == 0).all()
+    assert not Discount(0.0)(state).position.requires_grad
+    assert Discount(0.5)(state).position.requires_grad
 
 
 @given(factor=st.one_of(st.floats(max_value=0, exclude_max=True), st.floats(min_value=1, exclude_min=True)))
