@@ -53,8 +53,8 @@ class EmulatorModule(LightningModule):
         scene: The facts of the scenes; from the command line it comes from the data.
         unroll: K, calls that a training step backpropagates through; the training horizon is m K frames.
         unroll_growth: Share of the training, in [0, 1], over which the calls grow from 1 to K: early steps are cheap.
-        gradient_discount: In [0, 1], factor on gradients from each bundle to the one before: 1 is plain
-            backpropagation through time, 0 cuts it between bundles.
+        gradient_discount: In [0, 1], factor on gradients from each bundle to the one before. At 1, plain
+            backpropagation through time, much of them is noise; at 0, trainings diverge.
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error; 0 for none.
@@ -79,7 +79,7 @@ class EmulatorModule(LightningModule):
         scene: Scene,
         unroll: int = 2,
         unroll_growth: float = 0.0,
-        gradient_discount: float = 1.0,
+        gradient_discount: float = 0.5,
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
         density_weight: float = 4.0,

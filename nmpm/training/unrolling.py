@@ -1,8 +1,8 @@
 """The calls of a training step, through which gradients come back discounted.
 
-The flow of a splash parts neighbours exponentially, and so do gradients grow that go back through it. What a later
-bundle says of an earlier one is then mostly noise, which a few particles dominate. Discounted, later bundles still
-train the weights by their own errors in full.
+The flow of a splash parts neighbours exponentially, and so do gradients grow that go back through it: what a later
+bundle says of an earlier one is mostly noise (`benchmarks/gradient_shares.py`). Discounted, it counts less, and later
+bundles still train the weights by their own errors in full.
 """
 
 from __future__ import annotations
