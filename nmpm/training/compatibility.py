@@ -20,6 +20,9 @@ COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
 UNREPORTED = ("scene", "format", "recompute", "compile")
 """Hyperparameters that `changed_arguments` leaves out: compared elsewhere, or without influence on the result."""
 
+NEW = "not an option yet"
+"""What an argument was that the version which wrote a checkpoint did not have."""
+
 
 def check_same_scene(mine: Scene, theirs: Scene, data: str = "the data's") -> None:
     """Make sure that a model's scene is that of its data.
@@ -96,15 +99,17 @@ def check_same_optimizer(checkpoint: Mapping[str, Any], optimizer: Optimizer) ->
 def changed_arguments(stored: Mapping[str, Any], mine: Mapping[str, Any]) -> list[str]:
     """What a training goes on with that its checkpoint was made without, such as "model.unroll = 4 (was 2)".
 
+    Of arguments that the version which wrote the checkpoint did not have, it says "was not an option yet".
+
     Args:
         stored: Hyperparameters of the checkpoint.
         mine: Those of the model that goes on from it; `check_same_recipe` has compared the parts.
     """
-    names = [name for name in mine if name in stored and name not in (*COMPARED, *UNREPORTED)]
+    names = [name for name in mine if name not in (*COMPARED, *UNREPORTED)]
     return [
         f"{name} = {new} (was {old})"
         for argument in names
-        for name, old, new in _differences(stored[argument], mine[argument], f"model.{argument}")
+        for name, old, new in _differences(stored.get(argument, NEW), mine[argument], f"model.{argument}")
     ]
 
 

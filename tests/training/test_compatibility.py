@@ -97,6 +97,13 @@ def test_a_training_that_goes_on_unchanged_says_nothing(begun, tmp_path, caplog)
     assert "changed arguments" not in caplog.text
 
 
+def test_arguments_that_an_older_checkpoint_does_not_have_are_told(begun, tmp_path):
+    checkpoint = torch.load(begun, weights_only=True)
+    del checkpoint["hyper_parameters"]["gradient_discount"]
+    changed = module_of(data_of(tmp_path / "dataset")).adopt_arguments(checkpoint)
+    assert changed == ["model.gradient_discount = 0.5 (was not an option yet)"]
+
+
 def test_checkpoints_without_the_name_of_their_optimizer_are_compared_by_its_arguments(begun, tmp_path):
     old = torch.load(begun, weights_only=True)
     del old["nmpm_optimizer"]
