@@ -95,6 +95,16 @@ def test_a_wider_domain_keeps_the_wall_and_holds_more(name):
     assert made.position[0, made.particle_type != BOUNDARY, 0].max() > box_left
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_wider_domain_has_a_wall_layer_where_its_preset_has_one(name):
+    """Rounding must not part box and domain: a model of scenes without walls could not run there."""
+    preset = load_preset(name)
+    for times in range(2, 33):
+        wide = preset.widened(times).scene
+        assert wide.walled == preset.scene.walled, times
+        assert wide.input_channels == preset.scene.input_channels, times
+
+
 def test_a_wide_dam_break_has_as_many_times_as_many_particles():
     preset = load_preset("dambreak2d").coarsened(4)
     assert preset.widened(2).draw(0).counts[0] == 2 * preset.draw(0).counts[0]

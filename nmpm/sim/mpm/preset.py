@@ -133,7 +133,8 @@ class MpmPreset(Preset):
     def reach(self) -> tuple[Interval, ...]:
         """How far particles can get: the box, and a cell and a half beyond it where walls hold what touches them."""
         layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
-        return tuple((low - layer, high + layer) for low, high in self.box)
+        ends = ((low - layer, high + layer) for low, high in self.box)
+        return tuple(_snapped(own, edges) for own, edges in zip(ends, self.domain, strict=True))
 
     @property
     def particle_volume(self) -> float:
@@ -295,3 +296,9 @@ def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:
     if len(ramps) != len(start.obstacles):
         raise DataError("The material point method simulates ramps; other obstacles are not implemented.")
     return ramps
+
+
+def _snapped(ends: Interval, edges: Interval) -> Interval:
+    """The ends, those that are an edge of the domain but for rounding exactly so: a gap would be a wall layer."""
+    low, high = (edge if math.isclose(end, edge, abs_tol=1e-9) else end for end, edge in zip(ends, edges, strict=True))
+    return low, high
