@@ -88,8 +88,8 @@ class DivergenceGuard(Callback):
                 f"At step {trainer.global_step} the loss is {typical / self._least:.0f} times its least (medians of"
                 f" {RECENT} logged steps): the training seems to have diverged. Stop it, and start again{start} with a"
                 " lower model.optimizer.init_args.lr, or with fewer frames to backpropagate through (model.frames"
-                " times model.unroll): gradients through many frames of a turbulent flow explode. A"
-                " model.gradient_discount of 0.5 bounds them; one of 0 makes trainings diverge."
+                " times model.unroll): gradients through many frames of a turbulent flow explode. Keep"
+                " model.gradient_discount at 0.5: at 1 they are larger, at 0 trainings diverge."
             )
 
     def _check_weights(self, trainer: Trainer, weights: Iterable[tuple[str, Tensor]]) -> None:
