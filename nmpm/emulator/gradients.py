@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -13,26 +13,37 @@ from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.particles import Particles
 
+Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
 
-def recomputing_unroll(emulator: Emulator, particles: Particles, bundles: int) -> Iterator[Bundle]:
-    """`unroll` that keeps no activations between bundles: backward passes compute each bundle again.
 
-    Memory is that of one bundle and the states between bundles, for the time of one more forward pass.
+def unroll_with_gradients(
+    emulator: Emulator,
+    particles: Particles,
+    bundles: int,
+    call: Call,
+    state_after: Callable[[Bundle, Particles], Particles] = Bundle.state_after,
+) -> Iterator[Bundle]:
+    """Predict bundle after bundle, each from the last, with gradients.
 
     Args:
         emulator: Predicts m frames a call.
         particles: The state to start from.
         bundles: How many calls to make.
+        call: Makes one, such as `recomputed`.
+        state_after: What the next call starts from, of a bundle and of what it started from.
     """
     context = emulator.context(particles)
     for _ in range(bundles):
-        bundle = recomputed(emulator, particles, context)
+        bundle = call(emulator, particles, context)
         yield bundle
-        particles = bundle.state_after(particles)
+        particles = state_after(bundle, particles)
 
 
 def recomputed(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-    """A call of the emulator that keeps no activations: backward passes compute it again."""
+    """A call of the emulator that keeps no activations: backward passes compute it again.
+
+    The memory of several is that of one and of the states between them, for the time of one more forward pass.
+    """
     bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
     return bundle
 
@@ -61,5 +72,5 @@ def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int
         raise ValueError(f"A rollout with gradients has 1 or more frames, not {frames}.")
     with torch.no_grad():
         check_inputs(emulator, particles)
-    bundles = recomputing_unroll(emulator, particles, -(-frames // emulator.frames))
+    bundles = unroll_with_gradients(emulator, particles, -(-frames // emulator.frames), recomputed)
     return torch.cat([bundle.position for bundle in bundles], dim=1)[:, :frames]

@@ -7,7 +7,7 @@ bundles still train the weights by their own errors in full.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,16 +15,15 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator import Bundle, Emulator, RolloutContext
+from nmpm.emulator.gradients import Call, unroll_with_gradients
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
-
-Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
 
 
 def unroll_training(
     emulator: Emulator, particles: Particles, bundles: int, call: Call, discount: Discount
 ) -> Iterator[Bundle]:
-    """Predict bundle after bundle, each from the last, with gradients.
+    """Predict bundle after bundle, each from the last, with discounted gradients.
 
     Args:
         emulator: In training mode.
@@ -33,11 +32,9 @@ def unroll_training(
         call: Makes one: `direct`, or `nmpm.emulator.gradients.recomputed` to save memory.
         discount: Hands states from bundle to bundle.
     """
-    context = emulator.context(particles)
-    for _ in range(bundles):
-        bundle = call(emulator, particles, context)
-        yield bundle
-        particles = discount(bundle.state_after(particles))
+    return unroll_with_gradients(
+        emulator, particles, bundles, call, lambda bundle, before: discount(bundle.state_after(before))
+    )
 
 
 def direct(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
