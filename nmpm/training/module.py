@@ -248,7 +248,8 @@ class EmulatorModule(LightningModule):
         self.valid_errors.update(batch, predicted.position, predicted.fields)
 
     def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
-        predicted = self._predict(batch)
+        with torch.autocast(self.device.type, enabled=False):  # in the precision that trained models are used in
+            predicted = self._predict(batch)
         self.test_errors.update(batch, predicted.position, predicted.fields)
         return predicted.position
 

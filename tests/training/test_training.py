@@ -1,4 +1,5 @@
 import functools
+import json
 import os
 import signal
 import subprocess
@@ -21,6 +22,8 @@ from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.processors import UNet
 from nmpm.training import EmulatorModule
+from nmpm.training.callbacks.report import ReportWriter
+from nmpm.training.checkpoints import load_module
 from nmpm.training.schedules import Schedule
 from nmpm.transfer import Nearest, using
 
@@ -48,12 +51,13 @@ def trainer_of(root: Path, steps: int, **options) -> lightning.Trainer:
         "gradient_clip_val": 1.0,
     }
     averaging = EMAWeightAveraging(decay=0.5, use_buffers=False)
+    further = options.pop("callbacks", [])
     last = ModelCheckpoint(root, filename="last", every_n_train_steps=2, enable_version_counter=False)
     return lightning.Trainer(
         accelerator="cpu",
         max_steps=steps,
         default_root_dir=root,
-        callbacks=[averaging, last],
+        callbacks=[averaging, last, *further],
         **(defaults | options),
     )
 
@@ -170,6 +174,25 @@ def test_bf16_trains(make_dataset, tmp_path):
     trainer.fit(model, data)
     assert trainer.callback_metrics["train/loss"].isfinite()
     assert all(p.dtype == torch.float32 for p in model.parameters())
+
+
+def test_errors_of_a_bf16_training_are_those_of_the_loaded_model(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    trainer = trainer_of(tmp_path, 2, precision="bf16-mixed", callbacks=[ReportWriter()])
+    trainer.fit(module_of(data), data)
+    trainer.save_checkpoint(tmp_path / "trained.ckpt")
+    emulator = load_module(tmp_path / "trained.ckpt").emulator.eval()
+    metric = MSE()
+    for window in data.test_dataloader():
+        metric.update(window, rollout(emulator, window.initial, window.target.shape[1]))
+    expected = sorted(row["mse"] for row in metric.per_trajectory())
+    for precision in ("bf16-mixed", "32-true"):
+        tester = trainer_of(tmp_path, 2, precision=precision, callbacks=[ReportWriter()])
+        tester.test(module_of(data), data, ckpt_path=tmp_path / "trained.ckpt", weights_only=True)
+        report = json.loads((tmp_path / "report.json").read_text())
+        found = sorted(row["mse"] for row in report["per_trajectory"]["model"])
+        assert found == pytest.approx(expected, rel=1e-6)
+        assert report["training"]["precision"] == "bf16-mixed"
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ class ReportWriter(Callback):
     def __init__(self) -> None:
         self.trained_seconds = 0.0
         self.trained_steps = 0
+        self.trained_precision = ""
         self.curve: list[list[float]] = []  # seconds of training, steps and MSE of each validation
         self._since: float | None = None
         self._trained = False
@@ -48,17 +49,24 @@ class ReportWriter(Callback):
         return "Report"  # its name in checkpoints of earlier versions
 
     def state_dict(self) -> dict[str, Any]:
-        return {"trained_seconds": self._elapsed(), "trained_steps": self.trained_steps, "curve": list(self.curve)}
+        return {
+            "trained_seconds": self._elapsed(),
+            "trained_steps": self.trained_steps,
+            "trained_precision": self.trained_precision,
+            "curve": list(self.curve),
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if self._trained:
             return  # the test after a fit loads the best checkpoint, which is often older than the training's end
         self.trained_seconds = float(state_dict["trained_seconds"])
         self.trained_steps = int(state_dict.get("trained_steps", 0))
+        self.trained_precision = str(state_dict.get("trained_precision", ""))
         self.curve = list(state_dict.get("curve", []))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self._since, self._trained = time.monotonic(), True
+        self.trained_precision = str(trainer.precision)
 
     def on_train_batch_end(
         self,
@@ -128,7 +136,7 @@ class ReportWriter(Callback):
                 "steps": self.trained_steps,
                 "horizon": module.emulator.frames * module.unroll,
                 "seconds": round(self.trained_seconds, 1),
-                "precision": str(trainer.precision),
+                "precision": self.trained_precision or str(trainer.precision),
                 "devices": trainer.world_size,
                 "hardware": device_name(trainer.strategy.root_device),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
