@@ -1,4 +1,4 @@
-"""Data augmentation by exact symmetries of scenes: mirror images."""
+"""Data augmentation: mirror images, which are exact symmetries of scenes, and noise on positions."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from nmpm._support.collectives import normal_like
 from nmpm.errors import ConfigError
-from nmpm.particles import Window
+from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 
 
@@ -45,6 +46,17 @@ def mirror_windows(window: Window, scene: Scene, axis: int, chosen: Tensor) -> W
         obstacle=_reflect(window.obstacle, axis, middle, chosen),
         gravity=_reflect(window.gravity, axis, 0.0, chosen),
     )
+
+
+def with_position_noise(particles: Particles, deviation: float) -> Particles:
+    """The same particles with Gaussian noise of this standard deviation, in domain lengths, on their positions.
+
+    Ranks draw different noise; see `normal_like`.
+    """
+    if deviation <= 0:
+        return particles
+    noise = deviation * normal_like(particles.position)
+    return particles.with_motion(particles.position + noise, particles.velocity)
 
 
 def _reflect(values: Tensor, axis: int, middle: float, chosen: Tensor) -> Tensor:

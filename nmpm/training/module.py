@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
-from nmpm._support.collectives import global_mean, normal_like, rank_slice
+from nmpm._support.collectives import global_mean, rank_slice
 from nmpm._support.digests import weights_digest
 from nmpm._support.specs import class_path
 from nmpm.emulator import Emulator, EmulatorRecipe, Rollout, predict_rollout
@@ -27,9 +27,9 @@ from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric
-from nmpm.particles import Particles, Window
+from nmpm.particles import Window
 from nmpm.scene import Scene
-from nmpm.training.augmentation import check_mirrors, mirror_windows
+from nmpm.training.augmentation import check_mirrors, mirror_windows, with_position_noise
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.compatibility import (
     adopt_optimizer_arguments,
@@ -227,7 +227,8 @@ class EmulatorModule(LightningModule):
         for axis in self.mirror:
             draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
             batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
-        particles, count = self._add_position_noise(batch.initial), self.bundles(self._progress())
+        particles = with_position_noise(batch.initial, self.position_noise)
+        count = self.bundles(self._progress())
         call = recomputed if self.recompute else direct
         bundles = unroll_training(self.emulator, particles, count, call, self.discount)
         error = self._error(Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles]), batch)
@@ -300,9 +301,3 @@ class EmulatorModule(LightningModule):
             return 1.0
         step = self.global_step
         return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
-
-    def _add_position_noise(self, particles: Particles) -> Particles:
-        if self.position_noise <= 0:
-            return particles
-        noise = self.position_noise * normal_like(particles.position)
-        return particles.with_motion(particles.position + noise, particles.velocity)
