@@ -15,8 +15,9 @@ one row. All runs of a table must be of the same dataset. Columns:
 - ms per training step and minutes of training, from the run's report.
 
 Brackets: 95% interval of the ratio of means to the baseline, paired bootstrap over scenes, after averaging over seeds;
-it does not contain the scatter of seeds. Figures are kept in `recipes.json` in each run's folder, and measured again
-only if the checkpoint has changed or with `--fresh`; times are measured in every call that asks for `time`.
+it does not contain the scatter of seeds. Models run in float32, as users run them. Figures are kept in `recipes.json`
+in each run's folder, and measured again only if the checkpoint has changed or with `--fresh`; times are measured in
+every call that asks for `time`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ import statistics
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -95,10 +95,6 @@ class Run:
         """Frames at which shapes are compared, from 1."""
         return [round(multiple * load_preset(self.config["data"]["name"]).frames) for multiple in MULTIPLES]
 
-    def autocast(self) -> AbstractContextManager[None]:
-        """The precision that the run was trained and tested in."""
-        return torch.autocast("cpu", torch.bfloat16, enabled="bf16" in str(self.config["trainer"]["precision"]))
-
     def cost(self) -> dict[str, float]:
         """Steps, ms per step and minutes of the training, those of validations included."""
         training = self.report.get("training")
@@ -144,8 +140,7 @@ def measure_errors(run: Run, chosen: Namespace) -> dict[str, list[float]]:
     """MSE of each test scene, and the late earth mover's distance of the first ones."""
     metric, distances = MSE(HORIZONS), []
     for window in test_batches(run):
-        with run.autocast():
-            predicted = rollout(run.emulator, window.initial, window.target.shape[1])
+        predicted = rollout(run.emulator, window.initial, window.target.shape[1])
         metric.update(window, predicted)
         left = max(0, chosen.emd_scenes - len(distances))
         distances += [late_distance(window, predicted, row, chosen) for row in range(min(left, len(predicted)))]
@@ -179,19 +174,17 @@ def simulated_window(run: Run, scenes: int) -> Window:
 def measure_shapes(run: Run, chosen: Namespace) -> dict[str, Any]:
     """Height and crowding over the simulator's, by frame, with the run's constraints and without them."""
     window, frames = simulated_window(run, chosen.shape_scenes), run.frames
-    with run.autocast():
-        return {
-            "held": compare_shapes(run.emulator, window, frames),
-            "free": compare_shapes(run.emulator.unconstrained(), window, frames),
-        }
+    return {
+        "held": compare_shapes(run.emulator, window, frames),
+        "free": compare_shapes(run.emulator.unconstrained(), window, frames),
+    }
 
 
 def time_runs(runs: Mapping[Path, Run], rounds: int) -> dict[Path, float]:
     """Median ms per frame of each run at batch 1, the runs alternating."""
 
     def roll_out(run: Run, window: Window) -> None:
-        with run.autocast():
-            rollout(run.emulator, window.initial.scenes(slice(1)), TIMED_FRAMES)
+        rollout(run.emulator, window.initial.scenes(slice(1)), TIMED_FRAMES)
 
     windows = {path: test_batches(run)[0] for path, run in runs.items()}
     actions = {path: partial(roll_out, run, windows[path]) for path, run in runs.items()}

@@ -36,7 +36,7 @@ SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__m
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
     "generalisation", "gns", "gradient_shares", "hidden_state", "kills", "random_commits", "run_time_knob",
-    "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
+    "recipe_pictures", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
