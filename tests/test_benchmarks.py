@@ -518,6 +518,17 @@ def test_a_simulator_restarted_before_anything_is_strained_goes_on_as_it_was():
     np.testing.assert_allclose(again, frames[2:6], rtol=0, atol=1e-5)
 
 
+def test_a_simulator_that_takes_over_from_itself_changes_nothing():
+    from hand_over import hand_over
+
+    preset = load_preset("goop").with_frames(6)
+    frames = preset.simulate(0).position
+    path = hand_over(preset, preset.draw(0), frames[:3], 6)
+    assert path is not None
+    np.testing.assert_array_equal(path[:3], frames[:3])
+    np.testing.assert_allclose(path, frames[:6], rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["goop", "waterramps", "dambreak2d"])
 def test_stiffer_materials_need_substeps_as_sound_is_faster(name):
     import stiffness
