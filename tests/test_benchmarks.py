@@ -36,7 +36,7 @@ SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__m
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
     "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state", "kills", "random_commits", "run_time_knob",
-    "recipe_pictures", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
+    "recipe_pictures", "settled_shape", "simulators", "stable_substeps", "stiffness", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -527,6 +527,22 @@ def test_a_simulator_that_takes_over_from_itself_changes_nothing():
     assert path is not None
     np.testing.assert_array_equal(path[:3], frames[:3])
     np.testing.assert_allclose(path, frames[:6], rtol=0, atol=1e-5)
+
+
+def test_settled_shapes_are_compared_scene_by_scene_under_other_constraints():
+    import settled_shape
+
+    preset = load_preset("waterramps").with_frames(6)
+    torch.manual_seed(0)
+    emulator = EmulatorRecipe(preset.scene, cells=16, frames=4, processor=UNet(width=4, depth=2)).build().eval()
+    capped = settled_shape.held_to(emulator, "density_cap=3.0,rest_speed=0.01")
+    assert capped.constraints == dataclasses.replace(emulator.constraints, density_cap=3.0, rest_speed=0.01)
+    rows = {"model": emulator, "capped": capped}
+    scenes = list(settled_shape.measure(rows, "waterramps", [1, 4], 2))
+    assert [list(scene) for scene in scenes] == [["simulator", "twin", "model", "capped"]] * 2
+    assert all(values.shape == (2, 3) and (values > 0).all() for scene in scenes for values in scene.values())
+    heights = np.array([1.0, 2.0, 3.0])
+    assert settled_shape.ratio(1.1 * heights, heights) == "1.10 (1.10–1.10)"
 
 
 @pytest.mark.parametrize("name", ["goop", "waterramps", "dambreak2d"])

@@ -45,7 +45,8 @@ def settling(subject: Subject, size: Size) -> Iterator[Line]:
 
 def compare_shapes(emulator: Emulator, window: Window, frames: Sequence[int]) -> dict[int, dict[str, float]]:
     """Measures of a rollout over those of the recorded trajectories, by frame (from 1) and name."""
-    return _ratios(_predicted(emulator, window.initial, frames), _recorded(emulator, window, frames), frames)
+    predicted = predicted_shapes(emulator, window.initial, frames)
+    return _ratios(predicted, recorded_shapes(emulator, window, frames), frames)
 
 
 def _compare(
@@ -54,8 +55,8 @@ def _compare(
     """Measures of the twin and of each emulator over the simulator's, scene by scene, as long ones take memory."""
     found: list[Shapes] = [{frame: [] for frame in frames} for _ in range(len(emulators) + 2)]
     for truth, twin in simulate_beside(subject, preset, scenes, max(frames), [twin_of(preset)]):
-        shapes = [_recorded(subject.emulator, window, frames) for window in (truth, twin)]
-        shapes += [_predicted(emulator, truth.initial, frames) for emulator in emulators]
+        shapes = [recorded_shapes(subject.emulator, window, frames) for window in (truth, twin)]
+        shapes += [predicted_shapes(emulator, truth.initial, frames) for emulator in emulators]
         for kept, own in zip(found, shapes, strict=True):
             for frame in frames:
                 kept[frame] += own[frame]
@@ -63,12 +64,13 @@ def _compare(
     return [_ratios(other, simulated, frames) for other in others]
 
 
-def _recorded(emulator: Emulator, window: Window, frames: Sequence[int]) -> Shapes:
+def recorded_shapes(emulator: Emulator, window: Window, frames: Sequence[int]) -> Shapes:
+    """The shapes of a window's trajectories at frames, which count from 1, on an emulator's grid."""
     return {frame: [_shape(emulator, window.initial, window.target[:, frame - 1])] for frame in frames}
 
 
-def _predicted(emulator: Emulator, state: Particles, frames: Sequence[int]) -> Shapes:
-    """The shapes of a rollout, of which only one bundle is kept at a time."""
+def predicted_shapes(emulator: Emulator, state: Particles, frames: Sequence[int]) -> Shapes:
+    """The shapes of a rollout at frames, which count from 1; only one bundle is kept at a time."""
     shapes, made = {}, 0
     for bundle in stream(emulator, state, max(frames)):
         for frame in frames:
