@@ -121,7 +121,8 @@ def _about(dataset: Dataset) -> str:
     counts, preset = request.counts, request.preset
     return (
         f"{counts['train']} trajectories to train on, {counts['valid']} to validate and {counts['test']} to test, of"
-        f" {preset.frames + 1} frames, from nmpm's own {preset.generator}. Seed {request.seed}."
+        f" {preset.frames + 1} frames, from nmpm's own {preset.generator}, seed {request.seed}; figures on others'"
+        " data of that name are not comparable."
     )
 
 
