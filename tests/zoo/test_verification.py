@@ -56,8 +56,8 @@ def changed(model, change):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda emulator: emulator.input_std.fill_(1),
-        lambda emulator: emulator.output_scale.fill_(1),
+        lambda emulator: emulator.input_std.mul_(1.1),
+        lambda emulator: emulator.output_scale.mul_(1.1),
         lambda emulator: next(emulator.processor.parameters()).data.zero_(),
     ],
     ids=["input scale", "output scale", "a layer"],
