@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
@@ -174,6 +174,17 @@ class Scene:
         return dataclasses.replace(
             self, evolving=other.evolving, properties=other.properties, parameters=other.parameters
         )
+
+    def with_domain_moved(self, shift: Sequence[float]) -> Self:
+        """The same scene covered by a domain that is moved by `shift` (D,), in domain length; periods move with it.
+
+        Raises:
+            ConfigError: if the domain would no longer contain the bounds.
+        """
+        moved = [(low + d, high + d) for (low, high), d in zip(self.domain, shift, strict=True)]
+        sides = zip(self.bounds, moved, self.periodic, strict=True)
+        bounds = tuple(domain if wraps else own for own, domain, wraps in sides)
+        return dataclasses.replace(self, bounds=bounds, domain=tuple(moved))
 
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers; without densities and fields if there are none, as in older

@@ -46,7 +46,8 @@ def data_of(folder: Path, **options) -> TrajectoryDataModule:
 def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = None, **options) -> dict:
     """Train, write the last checkpoint to the file `last`, and return the record."""
     module = data_of(folder, **options.pop("data", {}))
-    model = {"unroll": 2, "position_noise": 1e-4, "grid_noise": 0.01, "mirror": (0,)} | options.pop("model", {})
+    noise = {"position_noise": 1e-4, "grid_noise": 0.01, "mirror": (0,), "jitter": 0.15}
+    model = {"unroll": 2} | noise | options.pop("model", {})
     if options.pop("soap", False):
         model["optimizer"] = SOAP
     torch.manual_seed(0)

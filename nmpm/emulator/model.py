@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -164,6 +165,23 @@ class Emulator(nn.Module):
         other = copy.copy(self)
         other.recipe = dataclasses.replace(self.recipe, constraints=constraints)
         other._plan = make_plan(other.recipe)
+        return other
+
+    def with_grid_moved(self, shift: Sequence[float]) -> Emulator:
+        """This emulator with its grid moved by `shift` (D,), in domain length, over the same scenes.
+
+        Weights and statistics are shared, not copied.
+
+        Raises:
+            ConfigError: if the grid would no longer cover the scene's bounds.
+        """
+        other = copy.copy(self)
+        other.recipe = dataclasses.replace(self.recipe, scene=self.scene.with_domain_moved(shift))
+        other.grid = other.recipe.grid
+        other._plan = make_plan(other.recipe)
+        bounds, walls = other.grid.bounds_in_cells(other.scene), wall_fraction(other.scene, other.grid)
+        own = {"bounds": bounds.to(self.bounds), "walls": walls.to(self.walls)}
+        other._buffers = {**self._buffers, **own}
         return other
 
     def with_windows(self, windows: Windows | None) -> Emulator:

@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
-from nmpm._support.collectives import global_mean, rank_slice
+from nmpm._support.collectives import global_mean
 from nmpm._support.digests import weights_digest
 from nmpm._support.specs import class_path
 from nmpm.emulator import Emulator, EmulatorRecipe, Rollout, predict_rollout
@@ -29,7 +29,7 @@ from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric
 from nmpm.particles import Window
 from nmpm.scene import Scene
-from nmpm.training.augmentation import check_mirrors, mirror_windows, with_position_noise
+from nmpm.training.augmentation import Augmentation
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.compatibility import (
     adopt_optimizer_arguments,
@@ -65,6 +65,8 @@ class EmulatorModule(LightningModule):
             at 1, mean squares.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
+        jitter: Cells, at most half of one, by which the grid is moved at most in each training step: where cells lie
+            is chance, which the network then learns.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
         recompute: Whether gradients recompute each bundle instead of keeping its activations: the memory of one bundle
             instead of K, for the time of one more forward pass.
@@ -87,6 +89,7 @@ class EmulatorModule(LightningModule):
         error_power: float = 0.5,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
+        jitter: float = 0.0,
         metrics: Sequence[RolloutMetric] | None = None,
         recompute: bool = False,
         compile: bool = False,  # noqa: A002 (torch's word)
@@ -102,10 +105,10 @@ class EmulatorModule(LightningModule):
         self.discount = Discount(gradient_discount)
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
-        check_mirrors(scene, mirror)
         self.error = TrainingError(density_weight, error_power)
         self.field_error = FieldError(field_weight, error_power)
-        self.position_noise, self.mirror = position_noise, tuple(mirror)
+        self.augmentation = Augmentation(tuple(mirror), jitter, position_noise)
+        self.augmentation.check(scene, self.emulator.grid)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
         plain = self.emulator.recipe.to_dict()
@@ -120,6 +123,7 @@ class EmulatorModule(LightningModule):
             "error_power": error_power,
             "position_noise": position_noise,
             "mirror": list(mirror),
+            "jitter": jitter,
             "recompute": recompute,
             "compile": compile,
             "seed": seed,
@@ -224,13 +228,10 @@ class EmulatorModule(LightningModule):
         Over several batches (`accumulate_grad_batches`) Lightning takes the plain mean, so that a particle weighs a
         little more in a batch with fewer particles.
         """
-        for axis in self.mirror:
-            draws = rank_slice(lambda rows: torch.rand(rows, device=self.device), len(batch.frames))
-            batch = mirror_windows(batch, self.emulator.scene, axis, draws < 0.5)
-        particles = with_position_noise(batch.initial, self.position_noise)
-        count = self.bundles(self._progress())
-        call = recomputed if self.recompute else direct
-        bundles = unroll_training(self.emulator, particles, count, call, self.discount)
+        batch = self.augmentation.mirrored(batch, self.emulator.scene)
+        particles, emulator = self.augmentation.start(batch), self.augmentation.jittered(self.emulator)
+        count, call = self.bundles(self._progress()), recomputed if self.recompute else direct
+        bundles = unroll_training(emulator, particles, count, call, self.discount)
         error = self._error(Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles]), batch)
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged)

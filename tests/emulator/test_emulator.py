@@ -320,3 +320,32 @@ def test_complex_weights_have_no_other_precision():
     emulator = small(box(), processor=FNO(modes=4, width=4, layers=1))
     with pytest.raises(ConfigError, match=r"FNO has complex weights.*autocast"):
         emulator.with_network(torch.bfloat16)
+
+
+@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("obstacles", [False, True])
+def test_a_moved_grid_sees_what_the_grid_sees_of_a_scene_moved_the_other_way(training, obstacles):
+    shift, here = (0.013, -0.007), box(obstacles=obstacles)
+    bounds = tuple((low - d, high - d) for (low, high), d in zip(here.bounds, shift, strict=True))
+    emulator, there = small(here), small(dataclasses.replace(here, bounds=bounds))
+    there.load_state_dict(emulator.state_dict())
+    particles = cloud(here, batch=2, speed=0.05, statics=5 if obstacles else 0)
+    offset = torch.tensor(shift)
+    moved = dataclasses.replace(particles, position=particles.position - offset, obstacle=particles.obstacle - offset)
+    own = emulator.with_grid_moved(shift).train(training)
+    found, expected = own(particles), there.train(training)(moved)
+    torch.testing.assert_close(found.position - offset, expected.position, atol=2e-6, rtol=0)
+    torch.testing.assert_close(found.velocity, expected.velocity, atol=2e-6, rtol=0)
+    assert (found.position - emulator.train(training)(particles).position).abs().max() > 1e-4
+    assert own.processor is emulator.processor
+
+
+def test_periods_move_with_the_grid_and_walls_must_stay_on_it():
+    everywhere = ((0.08, 0.92),) * 2
+    scene = box(bounds=everywhere, domain=everywhere, boundary=("periodic",) * 2, gravity=(0.0, 0.0))
+    emulator, particles = small(scene), cloud(scene, speed=0.05)
+    cell = emulator.grid.spacing[0]
+    same = emulator.with_grid_moved((cell, -2 * cell))(particles)  # a torus looks the same from the next cell
+    torch.testing.assert_close(same.position, emulator(particles).position, atol=2e-6, rtol=0)
+    with pytest.raises(ConfigError, match="must contain the bounds"):
+        small(box()).with_grid_moved((0.03, 0.0))

@@ -2,9 +2,12 @@ import pytest
 import torch
 from scenes import box, cloud
 
+from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
+from nmpm.grid import Grid
 from nmpm.particles import Window
-from nmpm.training.augmentation import check_mirrors, mirror_windows
+from nmpm.processors import UNet
+from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_windows, with_jitter
 
 
 def window_of(scene, batch=3):
@@ -35,3 +38,34 @@ def test_only_symmetries_are_allowed():
         check_mirrors(box(), [1])
     with pytest.raises(ConfigError, match="no axis 2"):
         check_mirrors(box(), [2])
+
+
+def test_jitter_moves_the_grid_by_less_than_asked_and_keeps_the_weights():
+    torch.manual_seed(0)
+    emulator = EmulatorRecipe(box(), 16, 2, processor=UNet(width=4, depth=1, perceptron=(4,))).build()
+    assert with_jitter(emulator, 0.0) is emulator
+    moves = []
+    for _ in range(200):
+        moved = with_jitter(emulator, 0.25)
+        assert moved.processor is emulator.processor
+        moves.append((torch.tensor(moved.grid.lower) - torch.tensor(emulator.grid.lower)) / emulator.grid.spacing[0])
+    assert torch.stack(moves).abs().max() <= 0.25 + 1e-6
+    assert (torch.stack(moves).amin(0) < -0.2).all()
+    assert (torch.stack(moves).amax(0) > 0.2).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "allowed", "refused", "message"),
+    [
+        ({}, 0.38, 0.39, "leaves 0.38 cells"),
+        ({"bounds": ((0.1, 0.9), (0.08, 0.92))}, 0.0, 0.1, "axis 1 leaves 0 cells"),
+        ({"bounds": ((0.2, 0.8), (0.2, 0.8))}, 0.5, 0.51, "half a cell"),
+        ({"bounds": ((0.08, 0.92),) * 2, "boundary": ("periodic",) * 2}, 0.5, 0.6, "half a cell"),
+        ({}, 0.0, -0.1, "from 0"),
+    ],
+)
+def test_jitter_leaves_walls_on_the_grid(changes, allowed, refused, message):
+    scene = box(**changes)
+    check_jitter(scene, Grid.of(scene, 16), allowed)
+    with pytest.raises(ConfigError, match=message):
+        check_jitter(scene, Grid.of(scene, 16), refused)

@@ -21,7 +21,7 @@ from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from tests.conftest import made_up_metadata, made_up_trajectory
 
 SIZES = ((30, 9), (24, 7), (18, 8), (21, 6), (16, 5))
-QUIET = {"position_noise": 0.0, "grid_noise": 0.0, "mirror": ()}
+QUIET = {"position_noise": 0.0, "grid_noise": 0.0, "mirror": (), "jitter": 0.0}
 HELD = {"buffer_size": 5}  # all trajectories, 84 windows
 
 
