@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,7 +23,7 @@ class Augmentation:
 
     Args:
         mirror: Axes along which half of the windows are mirrored.
-        jitter: Cells by which the grid is moved at most.
+        jitter: Cells by which the grid is moved at most, see `with_jitter`.
         position_noise: Standard deviation of the noise on initial positions, in domain lengths.
     """
 
@@ -93,29 +92,42 @@ def mirror_windows(window: Window, scene: Scene, axis: int, chosen: Tensor) -> W
 
 
 def check_jitter(scene: Scene, grid: Grid, cells: float) -> None:
-    """Make sure that the grid can be moved by so many cells and still covers the scene.
+    """Make sure that the grid can be moved.
 
     Raises:
-        ConfigError: naming the axis, and the room between a wall and the domain's end.
+        ConfigError: if `cells` is not from 0 to half a cell, or the scene has no wall layer, so that nothing can move.
     """
-    for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(scene.bounds, scene.domain, strict=True)):
-        room = min(low - outer_low, outer_high - high) / grid.spacing[axis]
-        if not 0 <= cells <= (0.5 if scene.periodic[axis] else min(room, 0.5)):
-            raise ConfigError(
-                f"model.jitter = {cells} must be from 0 to half a cell, and walls must stay on the grid: axis {axis} "
-                f"leaves {math.floor(100 * room) / 100:g} cells."
-            )
+    if not 0 <= cells <= 0.5:
+        raise ConfigError(f"model.jitter = {cells} must be from 0 to 0.5: half a cell to each side is all there is.")
+    if cells and not any(_room(scene, grid, cells)):
+        raise ConfigError(
+            f"model.jitter = {cells} moves the grid within the wall layer, between bounds and domain, which this scene "
+            "lacks: leave it 0, or give the data a larger domain."
+        )
 
 
 def with_jitter(emulator: Emulator, cells: float) -> Emulator:
     """The emulator with its grid moved by up to so many cells along each axis; weights are shared.
 
-    All ranks move it alike, as they have the same random state.
+    Walls stay on the grid: along axes whose wall layer is narrower it is moved by less. All ranks move it alike, as
+    they have the same random state.
     """
     if not cells:
         return emulator
-    draws = cells * (2 * torch.rand(emulator.grid.dim, dtype=torch.float64, device="cpu") - 1)
-    return emulator.with_grid_moved([d * h for d, h in zip(draws.tolist(), emulator.grid.spacing, strict=True)])
+    grid = emulator.grid
+    draws = (2 * torch.rand(grid.dim, dtype=torch.float64, device="cpu") - 1).tolist()
+    limits = zip(draws, _room(emulator.scene, grid, cells), grid.spacing, strict=True)
+    return emulator.with_grid_moved([draw * room * spacing for draw, room, spacing in limits])
+
+
+def _room(scene: Scene, grid: Grid, cells: float) -> list[float]:
+    """By how many cells the grid can be moved along each axis, at most `cells`."""
+    rooms = []
+    for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(scene.bounds, scene.domain, strict=True)):
+        layer = min(low - outer_low, outer_high - high) / grid.spacing[axis]
+        within = layer * (1 - 1e-9)  # so that rounding moves no wall off the grid
+        rooms.append(cells if scene.periodic[axis] else min(cells, within))
+    return rooms
 
 
 def with_position_noise(particles: Particles, deviation: float) -> Particles:

@@ -65,8 +65,8 @@ class EmulatorModule(LightningModule):
             at 1, mean squares.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
-        jitter: Cells, at most half of one, by which the grid is moved at most in each training step: where cells lie
-            is chance, which the network then learns.
+        jitter: Cells, up to half of one, by which the grid is moved at most in each training step, within the scene's
+            wall layer: where cells lie is chance, on which little should depend.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
         recompute: Whether gradients recompute each bundle instead of keeping its activations: the memory of one bundle
             instead of K, for the time of one more forward pass.

@@ -55,17 +55,33 @@ def test_jitter_moves_the_grid_by_less_than_asked_and_keeps_the_weights():
 
 
 @pytest.mark.parametrize(
-    ("changes", "allowed", "refused", "message"),
+    ("changes", "limits"),
     [
-        ({}, 0.38, 0.39, "leaves 0.38 cells"),
-        ({"bounds": ((0.1, 0.9), (0.08, 0.92))}, 0.0, 0.1, "axis 1 leaves 0 cells"),
-        ({"bounds": ((0.2, 0.8), (0.2, 0.8))}, 0.5, 0.51, "half a cell"),
-        ({"bounds": ((0.08, 0.92),) * 2, "boundary": ("periodic",) * 2}, 0.5, 0.6, "half a cell"),
-        ({}, 0.0, -0.1, "from 0"),
+        ({}, (0.3, 0.3)),
+        ({"bounds": ((0.081, 0.919), (0.1, 0.9))}, (0.019, 0.3)),  # of 0.0525 each
+        ({"bounds": ((0.1, 0.9), (0.08, 0.92))}, (0.3, 0.0)),
+        ({"bounds": ((0.08, 0.92),) * 2, "boundary": ("periodic",) * 2, "gravity": (0.0, 0.0)}, (0.3, 0.3)),
     ],
 )
-def test_jitter_leaves_walls_on_the_grid(changes, allowed, refused, message):
+def test_jitter_leaves_walls_on_the_grid(changes, limits):
+    torch.manual_seed(0)
+    emulator = EmulatorRecipe(box(**changes), 16, 1, processor=UNet(width=4, depth=1, perceptron=(4,))).build()
+    moved = [with_jitter(emulator, 0.3).grid.lower for _ in range(300)]  # raises if a wall leaves it
+    steps = (torch.tensor(moved) - torch.tensor(emulator.grid.lower)) / torch.tensor(emulator.grid.spacing)
+    assert (steps.abs().amax(0) <= torch.tensor(limits) + 1e-3).all()
+    assert (steps.abs().amax(0) >= 0.9 * torch.tensor(limits) - 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "cells", "message"),
+    [
+        ({}, 0.51, "from 0 to 0.5"),
+        ({}, -0.1, "from 0 to 0.5"),
+        ({"bounds": ((0.08, 0.92),) * 2}, 0.1, "which this scene lacks"),
+    ],
+)
+def test_a_jitter_that_cannot_be_is_refused(changes, cells, message):
     scene = box(**changes)
-    check_jitter(scene, Grid.of(scene, 16), allowed)
+    check_jitter(scene, Grid.of(scene, 16), 0.0)
     with pytest.raises(ConfigError, match=message):
-        check_jitter(scene, Grid.of(scene, 16), refused)
+        check_jitter(scene, Grid.of(scene, 16), cells)
