@@ -28,12 +28,12 @@ from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.compatibility import check_same_recipe
-from nmpm.training.module import EmulatorModule
+from nmpm.training.module import OVERALL, EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.run_folder import RunFolder
 from nmpm.zoo.registry import load_model
 
-BEST = {"filename": "best", "monitor": "valid/mse", "enable_version_counter": False}
+BEST = {"filename": "best", "monitor": f"valid/{OVERALL}", "enable_version_counter": False}
 # A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best
 # does not change.
 LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}

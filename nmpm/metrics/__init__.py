@@ -6,6 +6,14 @@ A metric is added by one file and one line here; others are named by their class
 from nmpm.metrics.base import RolloutMetric
 from nmpm.metrics.earth_mover import EarthMover, earth_mover, earth_mover_of_materials
 from nmpm.metrics.fields import FieldMSE
-from nmpm.metrics.mse import MSE
+from nmpm.metrics.mse import MSE, overall_error
 
-__all__ = ["MSE", "EarthMover", "FieldMSE", "RolloutMetric", "earth_mover", "earth_mover_of_materials"]
+__all__ = [
+    "MSE",
+    "EarthMover",
+    "FieldMSE",
+    "RolloutMetric",
+    "earth_mover",
+    "earth_mover_of_materials",
+    "overall_error",
+]

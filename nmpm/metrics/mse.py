@@ -6,7 +6,7 @@ domain length squared, from a rollout that starts with frames 0 and 1; *full* is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -15,6 +15,20 @@ from torchmetrics.utilities import dim_zero_cat
 
 from nmpm.metrics.base import RolloutMetric
 from nmpm.particles import Window
+
+
+def overall_error(errors: Mapping[str, Tensor], horizon: int) -> Tensor:
+    """Geometric mean of the MSE at the horizons of at least so many frames and over the full rollout, ().
+
+    Over the full rollout alone, a few scenes tell good weights from bad ones by chance.
+
+    Args:
+        errors: () by the names "mse@h" and "mse", from `MSE.compute`; others are left out.
+        horizon: Frames from which on a rollout is longer than what a model was trained for.
+    """
+    horizons = {int(name.removeprefix("mse@")): value for name, value in errors.items() if name.startswith("mse@")}
+    chosen = [errors["mse"], *(value for h, value in horizons.items() if h >= horizon)]
+    return torch.stack(chosen).log().mean().exp()
 
 
 class MSE(RolloutMetric):

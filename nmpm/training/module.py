@@ -26,7 +26,7 @@ from nmpm.emulator.gradients import recomputed
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
-from nmpm.metrics import MSE, RolloutMetric
+from nmpm.metrics import MSE, RolloutMetric, overall_error
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.training.augmentation import Augmentation
@@ -44,6 +44,9 @@ from nmpm.training.schedules import Schedule
 from nmpm.training.unrolling import Discount, direct, unroll_training
 
 CALIBRATION_BATCHES = 4
+
+OVERALL = "overall"
+"""Name of the validation error by which the best checkpoint is chosen, see `overall_error`."""
 
 
 class EmulatorModule(LightningModule):
@@ -270,7 +273,9 @@ class EmulatorModule(LightningModule):
         self.test_errors.reset()
 
     def on_validation_epoch_end(self) -> None:
-        self.log_dict({f"valid/{name}": value for name, value in self.valid_errors.compute().items()})
+        errors = self.valid_errors.compute()
+        overall = overall_error(errors, self.emulator.frames * self.unroll)
+        self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
         self.validated_step = self.global_step
 
     def on_test_epoch_end(self) -> None:

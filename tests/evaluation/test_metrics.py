@@ -5,7 +5,7 @@ from scipy.optimize import linear_sum_assignment
 
 from nmpm.evaluation.baselines import free_fall, still
 from nmpm.grid import Grid
-from nmpm.metrics import MSE, EarthMover, earth_mover
+from nmpm.metrics import MSE, EarthMover, earth_mover, overall_error
 from nmpm.particles import Window
 from nmpm.training.losses import position_error
 
@@ -30,6 +30,17 @@ def test_mse_at_h_is_the_mean_up_to_h_over_particles_and_dimensions():
     metric.update(recorded(target), predicted)
     found = {name: value.item() for name, value in metric.compute().items()}
     assert found == pytest.approx({"mse@1": 1.0, "mse@8": 4.5, "mse@32": 16.5, "mse": 20.5}, rel=1e-6)
+
+
+def test_the_overall_error_is_the_geometric_mean_from_a_horizon_on():
+    errors = {"mse@8": 1e-9, "mse@32": 1e-3, "mse@100": 1e-1, "mse": 10.0, "still/mse@100": 5.0, "mse_temperature": 7.0}
+    tensors = {name: torch.tensor(value) for name, value in errors.items()}
+    assert overall_error(tensors, 32).item() == pytest.approx(1e-1, rel=1e-5)  # (1e-3 1e-1 10) ** (1/3)
+    assert overall_error(tensors, 9).item() == pytest.approx(1e-1, rel=1e-5)
+    assert overall_error(tensors, 8).item() == pytest.approx(1e-3, rel=1e-5)
+    assert overall_error(tensors, 101).item() == pytest.approx(10.0, rel=1e-5)
+    assert overall_error({"mse": torch.tensor(0.0)}, 1).item() == 0.0
+    assert overall_error(tensors | {"mse": torch.tensor(torch.nan)}, 32).isnan()
 
 
 def test_padding_does_not_count_and_trajectories_of_any_length_do():

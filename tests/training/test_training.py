@@ -85,6 +85,8 @@ def test_training_lowers_the_loss_and_reports_rollouts_beside_the_trivial_predic
     for kind in ("", "still/", "free_fall/"):
         for name in ("mse", "mse@1", "mse@4"):
             assert figures[f"valid/{kind}{name}"].isfinite()
+    longer = torch.stack([figures[f"valid/{name}"] for name in ("mse@4", "mse")])  # than the 4 frames trained for
+    torch.testing.assert_close(figures["valid/overall"], longer.prod().sqrt())
 
 
 @pytest.mark.parametrize("optimizer", [functools.partial(torch.optim.Adam, lr=1e-3), SOAP])

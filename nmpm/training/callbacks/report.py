@@ -24,7 +24,7 @@ from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.evaluation.figures import PREDICTORS, figure_names, table_row
 from nmpm.metrics import MSE
 from nmpm.particles import Window
-from nmpm.training.module import EmulatorModule
+from nmpm.training.module import OVERALL, EmulatorModule
 from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
 
 
@@ -39,7 +39,7 @@ class ReportWriter(Callback):
         self.trained_seconds = 0.0
         self.trained_steps = 0
         self.trained_precision = ""
-        self.curve: list[list[float]] = []  # seconds of training, steps and MSE of each validation
+        self.curve: list[list[float]] = []  # seconds of training, steps, MSE and overall error of each validation
         self._since: float | None = None
         self._trained = False
         self._first_rollout: tuple[Window, Tensor] | None = None
@@ -79,9 +79,10 @@ class ReportWriter(Callback):
         self.trained_steps = trainer.global_step
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        mse = trainer.callback_metrics.get("valid/mse")
-        if self._trained and not trainer.sanity_checking and mse is not None:
-            self.curve.append([round(self._elapsed(), 1), self.trained_steps, float(mse)])
+        found = trainer.callback_metrics
+        errors = [float(found[name]) for name in ("valid/mse", f"valid/{OVERALL}") if name in found]
+        if self._trained and not trainer.sanity_checking and errors:
+            self.curve.append([round(self._elapsed(), 1), self.trained_steps, *errors])
         if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
             dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
             _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))

@@ -20,6 +20,7 @@ from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.publish import replace
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.trainings import History, Training
+from nmpm.zoo.queue.validations import Curve, lowest_errors
 from nmpm.zoo.registry import Zoo
 from nmpm.zoo.runs import BEST
 
@@ -56,7 +57,7 @@ def collect(history: History, zoo: Path, run: Command) -> str:
             with atomic_write(folder / file) as part:
                 part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         error = report["test"]["mse"]
-        if (reason := _reason_to_keep(name, zoo, best.error(), error)) is not None:
+        if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
         replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
         refresh(zoo / name, ["speed"])
@@ -126,15 +127,14 @@ def _about(dataset: Dataset) -> str:
     )
 
 
-def _reason_to_keep(name: str, zoo: Path, validation: float, test: float) -> str | None:
+def _reason_to_keep(name: str, zoo: Path, validations: Curve, test: float) -> str | None:
     """Why the published entry is better than weights with these errors; None if it is not, or there is none."""
     try:
         card = Zoo.card(name, zoo)
-        split, found = "validation", validation
-        published = min((float(point[2]) for point in card.get("curve", [])), default=None)
-        if published is None:
+        split, (published, found) = "validation", lowest_errors(card.get("curve", []), validations)
+        if not card.get("curve"):
             split, found, published = "test", test, float(card["test"]["mse"])
-    except (ZooError, KeyError, TypeError, ValueError):
+    except (ZooError, KeyError, TypeError, ValueError, IndexError):
         return None
     if published >= found:
         return None

@@ -43,12 +43,8 @@ class Published:
         return Published(folder, read_yaml(folder / CARD))
 
     def curve(self) -> list[list[float]]:
-        """Seconds of training, steps and MSE of each validation."""
+        """Seconds of training, steps, MSE and overall error of each validation."""
         return [list(point) for point in self.card.get("curve", [])]
-
-    def error(self) -> float:
-        """The lowest validation MSE."""
-        return min(float(point[2]) for point in self.curve())
 
     def seconds(self) -> float:
         """Seconds of training."""

@@ -15,6 +15,7 @@ from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo.queue.plan import Dataset, Extension, continued_training, new_training
 from nmpm.zoo.queue.published import Published
+from nmpm.zoo.queue.validations import lowest_errors
 from nmpm.zoo.runs import BEST
 
 LAST = BEST.with_name("last.ckpt")
@@ -74,12 +75,8 @@ class Training:
         return ["test", *words[1:], *options, "--ckpt_path", "best", "--verbose", "false"]
 
     def curve(self) -> list[list[float]]:
-        """Seconds of training, steps and MSE of each validation so far."""
+        """Seconds of training, steps, MSE and overall error of each validation so far."""
         return [list(point) for point in self._record().get("curve", [])]
-
-    def error(self) -> float:
-        """The lowest validation MSE so far; infinite before the first validation."""
-        return min((point[2] for point in self.curve()), default=float("inf"))
 
     def seconds(self) -> float:
         """Seconds of training so far, as of its last checkpoint."""
@@ -159,7 +156,8 @@ class History:
     def best(self) -> Training | None:
         """The training of the lowest validation error; None before the first validation."""
         validated = [training for training in self.trainings if training.best.is_file() and training.curve()]
-        return min(validated, key=Training.error, default=None)
+        errors = lowest_errors(*(training.curve() for training in validated))
+        return validated[errors.index(min(errors))] if validated else None
 
     def next_round(self) -> int | None:
         """Number of the training to start or to go on with, from 1; None when the dataset stops."""
@@ -173,7 +171,7 @@ class History:
         trainings, extension = self.trainings, self.extension
         if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.hours_of(len(trainings) + 1) <= 0:
             return True
-        errors = [stage.error() for stage in self.stages]
+        errors = lowest_errors(*(stage.curve() for stage in self.stages))
         return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
 
     def hours_of(self, number: int) -> float:
@@ -211,8 +209,10 @@ class History:
         best, entry = self.best(), self.starting_entry
         if entry is not None and entry.folder != self.folder / COPY:
             entry = entry.copy_to(self.folder / COPY)
-        if entry is not None and (best is None or entry.error() <= best.error()):
-            return entry.folder
+        if entry is not None:
+            kept, found = lowest_errors(entry.curve(), [] if best is None else best.curve())
+            if kept <= found:
+                return entry.folder
         if best is None and self.dataset.start and not self.trainings:
             best = self._origin().best()
         return None if best is None else best.best
@@ -240,10 +240,10 @@ class History:
         return left, left + max(extension.limit - self.planned_hours(count), 0.0)
 
     def curve(self) -> list[list[float]]:
-        """Seconds, steps and validation MSE over all trainings, one after the other."""
+        """Seconds, steps and validation errors over all trainings, one after the other."""
         points: list[list[float]] = []
         seconds, steps = 0.0, 0
         for stage in self.stages:
-            points += [[round(seconds + s, 1), steps + int(n), mse] for s, n, mse in stage.curve()]
+            points += [[round(seconds + s, 1), steps + int(n), *errors] for s, n, *errors in stage.curve()]
             seconds, steps = seconds + stage.seconds(), steps + stage.steps()
         return points
