@@ -181,10 +181,10 @@ class Scene:
         Raises:
             ConfigError: if the domain would no longer contain the bounds.
         """
-        moved = [(low + d, high + d) for (low, high), d in zip(self.domain, shift, strict=True)]
-        sides = zip(self.bounds, moved, self.periodic, strict=True)
-        bounds = tuple(domain if wraps else own for own, domain, wraps in sides)
-        return dataclasses.replace(self, bounds=bounds, domain=tuple(moved))
+        domain = tuple((low + d, high + d) for (low, high), d in zip(self.domain, shift, strict=True))
+        sides = zip(self.bounds, shift, self.periodic, strict=True)
+        bounds = tuple((low + d, high + d) if wraps else (low, high) for (low, high), d, wraps in sides)
+        return dataclasses.replace(self, bounds=bounds, domain=domain)
 
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers; without densities and fields if there are none, as in older
