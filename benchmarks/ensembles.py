@@ -24,19 +24,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from recipes import Run, format_error, format_markdown, test_batches
+from recipes import HORIZONS, Run, format_error, format_markdown, test_batches
+from scipy.stats import spearmanr
 from timing import make_parser, write_json
 from torch import Tensor
 
-from nmpm.emulator import Bundle, Emulator, rollout
+from nmpm.emulator import Bundle, Emulator, RolloutContext, rollout
+from nmpm.emulator.gradients import Call, unroll_with_gradients
 from nmpm.emulator.rasterise import volume_fraction
-from nmpm.emulator.rollouts import Rollout
 from nmpm.metrics import MSE
 from nmpm.particles import Particles, Window
 from nmpm.training.augmentation import with_jitter
 
-HORIZONS = (8, 32, 100)
 ONE, OF_ROLLOUTS, IN_CALLS, JITTERED = "one", "mean of rollouts", "mean in each call", "mean of jittered rollouts"
 SPREAD = "spread"
 JITTER = 0.35
@@ -44,26 +43,27 @@ JITTER = 0.35
 Figures = dict[str, list[float]]
 
 
+def roll_out(first: Emulator, state: Particles, frames: int, call: Call) -> Tensor:
+    """(B, frames, N, D) by calls that start from the last one's end."""
+    bundles = unroll_with_gradients(first, state, -(-frames // first.frames), call)
+    return torch.cat([bundle.position for bundle in bundles], dim=1)[:, :frames]
+
+
 def roll_out_together(emulators: Sequence[Emulator], state: Particles, frames: int) -> Tensor:
     """(B, frames, N, D): each bundle is the mean of what all predict from the common state."""
-    contexts, parts = [emulator.context(state) for emulator in emulators], []
-    for _ in range(-(-frames // emulators[0].frames)):
-        bundles = [emulator(state, context) for emulator, context in zip(emulators, contexts, strict=True)]
-        position = torch.stack([bundle.position for bundle in bundles]).mean(0)
-        velocity = torch.stack([bundle.velocity for bundle in bundles]).mean(0)
-        parts.append(Rollout(position, {}))
-        state = Bundle(position, velocity).state_after(state)
-    return Rollout.join(parts).position[:, :frames]
+    contexts = [emulator.context(state) for emulator in emulators]
+
+    def call(_: Emulator, particles: Particles, __: RolloutContext) -> Bundle:
+        bundles = [emulator(particles, context) for emulator, context in zip(emulators, contexts, strict=True)]
+        position, velocity = ([getattr(bundle, name) for bundle in bundles] for name in ("position", "velocity"))
+        return Bundle(torch.stack(position).mean(0), torch.stack(velocity).mean(0))
+
+    return roll_out(emulators[0], state, frames, call)
 
 
 def roll_out_jittered(emulator: Emulator, state: Particles, frames: int) -> Tensor:
     """(B, frames, N, D) with the grid at another place in each call."""
-    parts = []
-    for _ in range(-(-frames // emulator.frames)):
-        bundle = with_jitter(emulator, JITTER)(state)
-        parts.append(Rollout(bundle.position, {}))
-        state = bundle.state_after(state)
-    return Rollout.join(parts).position[:, :frames]
+    return roll_out(emulator, state, frames, lambda own, particles, _: with_jitter(own, JITTER)(particles))
 
 
 def density(emulator: Emulator, window: Window, position: Tensor) -> Tensor:
@@ -113,12 +113,6 @@ def some_scenes(run: Run, scenes: int) -> Iterator[Window]:
         scenes -= len(window.mask)
 
 
-def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
-    """Spearman's, of values without ties."""
-    ranks: list[NDArray[np.int64]] = [np.argsort(np.argsort(values)) for values in (first, second)]
-    return float(np.corrcoef(*ranks)[0, 1])
-
-
 @torch.no_grad()
 def main() -> None:
     """Measure and print the table."""
@@ -142,7 +136,7 @@ def main() -> None:
     ]
     sys.stdout.write(format_markdown(lines))
     for name in ("runs", "jittered"):
-        correlation = rank_correlation(spreads[name], spreads["error"])
+        correlation = spearmanr(spreads[name], spreads["error"]).statistic
         sys.stdout.write(f"spread of {name} {1e3 * np.mean(spreads[name]):.3g}, rank correlation {correlation:.2f}\n")
     write_json(chosen.json, {**joined, SPREAD: spreads})
 

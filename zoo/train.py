@@ -179,12 +179,12 @@ def remaining(plan: Plan, chosen: argparse.Namespace) -> str:
 
 def print_status(plan: Plan, chosen: argparse.Namespace) -> int:
     """A line per dataset."""
-    from nmpm.zoo.queue.validations import best_point
+    from nmpm.zoo.queue.validations import kept_mse
 
     for history in histories(plan, chosen):
         trainings, best = history.trainings, history.best()
         hours = sum(training.seconds() for training in trainings) / 3600
-        error = "not validated" if best is None else f"validation MSE {1e3 * best_point(best.curve())[2]:.4g} ×10⁻³"
+        error = "not validated" if best is None else f"validation MSE {1e3 * kept_mse(best.curve()):.4g} ×10⁻³"
         state = "stopped" if history.next_round() is None else f"training {history.next_round()}"
         state = f"needs {history.waits_for()}" if history.waits_for() else state
         sys.stdout.write(f"{history.dataset.name:<22} {state:<27} {hours:5.2f} h  {error}\n")

@@ -210,8 +210,9 @@ class History:
         if entry is not None and entry.folder != self.folder / COPY:
             entry = entry.copy_to(self.folder / COPY)
         if entry is not None:
-            kept, found = lowest_errors(entry.curve(), [] if best is None else best.curve())
-            if kept <= found:
+            trained = [] if best is None else best.curve()
+            entry_error, trained_error = lowest_errors(entry.curve(), trained)
+            if entry_error <= trained_error:
                 return entry.folder
         if best is None and self.dataset.start and not self.trainings:
             best = self._origin().best()

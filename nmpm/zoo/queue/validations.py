@@ -16,10 +16,15 @@ def lowest_errors(*curves: Curve) -> list[float]:
     """The error of each curve's best weights, all by the same measure; infinite for an empty curve."""
     measured = [curve for curve in curves if curve]
     column = _OVERALL if all(_states_overall(curve) for curve in measured) else _MSE
-    return [float(best_point(curve)[column]) if curve else float("inf") for curve in curves]
+    return [float(_best(curve)[column]) if curve else float("inf") for curve in curves]
 
 
-def best_point(curve: Curve) -> Sequence[float]:
+def kept_mse(curve: Curve) -> float:
+    """The full rollout's MSE of a curve's best weights; of a curve that is not empty."""
+    return float(_best(curve)[_MSE])
+
+
+def _best(curve: Curve) -> Sequence[float]:
     """The point whose weights were kept; of a curve that is not empty."""
     if not _states_overall(curve):
         return min(curve, key=lambda point: point[_MSE])
