@@ -7,7 +7,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from nmpm.training.callbacks.divergence import MOST_RISE, RECENT, DivergenceGuard
+from nmpm.training.callbacks.divergence import MOST_RISE, RECENT, DivergedError, DivergenceGuard
 
 
 def follow(losses, savers=()):
@@ -50,3 +50,15 @@ def test_losses_that_fall_or_scatter_are_no_divergence(losses):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         follow(losses)
+
+
+@pytest.mark.parametrize(("before", "good"), [([1.0] * 30, ["best", "last"]), ([1.0] * 30 + [50.0] * 30, ["best"])])
+@pytest.mark.filterwarnings("ignore:At step")
+def test_a_checkpoint_from_after_the_rise_is_not_called_good(tmp_path, before, good):
+    savers = [ModelCheckpoint(tmp_path, "best", monitor="valid/mse"), ModelCheckpoint(tmp_path, "last")]
+    for name in ("best", "last"):
+        (tmp_path / f"{name}.ckpt").touch()
+    with pytest.raises(DivergedError, match="the loss is nan") as error:
+        follow([*before, float("nan")], savers)
+    named = [name for name in ("best", "last") if f"{name}.ckpt" in str(error.value)]
+    assert named == good

@@ -99,8 +99,10 @@ class DivergenceGuard(Callback):
             raise self._diverged_error(trainer, f"the weights {broken or 'of another rank'} are not finite")
 
     def _diverged_error(self, trainer: Trainer, what: str) -> DivergedError:
-        good = [Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}" for saver in _savers(trainer)]
-        kept = [str(path) for path in good if path.is_file()]
+        # One that is saved regardless of the validation error may be from after the loss began to rise.
+        good = [saver for saver in _savers(trainer) if saver.monitor is not None or not self._warned]
+        paths = [Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}" for saver in good]
+        kept = [str(path) for path in paths if path.is_file()]
         return DivergedError(
             f"The training has diverged: at step {trainer.global_step} {what}. Lower the learning rate, clip gradients"
             f" harder, or unroll fewer bundles. Good checkpoints: {', '.join(kept) or 'none was written yet'}."
