@@ -7,6 +7,9 @@ The command line prints such an error without a traceback; everything else is a 
 class NmpmError(Exception):
     """Base of every error that `nmpm` raises on purpose."""
 
+    exit_status = 1
+    """Of the command that it ends."""
+
 
 class DataError(NmpmError, ValueError):
     """A file, trajectory or array does not hold what it should."""

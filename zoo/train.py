@@ -10,8 +10,8 @@
 
 A dataset is simulated first if it is missing. Where the zoo has an entry with the curve of its training, training goes
 on from its weights, and the hours that it took count. Everything lies in `runs/zoo/NAME`; after any interruption,
-kill -9 too, the same command goes on from the last checkpoint. Several of these processes share the work: each takes a
-dataset that no other one has.
+kill -9 too, the same command goes on from the last checkpoint. A training that diverges goes on from its best weights
+at half of the learning rate. Several of these processes share the work: each takes a dataset that no other one has.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from nmpm.zoo.queue.plan import Dataset, Plan
-    from nmpm.zoo.queue.trainings import History
+    from nmpm.zoo.queue.trainings import History, Training
 
 HERE = Path(__file__).parent
+RETREATS = 3
+"""Divergences of a training after which it goes on at half of the learning rate."""
 
 
 def parse(words: list[str] | None = None) -> argparse.Namespace:
@@ -112,13 +114,11 @@ def ready(plan: Plan, chosen: argparse.Namespace, failed: set[str]) -> Iterator[
 
 def train(history: History, number: int, chosen: argparse.Namespace) -> bool:
     """Simulate what is missing, train, and make the entry; False where something failed."""
-    from nmpm.cli import main as nmpm
     from nmpm.errors import NmpmError
 
     try:
         simulate(history.dataset, chosen.threads)
-        words = [*history.open(number).command(), *device_options(chosen.device)]
-        status = nmpm(words)
+        status = fit(history.open(number), chosen.device)
     except NmpmError as error:
         say(f"{history.dataset.name}: {error}")
         return False
@@ -128,6 +128,21 @@ def train(history: History, number: int, chosen: argparse.Namespace) -> bool:
     if status == 130:
         raise KeyboardInterrupt
     return status == 0 and collect_entry(history, chosen.zoo) == 0
+
+
+def fit(training: Training, device: str) -> int:
+    """The training's exit status; where it diverges it goes on more slowly from its best weights."""
+    from nmpm.cli import main as nmpm
+    from nmpm.training.callbacks.divergence import DivergedError
+
+    status = nmpm([*training.command(), *device_options(device)])
+    for _ in range(RETREATS):
+        if status != DivergedError.exit_status:
+            break
+        rate = training.slow_down(0.5)
+        say(f"{training.folder}: has diverged, and goes on from its best weights at a learning rate of {rate:g}.")
+        status = nmpm([*training.command(), *device_options(device)])
+    return status
 
 
 def simulate(dataset: Dataset, threads: int | None) -> None:

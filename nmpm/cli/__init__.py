@@ -72,7 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; errors that a user can correct, those of the file system too, are printed without a traceback.
 
     Returns:
-        The exit status: 0 for success, 1 for an error, 2 for a wrong call, 130 for an interruption.
+        The exit status: 0 for success, 1 for an error, 2 for a wrong call, 3 for a training that has diverged, 130 for
+        an interruption.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
@@ -91,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
-        return 1
+        return error.exit_status
     except OSError as error:
         if error.filename is None or error.strerror is None:
             raise

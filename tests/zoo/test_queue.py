@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.zoo import Zoo
 from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
-from nmpm.zoo.queue.trainings import History
+from nmpm.zoo.queue.trainings import History, Training
 
 SCRIPT = Path(__file__).parents[2] / "zoo" / "train.py"
 if not SCRIPT.is_file():
@@ -264,6 +265,42 @@ def test_planned_hours_read_the_card_of_the_entry_once(tmp_path, monkeypatch):
     history = History(Dataset("small", "goop.yaml", 2.0), tmp_path / "runs", Extension(hours=1.0), entry)
     assert history.planned_hours(3) == 0.5 + 1.5 + 1.0 + 1.0
     assert read == [entry / "card.yaml"]
+
+
+@pytest.mark.parametrize("trained", [True, False], ids=["best weights", "no weights"])
+def test_a_diverged_training_goes_back_and_slows_down(tmp_path, trained):
+    training = Training(tmp_path / "1")
+    training.start(new_training(Dataset("small", "goop.yaml", 1.0)))
+    (tmp_path / "1" / "checkpoints").mkdir()
+    last = tmp_path / "1" / "checkpoints" / "last.ckpt"
+    last.write_text("diverged")
+    if trained:
+        training.best.write_text("best")
+    assert [training.slow_down(0.5), training.slow_down(0.5)] == [3e-3, 1.5e-3]
+    assert last.is_file() == trained
+    assert not trained or last.read_text() == "best"
+    command = training.command()
+    assert command[command.index("--model.optimizer.init_args.lr") + 1] == "0.0015"
+    assert command.count("--model.optimizer.init_args.lr") == 1
+
+
+@pytest.mark.parametrize(("divergences", "done"), [(1, True), (4, False)])
+def test_the_queue_slows_a_diverging_training_down(queue, monkeypatch, capsys, divergences, done):
+    path, rates = queue(1 / 3600), []
+
+    def diverge_at_first(command):
+        if command[0] != "fit" or len(rates) == divergences:
+            return main(command)
+        rates.append(float(command[command.index("--model.optimizer.init_args.lr") + 1]) if rates else None)
+        return 3
+
+    monkeypatch.setattr("nmpm.cli.main", diverge_at_first)
+    assert (train(path) == 0) == done
+    assert capsys.readouterr().out.count("has diverged") == min(divergences, 3)
+    assert rates[1:] == [3e-3, 1.5e-3, 0.75e-3][: len(rates) - 1]
+    if done:
+        configuration = yaml.safe_load(next(Path("runs/small/1/logs").glob("*/config.yaml")).read_text())
+        assert configuration["model"]["optimizer"]["init_args"]["lr"] == 3e-3
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ MOST_RISE = 10.0
 class DivergedError(NmpmError):
     """The loss or the weights of a training are not finite."""
 
+    exit_status = 3
+
 
 class DivergenceGuard(Callback):
     """Checks the loss every `log_every_n_steps` steps, and the weights before each checkpoint and at the end.
@@ -104,7 +106,8 @@ class DivergenceGuard(Callback):
         paths = [Path(str(saver.dirpath)) / f"{saver.filename}{saver.FILE_EXTENSION}" for saver in good]
         kept = [str(path) for path in paths if path.is_file()]
         return DivergedError(
-            f"The training has diverged: at step {trainer.global_step} {what}. Lower the learning rate, clip gradients"
+            f"The training has diverged: at step {trainer.global_step} {what}. Lower the learning rate"
+            " (--model.optimizer.init_args.lr; with --ckpt_path best it goes on from the best weights), clip gradients"
             f" harder, or unroll fewer bundles. Good checkpoints: {', '.join(kept) or 'none was written yet'}."
         )
 

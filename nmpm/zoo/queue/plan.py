@@ -17,6 +17,8 @@ from nmpm.zoo.registry import check_name
 
 OPEN = "???"
 """Placeholder in a configuration for a value that the user has to give."""
+RATE = "model.optimizer.init_args.lr"
+"""Key of the learning rate in a configuration."""
 VALIDATIONS = 30
 """Validations in a training: points of the curve on the card."""
 
@@ -96,7 +98,7 @@ class Dataset:
         try:
             return float(self._configuration()["model"]["optimizer"]["init_args"]["lr"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(f"{self.config}: model.optimizer.init_args.lr is needed to extend a training.") from error
+            raise ConfigError(f"{self.config}: {RATE} is needed to extend a training.") from error
 
     def _configuration(self) -> dict[str, Any]:
         return read_yaml(find_config(self.config))
@@ -163,7 +165,7 @@ def new_training(dataset: Dataset) -> list[str]:
 
 def continued_training(dataset: Dataset, hours: float, rate: float, best: Path) -> list[str]:
     """The arguments of `nmpm` for a training from the weights of a checkpoint, at `rate` times the learning rate."""
-    start = {"model.optimizer.init_args.lr": rate * dataset.learning_rate(), "start_from": str(best)}
+    start = {RATE: rate * dataset.learning_rate(), "start_from": str(best)}
     return _words(dataset.config, hours, {**dataset.options, **start})
 
 

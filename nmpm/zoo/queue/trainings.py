@@ -13,7 +13,7 @@ from nmpm._support.bounded_files import read_yaml
 from nmpm._support.shipped import find_config
 from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
-from nmpm.zoo.queue.plan import Dataset, Extension, continued_training, new_training
+from nmpm.zoo.queue.plan import RATE, Dataset, Extension, continued_training, new_training
 from nmpm.zoo.queue.published import Published
 from nmpm.zoo.queue.validations import lowest_errors
 from nmpm.zoo.runs import BEST
@@ -49,8 +49,7 @@ class Training:
         """Write its command, and a copy of its configuration, so that changes of the shipped one do not reach it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(find_config(words[words.index("--config") + 1]), self.folder / CONFIG)
-        with atomic_write(self.folder / WORDS) as part:
-            part.write_text(json.dumps(words, indent=1), encoding="utf-8")
+        self._write(words)
 
     def command(self) -> list[str]:
         """The arguments of `nmpm` that start it or go on with it."""
@@ -60,6 +59,29 @@ class Training:
         for left in (path for path in self.folder.glob("*") if path.name not in (WORDS, CONFIG)):
             shutil.rmtree(left) if left.is_dir() else left.unlink()  # of a process that died before a checkpoint
         return words
+
+    def slow_down(self, factor: float) -> float:
+        """After a divergence: have it go on from its best weights, or start anew, at a lower learning rate.
+
+        Args:
+            factor: Of the rate so far.
+
+        Returns:
+            The new rate.
+        """
+        words = json.loads((self.folder / WORDS).read_text(encoding="utf-8"))
+        if f"--{RATE}" not in words:
+            words += [f"--{RATE}", str(read_yaml(self.folder / CONFIG)["model"]["optimizer"]["init_args"]["lr"])]
+        at = words.index(f"--{RATE}") + 1
+        rate = factor * float(words[at])
+        words[at] = str(rate)
+        if self.best.is_file():
+            with atomic_write(self.folder / LAST) as part:
+                shutil.copyfile(self.best, part)
+        else:
+            (self.folder / LAST).unlink(missing_ok=True)
+        self._write(words)
+        return rate
 
     def test_command(self, folder: Path) -> list[str]:
         """The arguments of `nmpm` that test the best weights, of which another folder has a copy.
@@ -94,6 +116,10 @@ class Training:
         if "--trainer.precision" in words:
             return words[words.index("--trainer.precision") + 1]
         return str(read_yaml(self.folder / CONFIG).get("trainer", {}).get("precision", "32-true"))
+
+    def _write(self, words: list[str]) -> None:
+        with atomic_write(self.folder / WORDS) as part:
+            part.write_text(json.dumps(words, indent=1), encoding="utf-8")
 
     def _words(self) -> list[str]:
         words: list[str] = json.loads((self.folder / WORDS).read_text(encoding="utf-8"))
