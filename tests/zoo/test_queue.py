@@ -102,6 +102,13 @@ def test_time_alone_ends_a_training_and_an_extension_starts_at_a_lower_rate():
     assert options["--start_from"] == "best.ckpt"
 
 
+def test_an_extension_lowers_the_rate_of_the_options():
+    dataset = Dataset("goop", "goop.yaml", 1, options={"model.optimizer.init_args.lr": 0.004})
+    words = continued_training(dataset, 1, 0.5, Path("best.ckpt"))
+    assert words.count("--model.optimizer.init_args.lr") == 1
+    assert float(words[words.index("--model.optimizer.init_args.lr") + 1]) == pytest.approx(0.002)
+
+
 def test_the_shipped_queue_is_read_and_simulates_what_its_configurations_say():
     plan = Plan.read(SCRIPT.with_name("queue.yaml"))
     simulated = {dataset.name: dataset.generation() for dataset in plan.datasets}

@@ -90,13 +90,13 @@ class Dataset:
         return {**self._configuration().get("data", {}), **own}
 
     def learning_rate(self) -> float:
-        """The configuration's.
+        """That of the options, or of the configuration.
 
         Raises:
-            ConfigError: if it states none.
+            ConfigError: if neither states one.
         """
         try:
-            return float(self._configuration()["model"]["optimizer"]["init_args"]["lr"])
+            return float(self.options.get(RATE) or self._configuration()["model"]["optimizer"]["init_args"]["lr"])
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(f"{self.config}: {RATE} is needed to extend a training.") from error
 
