@@ -135,13 +135,13 @@ def fit(training: Training, device: str) -> int:
     from nmpm.cli import main as nmpm
     from nmpm.training.callbacks.divergence import DivergedError
 
-    status = nmpm([*training.command(), *device_options(device)])
-    for _ in range(RETREATS):
-        if status != DivergedError.exit_status:
+    retreats = 0
+    while (status := nmpm([*training.command(), *device_options(device)])) == DivergedError.exit_status:
+        if retreats == RETREATS:
             break
+        retreats += 1
         rate = training.slow_down(0.5)
         say(f"{training.folder}: has diverged, and goes on from its best weights at a learning rate of {rate:g}.")
-        status = nmpm([*training.command(), *device_options(device)])
     return status
 
 

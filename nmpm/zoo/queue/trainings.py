@@ -69,12 +69,11 @@ class Training:
         Returns:
             The new rate.
         """
-        words = json.loads((self.folder / WORDS).read_text(encoding="utf-8"))
-        if f"--{RATE}" not in words:
-            words += [f"--{RATE}", str(read_yaml(self.folder / CONFIG)["model"]["optimizer"]["init_args"]["lr"])]
-        at = words.index(f"--{RATE}") + 1
-        rate = factor * float(words[at])
-        words[at] = str(rate)
+        words, option, rate = self._words(), f"--{RATE}", factor * float(self._stated(RATE))
+        if option in words:
+            words[words.index(option) + 1] = str(rate)
+        else:
+            words += [option, str(rate)]
         if self.best.is_file():
             with atomic_write(self.folder / LAST) as part:
                 shutil.copyfile(self.best, part)
@@ -112,10 +111,17 @@ class Training:
 
     def precision(self) -> str:
         """Precision of the training, as its command or else its configuration states it."""
+        return str(self._stated("trainer.precision") or "32-true")
+
+    def _stated(self, key: str) -> Any:
+        """The value of a key of the configuration in its command, or else in its configuration; None in neither."""
         words = self._words()
-        if "--trainer.precision" in words:
-            return words[words.index("--trainer.precision") + 1]
-        return str(read_yaml(self.folder / CONFIG).get("trainer", {}).get("precision", "32-true"))
+        if f"--{key}" in words:
+            return words[words.index(f"--{key}") + 1]
+        value: Any = read_yaml(self.folder / CONFIG)
+        for part in key.split("."):
+            value = (value or {}).get(part)
+        return value
 
     def _write(self, words: list[str]) -> None:
         with atomic_write(self.folder / WORDS) as part:
