@@ -274,7 +274,8 @@ def test_gpu_dry_run_prints_all_steps_in_order_and_runs_nothing(tmp_path):
     assert steps["tests"].endswith("pytest --device cuda")
     assert not (tmp_path / "logs").exists()
     started = {word for step in steps.values() for word in shlex.split(step) if word.startswith("benchmarks/")}
-    assert {f"benchmarks/{name}.py" for name in set(SCRIPTS) - WITHOUT_DEVICE - {"gpu"}} <= started
+    own_data = {"seen_scenes"}  # given by the user as a folder
+    assert {f"benchmarks/{name}.py" for name in set(SCRIPTS) - WITHOUT_DEVICE - own_data - {"gpu"}} <= started
 
 
 class ParsedError(Exception):
@@ -613,3 +614,28 @@ def test_equal_gradients_have_all_in_common_and_noise_has_nothing():
     assert common_share(noise).abs().max() < 0.02  # its standard deviation is 0.002
     halves = torch.randn(1, 2, 10_000) + noise
     torch.testing.assert_close(common_share(halves), torch.full((2,), 0.5), rtol=0, atol=0.05)
+
+
+def test_a_rollout_from_a_late_frame_is_compared_with_what_follows_it():
+    import seen_scenes
+
+    emulator = Zoo.load("goop").emulator
+    state = cloud(emulator.scene, count=40)
+    path = torch.cat([state.position[:, None], rollout(emulator, state, 39)], dim=1)
+    late = seen_scenes.cut(dataclasses.replace(Window.of(state), frames=path), start=8, frames=16)
+    torch.testing.assert_close(late.initial.position, path[:, 9])
+    torch.testing.assert_close(late.target, path[:, 10:26])
+    errors, (predicted, recorded) = seen_scenes.measure_scene(emulator, late)
+    own = rollout(emulator, late.initial, 16)
+    assert errors == pytest.approx((own - late.target).double().square().mean((0, 2, 3)).numpy(), rel=1e-3)
+    assert predicted == pytest.approx(float(own[:, 8:].diff(dim=1).double().square().mean()), rel=1e-3)
+    assert recorded == pytest.approx(float(late.target[:, 8:].diff(dim=1).double().square().mean()), rel=1e-3)
+
+
+def test_rows_of_seen_scenes_are_means_with_intervals_and_paired_ratios():
+    import seen_scenes
+
+    errors = np.array([[1e-3, 3e-3], [3e-3, 5e-3]])
+    energies = np.array([[1.0, 2.0], [2.0, 4.0]])
+    assert seen_scenes.format_row(errors, energies, [1, 100], None) == "2 |  | 3, 2–4 | 0.50"
+    assert seen_scenes.format_row(errors / 2, energies, [2], errors) == "2 | 1.5, 0.50 (0.50–0.50) | 0.50"
