@@ -132,6 +132,7 @@ def test_a_zoo_is_refreshed_and_its_table_names_every_model(root, capsys):
         "per_trajectory": [{"mse": 0.05, "mse@100": 0.01}, {"mse": 0.15, "mse@100": 0.01}],
         "training": {"steps": 20, "seconds": 7200.0, "hardware": "a CPU", "precision": "32-true", "parameters": 1},
         "curve": curve,
+        "goal": 0.08,
     }
     path.write_text(yaml.safe_dump(card))
     (root / "small" / "errors.csv").write_text("frame,model,still,free_fall\n1,0.1,0.2,0.3\n2,0.2,0.3,0.4\n")
@@ -141,7 +142,7 @@ def test_a_zoo_is_refreshed_and_its_table_names_every_model(root, capsys):
     assert golden_distance(Zoo.load("small", root), again["golden"]) == 0
     assert again["speed"][0]["ms_per_frame"] > 0
     text = (root / "README.md").read_text()
-    assert "| [small](small/README.md) | active | made up | 100 | 50 – 150 | 10 |  | 1e+03 | 2.0 h |" in text
+    assert "| [small](small/README.md) | active | made up | 100 | 50 – 150 | 80 | 10 |  | 1e+03 | 2.0 h |" in text
     card_text = (root / "small" / "README.md").read_text()
     assert "![errors over frames and over training](chart.png)" in card_text
     assert "| model, 95% over scenes |" in card_text
