@@ -26,10 +26,11 @@ Pretrained models, one folder each: `card.yaml` (what it is and how good), `conf
 again, `nmpm zoo add RUN NAME` adds one and `python zoo/train.py` trains them all. `nmpm zoo refresh` writes this table.
 
 Errors are full-rollout MSE ×10⁻³ in domain length², over test scenes, with the 95% interval of their mean; beside them
-the goal of `queue.yaml` and the better of two trivial predictors, nothing moves and free fall. *Twins*: the error over
-that of the simulator with other time steps beside itself. Milliseconds are per frame of one scene.
+the goal of `queue.yaml` and the better of two trivial predictors, nothing moves and free fall. *At 100*: the error
+over the first 100 frames. *Twins*: the error over that of the simulator with other time steps beside itself.
+Milliseconds are per frame of one scene.
 """
-COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100 frames", "twins", "trivial", "trained", "ms per frame")
+COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "trivial", "trained", "ms per frame")
 
 
 def write_index(root: Path) -> Path:
@@ -101,7 +102,7 @@ def _row(name: str, card: Mapping[str, Any]) -> str:
         "MSE": _thousandths(test.get("mse")),
         "95%": "" if interval is None else f"{_thousandths(interval[0])} – {_thousandths(interval[1])}",
         "goal": _thousandths(card.get("goal")),
-        "at 100 frames": _thousandths(test.get("mse@100")),
+        "at 100": _thousandths(test.get("mse@100")),
         "twins": twin_ratio(card, "mse"),
         "trivial": _thousandths(min(trivial, default=None)),
         "trained": f"{training['seconds'] / 3600:.1f} h" if "seconds" in training else "",
