@@ -12,6 +12,7 @@ from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader, SplitRecordings
+from nmpm.data.progress import progress_bar
 from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
@@ -41,6 +42,14 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
         run = shorter.simulate(seed)
         stored = Trajectory(run.position, run.particle_type, run.attributes)
         yield collate([reader.recording(stored, f"{preset.name}, seed {seed}")], model.scene)
+
+
+def track_test_scenes(what: str, model: Pretrained, data: Path | None) -> Iterator[Window]:
+    """All of `iterate_test_scenes` whole, with a progress bar that says what is done with them."""
+    with progress_bar(f"{what} of {model.name}", len(model.card["per_trajectory"])) as advance:
+        for window in iterate_test_scenes(model, None, data):
+            yield window
+            advance()
 
 
 def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:

@@ -56,18 +56,27 @@ def test_the_floor_repeats(goop):
     assert measure_floor(model) == measure_floor(model)
 
 
-def test_stress_tests_held_and_free_are_counted(goop, monkeypatch):
-    def two_lines(subject, size):
+def test_stress_tests_held_and_free_are_counted_and_settling_is_simulated_once(goop, monkeypatch):
+    settled = []
+
+    def long(subject, size):
         assert size is QUICK
         held = subject.emulator.constraints.energy
         yield Line("long", "energy", held, {}, "")
         yield Line("long", "speed", None, {}, "")
 
-    monkeypatch.setattr("nmpm.zoo.measures.stress.battery", two_lines)
+    def settling(subject, size):
+        settled.append(subject.emulator.constraints.energy)
+        yield Line("settling", "with constraints", True, {}, "")
+        yield Line("settling", "without constraints", False, {}, "")
+
+    monkeypatch.setattr("nmpm.zoo.measures.stress.GROUPS", {"long": long, "settling": settling})
     refresh(goop, ["stress"])
     card = yaml.safe_load((goop / "card.yaml").read_text())
-    assert card["stress"] == {"size": "quick", "passed": 1, "failed": []}
-    assert card["stress_free"] == {"size": "quick", "passed": 0, "failed": ["long: energy"]}
+    assert settled == [True]
+    assert card["stress"] == {"size": "quick", "passed": 2, "failed": ["settling: without constraints"]}
+    free = ["long: energy", "settling: without constraints"]
+    assert card["stress_free"] == {"size": "quick", "passed": 0, "failed": free}
 
 
 def test_what_cannot_be_measured_is_named(goop, capsys):

@@ -13,7 +13,7 @@ from nmpm.evaluation.trade.errors import GAIN, Measures, measure_errors
 from nmpm.particles import Window
 from nmpm.viz import LabelledTrajectories, write_snapshots
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.scenes import iterate_test_scenes
+from nmpm.zoo.scenes import track_test_scenes
 
 WORST = "worst.png"
 EMD_FRAMES = 3
@@ -28,7 +28,7 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     """
     rows: list[dict[str, float]] = []
     worst: tuple[Window, Tensor] | None = None
-    for window in iterate_test_scenes(model, None, data):
+    for window in track_test_scenes("quality", model, data):
         predicted = model.rollout(window.initial.to(model.emulator.device), window.target.shape[1]).cpu()
         rows.append(measure_errors(model.scene, window, predicted, Measures((), EMD_FRAMES)))
         if worst is None or rows[-1]["mse"] >= max(row["mse"] for row in rows):

@@ -23,7 +23,7 @@ from nmpm.sim import InitialState, Preset
 from nmpm.sim.nudge import nudge
 from nmpm.sim.twin import twin_of
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.scenes import iterate_test_scenes, simulation_of
+from nmpm.zoo.scenes import simulation_of, track_test_scenes
 
 NUDGE = 1e-6
 """Of the floor: standard deviation of the initial positions, as a share of the domain's longest side."""
@@ -72,7 +72,7 @@ def measure_twin(model: Pretrained, data: Path | None = None) -> Twin:
     """
     preset, _ = simulation_of(model)
     other = twin_of(preset)
-    return Twin(other.substeps, preset.substeps, _compare(model, other, lambda own, seed: own.draw(seed), data))
+    return Twin(other.substeps, preset.substeps, _compare("twin", model, other, lambda own, seed: own.draw(seed), data))
 
 
 def measure_floor(model: Pretrained, data: Path | None = None) -> dict[str, float]:
@@ -86,15 +86,15 @@ def measure_floor(model: Pretrained, data: Path | None = None) -> dict[str, floa
         ConfigError: if the data are not simulated, or by another revision of the simulator.
     """
     preset, _ = simulation_of(model)
-    return _compare(model, preset, lambda own, seed: nudge(own, own.draw(seed), NUDGE, seed), data)
+    return _compare("floor", model, preset, lambda own, seed: nudge(own, own.draw(seed), NUDGE, seed), data)
 
 
-def _compare(model: Pretrained, other: Preset, start: Start, data: Path | None) -> dict[str, float]:
+def _compare(what: str, model: Pretrained, other: Preset, start: Start, data: Path | None) -> dict[str, float]:
     """Mean errors of another simulation of the test scenes."""
     preset, request = simulation_of(model)
     reader = RecordingReader(preset_metadata(preset), model.scene)
     rows = []
-    for index, window in enumerate(iterate_test_scenes(model, None, data)):
+    for index, window in enumerate(track_test_scenes(what, model, data)):
         seed = request.trajectory_seed("test", index)
         run = other.simulate_from(start(preset, seed), preset.frames)
         stored = Trajectory(run.position, run.particle_type, run.attributes)
