@@ -18,6 +18,17 @@ CONSTRAINTS = {
     "bounds": "bounds = {value} (no particle leaves the scene's bounds)",
 }
 """What each constraint enforces, by its key in `card.yaml`."""
+PICTURES = {
+    "chart.png": "errors over frames and over training",
+    "rollout.png": "rollout",
+    "worst.png": "the test scene with the largest error",
+}
+"""What an entry's pictures show, by their names."""
+SOURCE = (
+    "O. Rochman-Sharabi, S. Lewin, G. Louppe, *A Neural Material Point Method for Particle-based Emulation*, TMLR 2025,"
+    " arXiv 2408.15753"
+)
+"""The paper of the method."""
 NAMED = 4
 """Failed stress tests that a README names; more are counted by group."""
 
@@ -80,12 +91,8 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         "positions = model.rollout(model.example(), frames=400)  # (1, 400, N, D)",
         "```",
     ]
-    pictures = {
-        "chart.png": "errors over frames and over training",
-        "rollout.png": "rollout",
-        "worst.png": "the test scene with the largest error",
-    }
-    lines += [line for name, text in pictures.items() if name in files for line in ("", f"![{text}]({name})")]
+    lines += [line for name, text in PICTURES.items() if name in files for line in ("", f"![{text}]({name})")]
+    lines += ["", *_licence_lines(card)]
     return "\n".join(lines) + "\n"
 
 
@@ -168,12 +175,17 @@ def _range(figure: Mapping[str, Any], factor: float) -> str:
 
 def _speed_lines(card: Mapping[str, Any]) -> list[str]:
     lines = [
-        f"{entry['hardware']}: {entry['ms_per_frame']:.3g} ms per frame of one scene of {entry['particles']} particles,"
-        f" {entry['best_ms_per_frame']:.3g} ms in batches of {entry['best_batch']}"
-        + (f"; {entry['memory_mb']:.0f} MB at the peak." if entry.get("memory_mb") is not None else ".")
+        f"{entry['hardware']}: {entry['ms_per_frame']:.3g} ms per frame{_memory(entry, 'memory_mb')} of one scene of"
+        f" {entry['particles']} particles, {entry['best_ms_per_frame']:.3g} ms{_memory(entry, 'best_memory_mb')} in"
+        f" batches of {entry['best_batch']}."
         for entry in card.get("speed") or ()
     ]
     return [line for text in lines for line in (text, "")]
+
+
+def _memory(entry: Mapping[str, Any], name: str) -> str:
+    """Peak memory beside a time, empty where it is not known."""
+    return f" and {entry[name]:.3g} MB" if entry.get(name) is not None else ""
 
 
 def _lifecycle_lines(card: Mapping[str, Any]) -> list[str]:
@@ -184,6 +196,13 @@ def _lifecycle_lines(card: Mapping[str, Any]) -> list[str]:
     }
     state = lifecycle(card)
     return [texts[state], ""] if state in texts else []
+
+
+def _licence_lines(card: Mapping[str, Any]) -> list[str]:
+    """The licence, and how to cite the model: the method by its paper, the weights by their hash."""
+    licence = f"Licence: {card['license']}. " if card.get("license") else ""
+    weights = f", SHA-256 of its weights {card['sha256'][:12]}…" if card.get("sha256") else ""
+    return [f"{licence}To cite it: `nmpm`'s model `{card['name']}`{weights}; the method: {SOURCE}."]
 
 
 def _interval_row(card: Mapping[str, Any], names: list[str]) -> list[str]:

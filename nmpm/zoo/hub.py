@@ -20,10 +20,11 @@ import yaml
 
 from nmpm._support.messages import one_line
 from nmpm.errors import ZooError
+from nmpm.zoo.cards import PICTURES
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.pretrained import SIMULATED
 
-FILES = (CARD, "config.yaml", "model.safetensors", "README.md", "rollout.png", "chart.png", "errors.csv")
+FILES = (CARD, "config.yaml", "model.safetensors", "README.md", *PICTURES, "errors.csv")
 """Files of an entry that are uploaded and downloaded."""
 ID = re.compile(r"(?P<repository>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})@(?P<revision>[\w./-]{1,100})")
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
@@ -141,7 +142,7 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
 
 
 def hub_metadata(card: Mapping[str, Any]) -> dict[str, Any]:
-    """What the hub's model card states in its head: library, tags, licence, results."""
+    """What the hub's model card states in its head: library, tags, licence, data, metrics and results."""
     dataset = str(card.get("dataset", "")).partition(SIMULATED)[0]
     figures = [
         {"type": "mse", "name": f"rollout {name}", "value": value}
@@ -157,5 +158,7 @@ def hub_metadata(card: Mapping[str, Any]) -> dict[str, Any]:
         "library_name": "nmpm",
         "license": str(card.get("license", "other")).lower(),
         "tags": ["nmpm", "particle-simulation", "physics", "surrogate-model"],
+        **({"datasets": [dataset]} if dataset else {}),
+        "metrics": ["mse"],
         "model-index": [{"name": str(card.get("name", "model")), "results": [result]}] if figures else [],
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from pathlib import Path
 from typing import Any
@@ -30,19 +31,22 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
 
     Returns:
         `hardware`, `particles`, `ms_per_frame` of one scene, the `best_batch` of `BATCHES` with its
-        `best_ms_per_frame` and scene, and `memory_mb`, the peak on a GPU beside the weights, None elsewhere.
+        `best_ms_per_frame` per scene; `memory_mb` and `best_memory_mb`, the peaks of one scene and of that batch beside
+        the weights, in MB, None where nothing counts them.
     """
     count = model.fitting_count(int(model.card.get("particles", PARTICLES)))
     state = model.example(count=count).to(model.emulator.device)
     times = {batch: _milliseconds(model, _repeated(state, batch)) / batch for batch in BATCHES}
     best = min(times, key=lambda batch: times[batch])
+    memory = {batch: _peak_memory(model, _repeated(state, batch)) for batch in (1, best)}
     return {
         "hardware": device_name(model.emulator.device),
         "particles": state.position.shape[1],
         "ms_per_frame": round(times[1], 4),
         "best_batch": best,
         "best_ms_per_frame": round(times[best], 4),
-        "memory_mb": _peak_memory(model, state),
+        "memory_mb": memory[1],
+        "best_memory_mb": memory[best],
     }
 
 
@@ -62,8 +66,6 @@ def _milliseconds(model: Pretrained, state: Particles) -> float:
 
 
 def _peak_memory(model: Pretrained, state: Particles) -> float | None:
-    """Peak of the MB that a rollout of two bundles allocates on a GPU; None elsewhere, where nothing counts them."""
-    device = model.emulator.device
-    if device.type != "cuda":
-        return None
-    return round(peak_bytes(lambda: rollout(model.emulator, state, 2 * model.emulator.frames), device) / 2**20, 1)
+    """Peak of the MB that a rollout of two bundles allocates; None where nothing counts them."""
+    peak = peak_bytes(lambda: rollout(model.emulator, state, 2 * model.emulator.frames), model.emulator.device)
+    return round(peak / 1e6, 1) if math.isfinite(peak) else None

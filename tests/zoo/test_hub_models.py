@@ -1,5 +1,7 @@
 """Models on the hub, tried against a fake of it: pushed, pulled, loaded by id, offline, damaged, private, cut short."""
 
+import re
+
 import huggingface_hub
 import pytest
 import torch
@@ -7,10 +9,11 @@ import yaml
 from huggingface_hub import constants
 from huggingface_hub.utils import _http
 
+from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import ZooError
 from nmpm.zoo import Zoo, load_model
-from nmpm.zoo.hub import HubId, download, hub_metadata, pull, push
+from nmpm.zoo.hub import FILES, HubId, download, hub_metadata, pull, push
 from tests.zoo.fake_hub import serve
 
 
@@ -110,10 +113,18 @@ def test_without_a_revision_nothing_is_fetched(hub):
     assert hub.requests == []
 
 
+def test_all_pictures_of_a_card_are_uploaded():
+    entry = shipped_folder("zoo") / "goop"
+    shown = re.findall(r"!\[.*?\]\((.*?)\)", (entry / "README.md").read_text(encoding="utf-8"))
+    assert shown
+    assert set(shown) <= set(FILES)
+
+
 def test_the_hub_is_told_library_licence_and_results(hub, root):
     card = {"name": "goop", "license": "MIT", "dataset": "goop, simulated by nmpm"}
     metadata = hub_metadata(card | {"test": {"mse": 0.1, "still/mse": 1.0}})
     assert (metadata["library_name"], metadata["license"]) == ("nmpm", "mit")
+    assert (metadata["datasets"], metadata["metrics"]) == (["goop"], ["mse"])
     result = metadata["model-index"][0]["results"][0]
     assert result["dataset"]["name"] == "goop"
     assert result["metrics"] == [{"type": "mse", "name": "rollout mse", "value": 0.1}]
