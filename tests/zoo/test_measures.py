@@ -9,6 +9,7 @@ import yaml
 from nmpm.cli import main
 from nmpm.errors import ZooError
 from nmpm.evaluation.stress import QUICK, Line
+from nmpm.evaluation.stress.settling import settling
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
 from nmpm.zoo.cards import readme
@@ -65,12 +66,12 @@ def test_stress_tests_held_and_free_are_counted_and_settling_is_simulated_once(g
         yield Line("long", "energy", held, {}, "")
         yield Line("long", "speed", None, {}, "")
 
-    def settling(subject, size):
+    def settle(subject, size):
         settled.append(subject.emulator.constraints.energy)
         yield Line("settling", "with constraints", True, {}, "")
         yield Line("settling", "without constraints", False, {}, "")
 
-    monkeypatch.setattr("nmpm.zoo.measures.stress.GROUPS", {"long": long, "settling": settling})
+    monkeypatch.setattr("nmpm.zoo.measures.stress.GROUPS", {"long": long, "settling": settle})
     refresh(goop, ["stress"])
     card = yaml.safe_load((goop / "card.yaml").read_text())
     assert settled == [True]
@@ -79,8 +80,24 @@ def test_stress_tests_held_and_free_are_counted_and_settling_is_simulated_once(g
     assert card["stress_free"] == {"size": "quick", "passed": 0, "failed": free}
 
 
+def test_invariants_are_tested_without_the_simulator(goop, monkeypatch):
+    presets = []
+
+    def long(subject, size):
+        presets.append(subject.preset)
+        yield Line("long", "energy", subject.emulator.constraints.energy, {}, "")
+
+    monkeypatch.setattr("nmpm.zoo.measures.stress.GROUPS", {"long": long, "settling": settling})
+    refresh(goop, ["invariants"])
+    card = yaml.safe_load((goop / "card.yaml").read_text())
+    assert presets == [None, None]
+    assert card["stress"] == {"size": "quick, without the simulator", "passed": 1, "failed": []}
+    assert card["stress_free"]["failed"] == ["long: energy"]
+    assert "held: 1 of 1 lines passed, quick, without the simulator" in (goop / "README.md").read_text()
+
+
 def test_what_cannot_be_measured_is_named(goop, capsys):
-    with pytest.raises(ZooError, match=r"--measure sped: .* speed, quality, twin, floor, stress"):
+    with pytest.raises(ZooError, match=r"--measure sped: .* speed, quality, twin, floor, stress, invariants"):
         refresh(goop, ["sped"])
     assert main(["zoo", "refresh", "--measure", "quality", "--data", ".", "--root", str(goop.parent)]) == 1
     assert "give the model's NAME too" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from typing import Any
 
 from nmpm.zoo.measures.quality import quality_facts
 from nmpm.zoo.measures.simulator import floor_facts, twin_facts
-from nmpm.zoo.measures.stress import stress_facts
+from nmpm.zoo.measures.stress import invariant_facts, stress_facts
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.speed import speed_facts
 
@@ -27,5 +27,6 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         "twin": twin_facts,
         "floor": floor_facts,
         "stress": stress_facts,
+        "invariants": invariant_facts,
     }
 )
