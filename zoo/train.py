@@ -106,10 +106,13 @@ def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
 
 
 def ready(plan: Plan, chosen: argparse.Namespace, failed: set[str]) -> Iterator[tuple[History, int]]:
-    """Datasets with the number of their next training: all first ones, then all second ones, …."""
+    """Datasets with the number of their next training: all first ones, then all second ones, ….
+
+    Trainings that go on from an entry that already has its dataset's hours count as second ones.
+    """
     waiting = (h for h in histories(plan, chosen) if h.dataset.name not in failed and not h.waits_for())
-    rounds = [(number, order, h) for order, h in enumerate(waiting) if (number := h.next_round()) is not None]
-    yield from ((history, number) for number, _, history in sorted(rounds, key=lambda entry: entry[:2]))
+    rounds = [(h, number) for h in waiting if (number := h.next_round()) is not None]
+    yield from sorted(rounds, key=lambda entry: entry[1] + entry[0].entry_has_hours())
 
 
 def train(history: History, number: int, chosen: argparse.Namespace) -> bool:
@@ -194,15 +197,16 @@ def remaining(plan: Plan, chosen: argparse.Namespace) -> str:
 
 def print_status(plan: Plan, chosen: argparse.Namespace) -> int:
     """A line per dataset."""
-    from nmpm.zoo.queue.validations import kept_mse
+    from nmpm.zoo.queue.validations import kept_mse, lowest_errors
 
     for history in histories(plan, chosen):
-        trainings, best = history.trainings, history.best()
-        hours = sum(training.seconds() for training in trainings) / 3600
-        error = "not validated" if best is None else f"validation MSE {1e3 * kept_mse(best.curve()):.4g} ×10⁻³"
+        curves = [stage.curve() for stage in history.stages]
+        errors = lowest_errors(*curves)
+        best = curves[errors.index(min(errors))] if any(curves) else []
+        error = f"validation MSE {1e3 * kept_mse(best):.4g} ×10⁻³" if best else "not validated"
         state = "stopped" if history.next_round() is None else f"training {history.next_round()}"
         state = f"needs {history.waits_for()}" if history.waits_for() else state
-        sys.stdout.write(f"{history.dataset.name:<22} {state:<27} {hours:5.2f} h  {error}\n")
+        sys.stdout.write(f"{history.dataset.name:<22} {state:<27} {history.hours():5.2f} h  {error}\n")
     sys.stdout.write(f"{remaining(plan, chosen)}\n")
     return 0
 

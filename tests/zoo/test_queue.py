@@ -228,6 +228,20 @@ def test_where_no_training_is_left_it_goes_on_from_the_published_entry(queue, tm
     assert not Path("runs/small/2").exists()
 
 
+def test_datasets_that_lack_hours_come_first(tmp_path):
+    script = runpy.run_path(str(SCRIPT))
+    for name, seconds in {"long": 7200, "short": 1800, "new": None}.items():
+        if seconds is not None:
+            (tmp_path / "zoo" / name).mkdir(parents=True)
+            card = {"training": {"seconds": seconds, "steps": 7}, "curve": [[900.0, 5, 0.2]]}
+            (tmp_path / "zoo" / name / "card.yaml").write_text(yaml.safe_dump(card))
+    datasets = tuple(Dataset(name, "goop.yaml", 2.0) for name in ("long", "short", "new"))
+    plan = Plan(datasets, Extension(hours=1.0, gain=0.03, limit=5.0))
+    chosen = script["parse"](["--zoo", str(tmp_path / "zoo"), "--runs", str(tmp_path / "runs")])
+    order = [history.dataset.name for history, _ in script["ready"](plan, chosen, set())]
+    assert order == ["short", "new", "long"]
+
+
 def test_fresh_trainings_ignore_the_published_entry(queue):
     path = queue(1 / 3600)
     assert train(path) == 0

@@ -191,6 +191,10 @@ class History:
         errors = lowest_errors(*(training.curve() for training in validated))
         return validated[errors.index(min(errors))] if validated else None
 
+    def hours(self) -> float:
+        """Hours of training so far, with those of the entry that the first training goes on from."""
+        return sum(stage.seconds() for stage in self.stages) / 3600
+
     def next_round(self) -> int | None:
         """Number of the training to start or to go on with, from 1; None when the dataset stops."""
         trainings = self.trainings
@@ -214,6 +218,10 @@ class History:
         """Hours of so many trainings, at least one, and of the entry that the first one goes on from."""
         done = self._hours_of_entry()
         return done + self._hours_of_first(done) + (count - 1) * self.extension.hours
+
+    def entry_has_hours(self) -> bool:
+        """Whether the entry that the first training goes on from was trained for the dataset's hours, to 5%."""
+        return self._hours_of_entry() >= 0.95 * self.dataset.hours
 
     def _hours_of_entry(self) -> float:
         entry = self.starting_entry
