@@ -76,6 +76,9 @@ def _parser() -> argparse.ArgumentParser:
         " twin and floor (the simulator beside itself), stress; invariants: the stress tests without the simulator,"
         " where its scenes would take hours",
     )
+    refresh.add_argument(
+        "--half", action="store_true", help="store the network's weights in float16 where a rollout does not notice"
+    )
     refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its test scenes")
     refresh.add_argument(
         "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
@@ -181,6 +184,7 @@ def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm.errors import ConfigError
     from nmpm.zoo.index import refresh, write_index
     from nmpm.zoo.registry import Zoo
+    from nmpm.zoo.storage import halve
 
     if chosen.data is not None and chosen.name is None:
         raise ConfigError("--data is the folder of one model's data: give the model's NAME too.")
@@ -188,6 +192,8 @@ def _refresh(chosen: argparse.Namespace) -> None:
         raise ConfigError("--failures is about one model: give the model's NAME too.")
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
+        if chosen.half:
+            halve(Zoo.folder(name, root))
         refresh(Zoo.folder(name, root), chosen.measure, chosen.data, chosen.failures)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 

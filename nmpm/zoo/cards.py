@@ -79,7 +79,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         *_failure_lines(card),
         *_speed_lines(card),
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
-        f"{training['precision']}; {training['parameters']:,} parameters; one run.",
+        f"{training['precision']}; {training['parameters']:,} parameters{_storage(card)}; one run.",
         "",
         *_constraint_lines(card),
         f"`nmpm stress`: {stress_line(card)}. `held` is with these constraints, `free` with the bounds alone.",
@@ -181,6 +181,11 @@ def _speed_lines(card: Mapping[str, Any]) -> list[str]:
         for entry in card.get("speed") or ()
     ]
     return [line for text in lines for line in (text, "")]
+
+
+def _storage(card: Mapping[str, Any]) -> str:
+    """What the weights are stored in, where a card says so."""
+    return f", stored in {card['weights']}" if card.get("weights") else ""
 
 
 def _memory(entry: Mapping[str, Any], name: str) -> str:

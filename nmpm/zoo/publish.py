@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from safetensors.torch import save
 
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
@@ -27,6 +26,7 @@ from nmpm.zoo.index import write_index
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
 from nmpm.zoo.registry import check_name
 from nmpm.zoo.runs import BEST
+from nmpm.zoo.storage import round_network, serialise, stored_precision
 
 STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
 """Files of `nmpm stress --report`, with and without constraints, by the key of the card."""
@@ -70,8 +70,8 @@ def _publish(run: Path, name: str, target: Path, about: str) -> None:
     for needed in (checkpoint, report):
         if not needed.is_file():
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
-    emulator = load_module(checkpoint).emulator.eval().requires_grad_(False)
-    weights = save({key: value.contiguous() for key, value in emulator.state_dict().items()})
+    emulator = round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
+    weights = serialise(emulator)
     files = [path for path in (run / file for file in COPIED) if path.is_file()]
     try:
         card = _card(name, about, _read_json(report), emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
@@ -146,6 +146,7 @@ def _card(name: str, about: str, figures: Mapping[str, Any], emulator: Emulator)
         "constraints": dataclasses.asdict(emulator.constraints),
         "obstacles": emulator.scene.obstacles,
         "versions": figures["versions"],
+        "weights": stored_precision(emulator),
         "golden": golden_rollout(emulator),
     }
     return card | {"lifecycle": lifecycle(card)}
