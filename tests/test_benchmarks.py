@@ -35,9 +35,9 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
-    "ensembles", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state", "kills", "random_commits",
-    "recipe_pictures", "run_time_knob", "settled_shape", "simulators", "stable_substeps", "stiffness", "trades",
-    "where_emulation_pays",
+    "ensembles", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state", "installed_wheel", "kills",
+    "random_commits", "recipe_pictures", "run_time_knob", "settled_shape", "simulators", "stable_substeps", "stiffness",
+    "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 

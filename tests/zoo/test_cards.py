@@ -55,7 +55,9 @@ def test_an_entry_states_stress_with_and_without_constraints(run, home):
     assert "energy (kinetic plus potential energy never exceeds" in text
     assert "rest_speed = 0.01 cells per frame" in text
     assert "solids" not in text  # the scene has none
-    assert "Trained for 70 steps in 1.5 minutes on a CPU, 32-true; 1,234 parameters, stored in float16; one run." in text
+    assert (
+        "Trained for 70 steps in 1.5 minutes on a CPU, 32-true; 1,234 parameters, stored in float16; one run." in text
+    )
     assert "of one run, over 2 trajectories" in text
     weights = model.card["sha256"][:12]
     assert f"Licence: MIT. To cite it: `nmpm`'s model `goop/mine`, SHA-256 of its weights {weights}…" in text
