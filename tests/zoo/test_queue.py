@@ -17,6 +17,7 @@ import yaml
 from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.zoo import Zoo
+from nmpm.zoo.queue.collection import simulator_facts
 from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
 from nmpm.zoo.queue.trainings import History, Training
 
@@ -190,6 +191,14 @@ def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
     assert train(path, "--collect") == 0
     assert Zoo.card("small", "zoo")["test"]["mse"] > 0
     assert Zoo.card("small", "zoo")["about"] == about
+
+
+def test_facts_of_the_simulator_stay_as_long_as_the_simulation_does():
+    former = {"simulation": {"seed": 0}, "twin": {"mse": 0.1}, "floor": {"mse": 0.01}, "quality": {"emd": 1.0}}
+    assert simulator_facts(former, {"simulation": {"seed": 0}}) == {"twin": {"mse": 0.1}, "floor": {"mse": 0.01}}
+    assert simulator_facts(former, {"simulation": {"seed": 1}}) == {}
+    assert simulator_facts({"twin": {"mse": 0.1}}, {}) == {}  # recorded
+    assert simulator_facts({}, {"simulation": {"seed": 0}}) == {}
 
 
 def test_a_dataset_that_another_process_has_is_left_to_it(queue, capsys):

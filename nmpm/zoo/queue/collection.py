@@ -5,7 +5,7 @@ from __future__ import annotations
 import filecmp
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ZooError
-from nmpm.zoo.entries import load_entry, read_card
+from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import refresh, write_card, write_index
 from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.publish import replace
@@ -59,9 +59,11 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         error = report["test"]["mse"]
         if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
+        former = read_card(zoo / name) if (zoo / name / CARD).is_file() else {}
         replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
         refresh(zoo / name, ["speed"])
-        write_card(zoo / name, read_card(zoo / name) | _references(zoo / name, history))
+        card = read_card(zoo / name)
+        write_card(zoo / name, card | _references(zoo / name, history, simulator_facts(former, card)))
         write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
 
@@ -81,10 +83,22 @@ def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
     return _read(folder / "report.json")
 
 
-def _references(entry: Path, history: History) -> dict[str, Any]:
-    """What a card states beside the errors of the model: the goal, and how uncertain the simulator itself is."""
-    found: dict[str, Any] = {} if history.dataset.goal is None else {"goal": history.dataset.goal}
-    if history.dataset.generation() is None:
+def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
+    """How uncertain the simulator itself is, from the card of a former model of the same simulation."""
+    same = "simulation" in card and former.get("simulation") == card["simulation"]
+    return {key: former[key] for key in ("twin", "floor") if same and key in former}
+
+
+def _references(entry: Path, history: History, known: Mapping[str, Any]) -> dict[str, Any]:
+    """What a card states beside the errors of the model: the goal, and how uncertain the simulator itself is.
+
+    Args:
+        entry: Its folder.
+        history: Of the dataset.
+        known: From `simulator_facts`.
+    """
+    found = dict(known) if history.dataset.goal is None else {**known, "goal": history.dataset.goal}
+    if history.dataset.generation() is None or "twin" in known:
         return found
     kept = history.folder / "twin.json"
     if not kept.is_file():  # measured once, as it does not depend on the model
