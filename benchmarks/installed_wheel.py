@@ -46,10 +46,10 @@ def main() -> int:
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         wheel = build(Path(folder))
-        megabytes = wheel.stat().st_size / 1e6
-        sys.stdout.write(f"{wheel.name}: {megabytes:.1f} MB\n")
+        size = wheel.stat().st_size
+        sys.stdout.write(f"{wheel.name}: {size / 1e6:.1f} MB\n")
         programs = install(wheel, Path(folder) / "environment")
-        failed = [*(["the wheel's size"] if wheel.stat().st_size >= MOST_BYTES else [])]
+        failed = ["the wheel's size"] if size >= MOST_BYTES else []
         for what, words in checks(programs, chosen.full, chosen.recorded):
             sys.stdout.write(f"\n{what}\n")
             sys.stdout.flush()

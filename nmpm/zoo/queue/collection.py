@@ -97,16 +97,16 @@ def _references(entry: Path, history: History, known: Mapping[str, Any]) -> dict
         history: Of the dataset.
         known: From `simulator_facts`.
     """
-    found = dict(known) if history.dataset.goal is None else {**known, "goal": history.dataset.goal}
-    if history.dataset.generation() is None or "twin" in known:
-        return found
+    goal = {} if history.dataset.goal is None else {"goal": history.dataset.goal}
+    if "twin" in known or history.dataset.generation() is None:  # the former card states it, or the data are recorded
+        return {**known, **goal}
     kept = history.folder / "twin.json"
     if not kept.is_file():  # measured once, as it does not depend on the model
         data = catalog.dataset_folder(*_request(history.dataset))
         twin = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None)
         with atomic_write(kept) as part:
             part.write_text(json.dumps(twin.to_dict(), indent=1), encoding="utf-8")
-    return found | {"twin": _read(kept)}
+    return {**known, **goal, "twin": _read(kept)}
 
 
 def _request(dataset: Dataset) -> tuple[str, SimulationRequest]:
