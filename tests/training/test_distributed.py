@@ -110,6 +110,7 @@ from pathlib import Path
 
 from lightning.pytorch import Trainer
 from test_training import data_of, module_of
+from torch import distributed
 
 from nmpm.training import EmulatorModule
 from nmpm.training.callbacks.divergence import DivergedError, DivergenceGuard
@@ -132,6 +133,8 @@ try:
     trainer.fit(module, datamodule=data)
 except DivergedError as error:
     (Path(sys.argv[2]) / f"rank_{trainer.global_rank}.txt").write_text(str(error))
+distributed.barrier()  # a process that ends first closes its connections, while the other may still be reading from them
+distributed.destroy_process_group()
 """
 
 
@@ -140,13 +143,15 @@ def test_all_processes_stop_where_the_loss_of_one_is_not_finite(make_dataset, tm
     (tmp_path / "diverge.py").write_text(DIVERGE)
     words = ["--standalone", "--nproc_per_node", "2", str(tmp_path / "diverge.py"), str(make_dataset()), str(tmp_path)]
     paths = [os.environ.get("PYTHONPATH", ""), str(Path(__file__).parent)]
-    subprocess.run(
+    ended = subprocess.run(
         [sys.executable, "-m", "torch.distributed.run", *words],
-        check=True,
+        check=False,
         env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
-        timeout=120,
+        text=True,
+        timeout=240,
     )
+    assert ended.returncode == 0, ended.stderr
     said = [(tmp_path / f"rank_{rank}.txt").read_text() for rank in (0, 1)]
     assert "at step 3 the loss of another rank is not finite" in said[0]
     assert "at step 3 the loss is nan" in said[1]
