@@ -1,8 +1,9 @@
-"""Atomic writing of files."""
+"""Atomic writing of files and folders."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,3 +31,25 @@ def atomic_write(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yields a new, empty folder beside `path`, and renames it to `path` on success, in place of a former one.
+
+    After an exception the new folder is deleted and `path` is unchanged. Replacing takes two renames: a process that is
+    killed between them leaves the former folder in a hidden one beside `path`.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name[:STEM]}.", dir=path.parent) as temporary:
+        new, former = Path(temporary) / "new", Path(temporary) / "former"
+        new.mkdir()
+        yield new
+        if path.exists():
+            os.replace(path, former)
+        try:
+            os.replace(new, path)
+        except OSError:
+            if former.exists():
+                os.replace(former, path)
+            raise

@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from nmpm._support.atomic import atomic_folder
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
 from nmpm.errors import ZooError
@@ -114,10 +113,7 @@ def _writable_zoo(zoo: Path) -> Path:
 
 def _write(target: Path, weights: bytes, texts: Mapping[str, str], files: Sequence[Path]) -> None:
     """Write an entry's folder, in place of a former one; variants, which lie within it, stay."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".adding-", dir=target.parent) as folder:
-        new, former = Path(folder) / "new", Path(folder) / "former"
-        new.mkdir()
+    with atomic_folder(target) as new:
         (new / "model.safetensors").write_bytes(weights)
         for name, text in texts.items():
             (new / name).write_text(text, encoding="utf-8")
@@ -126,9 +122,6 @@ def _write(target: Path, weights: bytes, texts: Mapping[str, str], files: Sequen
         write_chart(new)
         for card in target.glob(f"*/{CARD}"):
             shutil.copytree(card.parent, new / card.parent.name)
-        if target.exists():
-            os.replace(target, former)
-        os.replace(new, target)
 
 
 def _card(name: str, about: str, figures: Mapping[str, Any], emulator: Emulator) -> dict[str, Any]:

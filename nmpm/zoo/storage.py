@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import tempfile
 from hashlib import sha256
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from nmpm._support.atomic import atomic_folder
 from nmpm.emulator import Emulator
 from nmpm.zoo.entries import load_entry, read_card
 from nmpm.zoo.golden import golden_distance, golden_rollout
@@ -71,9 +70,8 @@ def halve(folder: Path) -> bool:
     weights = serialise(half)
     if half is emulator or weights == (folder / WEIGHTS).read_bytes():
         return False
-    with tempfile.TemporaryDirectory(prefix=".halving-", dir=folder.parent) as temporary:
-        new, former = Path(temporary) / "new", Path(temporary) / "former"
-        shutil.copytree(folder, new)
+    with atomic_folder(folder) as new:
+        shutil.copytree(folder, new, dirs_exist_ok=True)
         (new / WEIGHTS).write_bytes(weights)
         facts = {
             "weights": stored_precision(half),
@@ -81,8 +79,6 @@ def halve(folder: Path) -> bool:
             "sha256": sha256(weights).hexdigest(),
         }
         write_card(new, read_card(new) | facts)
-        os.replace(folder, former)
-        os.replace(new, folder)
     return True
 
 

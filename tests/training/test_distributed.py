@@ -133,7 +133,7 @@ try:
     trainer.fit(module, datamodule=data)
 except DivergedError as error:
     (Path(sys.argv[2]) / f"rank_{trainer.global_rank}.txt").write_text(str(error))
-distributed.barrier()  # a process that ends first closes its connections, while the other may still be reading from them
+distributed.barrier()  # a process that ends closes its connections, which the other may still read from
 distributed.destroy_process_group()
 """
 

@@ -90,7 +90,7 @@ def test_names_that_are_taken_and_folders_that_cannot_be_written(run, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ZooError, match="cannot be written"):
         add(run, "mine", tmp_path / "file")
-    assert sorted(path.name for path in shipped_folder("zoo").glob(".adding-*")) == []
+    assert sorted(path.name for path in shipped_folder("zoo").glob(".*")) == []
 
 
 @pytest.mark.parametrize("write", [add, replace])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import read_yaml
 
 CARD = "card.yaml"
@@ -36,10 +36,8 @@ class Published:
 
     def copy_to(self, folder: Path) -> Published:
         """Copy the entry, so that trainings keep their starting point when the zoo's entry is replaced."""
-        part = folder.with_name(f"{folder.name}.part")
-        shutil.rmtree(part, ignore_errors=True)
-        shutil.copytree(self.folder, part)
-        os.replace(part, folder)
+        with atomic_folder(folder) as new:
+            shutil.copytree(self.folder, new, dirs_exist_ok=True)
         return Published(folder, read_yaml(folder / CARD))
 
     def curve(self) -> list[list[float]]:
