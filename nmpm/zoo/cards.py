@@ -141,9 +141,11 @@ def _floor_lines(card: Mapping[str, Any]) -> list[str]:
     if not floor:
         return []
     figures = ", ".join(f"`{name}` {1e3 * floor[name]:.2g} ×10⁻³" for name in ("mse@100", "mse") if name in floor)
+    unstable = floor.get("unstable")
+    left_out = f" Without test scenes {unstable}, which the nudge makes unstable." if unstable else ""
     return [
         f"Predictability: the simulator beside itself, started from positions that differ by {floor['nudge']:g} of the"
-        f" domain's side: {figures}.",
+        f" domain's side: {figures}.{left_out}",
         "",
     ]
 

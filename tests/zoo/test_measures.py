@@ -7,13 +7,15 @@ import pytest
 import yaml
 
 from nmpm.cli import main
-from nmpm.errors import ZooError
+from nmpm.errors import UnstableError, ZooError
 from nmpm.evaluation.stress import QUICK, Line
 from nmpm.evaluation.stress.settling import settling
 from nmpm.sim import load_preset
+from nmpm.sim.nudge import nudge
 from nmpm.zoo import Zoo
 from nmpm.zoo.cards import readme
 from nmpm.zoo.index import refresh
+from nmpm.zoo.measures import simulator
 from nmpm.zoo.measures.simulator import NUDGE, measure_floor
 
 SHIPPED = Path(__file__).parents[2] / "zoo"
@@ -55,6 +57,46 @@ def test_quality_floor_and_the_worst_scene_are_on_the_card(goop, capsys):
 def test_the_floor_repeats(goop):
     model = Zoo.load("goop", goop.parent)
     assert measure_floor(model) == measure_floor(model)
+
+
+def nudge_all_but(stable: set[int]):
+    """`nudge`, unstable in all scenes but these."""
+    scenes = iter(range(2))
+
+    def nudge_or_fail(preset, state, size, seed):
+        if next(scenes) not in stable:
+            raise UnstableError("The simulation has blown up.")
+        return nudge(preset, state, size, seed)
+
+    return nudge_or_fail
+
+
+def test_scenes_that_the_nudge_makes_unstable_are_named(goop, monkeypatch):
+    model = Zoo.load("goop", goop.parent)
+    both = measure_floor(model).errors["mse"]
+    monkeypatch.setattr(simulator, "nudge", nudge_all_but({0}))
+    first = measure_floor(model)
+    monkeypatch.setattr(simulator, "nudge", nudge_all_but({1}))
+    assert main(["zoo", "refresh", "goop", "--measure", "floor", "--root", str(goop.parent)]) == 0
+    second = yaml.safe_load((goop / "card.yaml").read_text())["floor"]
+    assert (first.unstable, second["unstable"]) == ((1,), [0])
+    assert (first.errors["mse"] + second["mse"]) / 2 == pytest.approx(both)
+    assert "Without test scenes [0], which the nudge makes unstable." in (goop / "README.md").read_text()
+    monkeypatch.setattr(simulator, "nudge", nudge_all_but(set()))
+    with pytest.raises(UnstableError, match="all test scenes of goop unstable"):
+        measure_floor(model)
+
+
+def test_a_twin_that_is_unstable_names_its_scenes(goop, monkeypatch):
+    class Unstable:
+        substeps = 3
+
+        def simulate_from(self, state, frames):
+            raise UnstableError("The simulation has blown up.")
+
+    monkeypatch.setattr(simulator, "twin_of", lambda preset: Unstable())
+    with pytest.raises(UnstableError, match=r"With 3 substeps test scenes \[0, 1\] are unstable: goop has no twin"):
+        simulator.measure_twin(Zoo.load("goop", goop.parent))
 
 
 def test_stress_tests_held_and_free_are_counted_and_settling_is_simulated_once(goop, monkeypatch):
