@@ -37,8 +37,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yields a new, empty folder beside `path`, and renames it to `path` on success, in place of a former one.
 
-    After an exception the new folder is deleted and `path` is unchanged. Replacing takes two renames: a process that is
-    killed between them leaves the former folder in a hidden one beside `path`.
+    Nothing of a former folder stays that the caller does not copy. After an exception the new one is deleted and `path`
+    is unchanged. A process that is killed leaves a hidden folder beside `path`; between the two renames that replacing
+    takes, it holds the former folder.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name[:STEM]}.", dir=path.parent) as temporary:
