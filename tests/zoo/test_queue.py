@@ -137,6 +137,21 @@ def test_a_dataset_waits_for_its_data_and_for_the_training_that_it_starts_from(t
         plan.with_data({"lava": "folder"})
 
 
+def test_an_entry_of_the_zoo_replaces_the_training_that_a_dataset_starts_from(tmp_path):
+    entry = tmp_path / "zoo" / "recorded"
+    entry.mkdir(parents=True)
+    card = {"training": {"seconds": 900, "steps": 7}, "curve": [[900.0, 7, 0.2, 0.2]]}
+    (entry / "card.yaml").write_text(yaml.safe_dump(card))
+    dataset = Dataset("recorded", "goop.yaml", 0.5, start="simulated")
+    extension = Extension(hours=1.0, gain=0.03, limit=5.0)
+    assert History(dataset, tmp_path / "runs/recorded", extension).waits_for() == "simulated"
+    history = History(dataset, tmp_path / "runs/recorded", extension, entry)
+    assert history.waits_for() == ""
+    assert history.planned_hours(1) == pytest.approx(1.25)
+    words = json.loads((history.open(1).folder / "words.json").read_text())
+    assert words[words.index("--start_from") + 1] == str(tmp_path / "runs/recorded/published")
+
+
 def test_mistakes_in_a_queue_are_named(queue, tmp_path):
     path = queue(1.0)
     with pytest.raises(ConfigError, match=r"has no lava; it has small"):

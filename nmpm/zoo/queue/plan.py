@@ -52,7 +52,8 @@ class Dataset:
         options: Further values of the configuration, by dotted keys.
         about: Description of the data on the card, beside their name.
         goal: What the full-rollout MSE on the test split is meant to be, in domain length squared; for the card.
-        start: Another dataset of the queue, whose best weights the first training starts from, at the extension's rate.
+        start: Another dataset of the queue, whose best weights the first training starts from, at the extension's rate,
+            where the zoo has no entry to go on from.
     """
 
     name: str

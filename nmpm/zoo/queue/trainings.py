@@ -175,7 +175,7 @@ class History:
     def starting_entry(self) -> Published | None:
         """The entry that the first training goes on from; None where it starts from random weights."""
         copy = Published.find(self.folder / COPY)
-        if copy is not None or self.entry is None or self.dataset.start or self.trainings:
+        if copy is not None or self.entry is None or self.trainings:
             return copy
         return Published.find(self.entry)
 
@@ -262,6 +262,8 @@ class History:
         """What the first training waits for, in words: data or another training; empty where nothing is missing."""
         if self.dataset.lacks_data:
             return f"--data {self.dataset.name}=FOLDER"
+        if self.starting_entry is not None:
+            return ""
         origin = self._origin().trainings
         return "" if not self.dataset.start or (origin and origin[0].finished) else self.dataset.start
 
