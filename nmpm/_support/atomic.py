@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import os
+import platform
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
+from hashlib import sha256
 from pathlib import Path
 
 STEM = 40
 """Characters of a file's name that its temporary name begins with."""
+
+NEW, FORMER = "new", "former"
+"""Within the temporary folder beside one that is written: what is to appear, and what it takes the place of."""
 
 
 def temporary_path(path: Path) -> Path:
@@ -34,23 +41,61 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yields a new, empty folder beside `path`, and renames it to `path` on success, in place of a former one.
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yields an empty folder beside `path`, and renames it to `path` on success.
 
-    Nothing of a former folder stays that the caller does not copy. After an exception the new one is deleted and `path`
-    is unchanged. A process that is killed leaves a hidden folder beside `path`; between the two renames that replacing
-    takes, it holds the former folder.
+    After an exception it is deleted. What a killed process of this machine left is deleted by the next one that writes
+    the same path.
+
+    Raises:
+        OSError: if `path` is there by then, unless it is an empty folder.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name[:STEM]}.", dir=path.parent) as temporary:
-        new, former = Path(temporary) / "new", Path(temporary) / "former"
-        new.mkdir()
-        yield new
+    with _workplace(path) as place:
+        yield place / NEW
+        os.replace(place / NEW, path)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yields an empty folder beside `path`, and renames it to `path` on success, in place of a former one.
+
+    Nothing of a former folder stays that the caller does not copy. After an exception `path` is unchanged. A process of
+    this machine that is killed between the two renames that replacing takes leaves no folder at `path`: the next one
+    that writes it brings the former one back first.
+    """
+    with _workplace(path) as place:
+        yield place / NEW
         if path.exists():
-            os.replace(path, former)
+            os.replace(path, place / FORMER)
         try:
-            os.replace(new, path)
+            os.replace(place / NEW, path)
         except OSError:
-            if former.exists():
-                os.replace(former, path)
+            if (place / FORMER).exists():
+                os.replace(place / FORMER, path)
             raise
+
+
+@contextmanager
+def _workplace(path: Path) -> Iterator[Path]:
+    """A hidden folder beside `path` with an empty folder `NEW`, after leftovers of killed processes are cleared."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # A name that is cut may be that of several paths; their digests differ.
+    stem = f".{path.name[:STEM]}.{sha256(path.name.encode()).hexdigest()[:8]}.{platform.node()}."
+    for left in path.parent.glob(f"{escape(stem)}*"):
+        if not _is_running(left.name.removeprefix(stem).split(".")[0]):
+            if (left / FORMER).exists() and not path.exists():
+                os.replace(left / FORMER, path)
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f"{stem}{os.getpid()}.", dir=path.parent) as place:
+        (Path(place) / NEW).mkdir()
+        yield Path(place)
+
+
+def _is_running(process: str) -> bool:
+    try:
+        os.kill(int(process), 0)
+    except PermissionError:  # another user's
+        return True
+    except (ProcessLookupError, ValueError):
+        return False
+    return True

@@ -7,7 +7,6 @@ repositories take the hub's own login (`hf auth login`, `HF_TOKEN`).
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import tempfile
@@ -18,6 +17,7 @@ from typing import Any, Self
 
 import yaml
 
+from nmpm._support.atomic import atomic_folder
 from nmpm._support.messages import one_line
 from nmpm.errors import ZooError
 from nmpm.zoo.cards import PICTURES
@@ -92,16 +92,12 @@ def pull(identifier: HubId, target: Path) -> Path:
         raise ZooError(f"{target} exists: choose another name, or remove it first.")
     folder = download(identifier)
     load_entry(folder)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=".pulling-", dir=target.parent))
-    try:
+    with atomic_folder(target) as new:
+        if target.is_dir():  # variants lie within it
+            shutil.copytree(target, new, dirs_exist_ok=True)
         for name in FILES:
             if (folder / name).is_file():
-                shutil.copyfile(folder / name, part / name)
-        part.chmod(0o755)
-        os.replace(part, target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+                shutil.copyfile(folder / name, new / name)
     return target
 
 

@@ -1,10 +1,13 @@
 """Files and folders appear whole or not at all."""
 
 import os
+import signal
+import subprocess
+import sys
 
 import pytest
 
-from nmpm._support.atomic import atomic_folder, atomic_write
+from nmpm._support.atomic import atomic_folder, atomic_write, new_folder
 
 
 def files_of(folder):
@@ -47,6 +50,70 @@ def test_a_former_folder_comes_back_if_the_new_one_cannot_be_renamed(tmp_path, m
     with pytest.raises(OSError, match="no space"):
         write(tmp_path / "one", "second")
     assert files_of(tmp_path) == {"one/inner/file": "first"}
+
+
+def killed(writer, path, patch=""):
+    """Kill a process that writes a folder, after its files or where `patch` says so."""
+    script = f"""
+import os, signal
+from pathlib import Path
+from nmpm._support import atomic
+{patch}
+with atomic.{writer}(Path({str(path)!r})) as new:
+    (new / "file").write_text("of the killed")
+    if not {patch!r}:
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == -signal.SIGKILL
+
+
+BETWEEN_RENAMES = """
+rename = os.replace
+def replace(source, target):
+    if Path(source).name == "new":
+        os.kill(os.getpid(), signal.SIGKILL)
+    rename(source, target)
+os.replace = replace
+"""
+
+
+@pytest.mark.parametrize("writer", ["new_folder", "atomic_folder"])
+@pytest.mark.parametrize("name", ["one", "[o]*?", "o" * 200])
+def test_what_a_killed_process_left_is_cleared_by_the_next_one(tmp_path, writer, name):
+    killed(writer, tmp_path / name)
+    killed("atomic_folder", tmp_path / f"{name}.other")
+    assert not (tmp_path / name).exists()
+    with atomic_folder(tmp_path / name) as new, new_folder(tmp_path / f"{name}s") as other:
+        (new / "file").write_text("whole")
+        (other / "file").write_text("another")
+    left = {path: text for path, text in files_of(tmp_path).items() if text != "of the killed"}
+    assert left == {f"{name}/file": "whole", f"{name}s/file": "another"}
+    assert len(list(tmp_path.iterdir())) == 3  # what was left for another path stays
+
+
+def test_a_former_folder_comes_back_after_a_kill_between_two_renames(tmp_path):
+    write(tmp_path / "one", "first")
+    killed("atomic_folder", tmp_path / "one", BETWEEN_RENAMES)
+    assert not (tmp_path / "one").exists()
+    with pytest.raises(TypeError):
+        write(tmp_path / "one", None)
+    assert files_of(tmp_path) == {"one/inner/file": "first"}
+
+
+def test_a_folder_of_a_running_process_is_left_alone(tmp_path):
+    with atomic_folder(tmp_path / "one") as first:
+        (first / "file").write_text("first")
+        write(tmp_path / "one", "second")
+    assert files_of(tmp_path) == {"one/file": "first"}
+
+
+def test_a_new_folder_replaces_none_that_holds_files(tmp_path):
+    (tmp_path / "one").mkdir()
+    with new_folder(tmp_path / "one") as new:
+        (new / "file").write_text("first")
+    with pytest.raises(OSError, match="not empty"), new_folder(tmp_path / "one") as new:
+        (new / "file").write_text("second")
+    assert files_of(tmp_path) == {"one/file": "first"}
 
 
 def test_a_file_is_old_or_new(tmp_path):

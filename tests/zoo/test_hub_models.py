@@ -40,6 +40,9 @@ def test_a_pushed_model_is_loaded_by_its_id_rolled_out_and_pulled(hub, root, tmp
     assert main(["rollout", identifier, "--frames", "4", "--particles", "50"]) == 0
     assert main(["zoo", "pull", identifier, "small/mine"]) == 0
     assert torch.equal(Zoo.load("small/mine").rollout(state, 8), expected)
+    assert main(["zoo", "pull", identifier, "small"]) == 0
+    for name in ("small", "small/mine"):  # a variant stays where the model of that name comes later
+        assert torch.equal(Zoo.load(name).rollout(state, 8), expected)
     assert main(["zoo", "pull", identifier, "small/mine"]) == 1
     assert "exists: choose another name" in capsys.readouterr().err
 

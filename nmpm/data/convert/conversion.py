@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from nmpm._support.atomic import new_folder
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset
 from nmpm.data.convert.conversion_log import ConversionLog
 from nmpm.data.format import SPLITS, Trajectory, write_metadata, write_split
@@ -66,37 +64,10 @@ def write_native(source: ForeignDataset, destination: Path) -> tuple[str, ...]:
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination}: exists already; choose another folder, or delete this one.")
     try:
-        with _replacing_folder(destination) as part:
+        with new_folder(destination) as part:
             return _write(source, part)
     except OSError as error:
         raise DataError(f"{destination}: cannot be written ({error}).") from error
-
-
-@contextmanager
-def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """Yields a temporary folder, which is renamed to the given one on success and deleted otherwise."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    for stale in folder.parent.glob(f".{folder.name}.*.part"):
-        if not _is_running(stale.name.split(".")[-2]):
-            shutil.rmtree(stale, ignore_errors=True)
-    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    try:
-        yield part
-        os.replace(part, folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def _is_running(process: str) -> bool:
-    with suppress(ProcessLookupError, ValueError):
-        try:
-            os.kill(int(process), 0)
-        except PermissionError:
-            return True
-        return True
-    return False
 
 
 def _write(source: ForeignDataset, folder: Path) -> tuple[str, ...]:
