@@ -52,7 +52,7 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
     """Rewrite what is derived from an entry's card and weights: lifecycle, README and chart.
 
     A golden rollout is added where the card has none; an existing one is kept, as replacing it would hide a change
-    of the results. The card is written after each measure.
+    of the results. The card is written after each measure, with what others wrote to it meanwhile.
 
     Args:
         folder: Of the entry.
@@ -63,7 +63,7 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
             to be looked at again.
 
     Raises:
-        ZooError: if a file is missing or damaged, or a measure is unknown.
+        ZooError: if a file is missing or damaged, a measure is unknown, or the weights are replaced meanwhile.
         ConfigError: if what is to be measured needs a simulator or data that are not there.
     """
     unknown = sorted(set(measures) - set(MEASURES))
@@ -78,8 +78,10 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
         card |= {"failures": " ".join(failures.split())} if failures.strip() else {}
     write_card(folder, card)
     for name in measures:
-        card |= MEASURES[name](model, folder, data)
-        write_card(folder, card)
+        facts, now = MEASURES[name](model, folder, data), read_card(folder)
+        if now.get("sha256") != card.get("sha256"):
+            raise ZooError(f"{folder}: its weights were replaced while {name} was measured; measure it again.")
+        write_card(folder, now | facts)
 
 
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:

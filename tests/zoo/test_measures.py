@@ -12,7 +12,7 @@ from nmpm.evaluation.stress import QUICK, Line
 from nmpm.evaluation.stress.settling import settling
 from nmpm.sim import load_preset
 from nmpm.sim.nudge import nudge
-from nmpm.zoo import Zoo
+from nmpm.zoo import Zoo, index
 from nmpm.zoo.cards import readme
 from nmpm.zoo.index import refresh
 from nmpm.zoo.measures import simulator
@@ -136,6 +136,29 @@ def test_invariants_are_tested_without_the_simulator(goop, monkeypatch):
     assert card["stress"] == {"size": "quick, without the simulator", "passed": 1, "failed": []}
     assert card["stress_free"]["failed"] == ["long: energy"]
     assert "held: 1 of 1 lines passed, quick, without the simulator" in (goop / "README.md").read_text()
+
+
+def test_a_measure_keeps_what_is_written_to_the_card_meanwhile(goop, monkeypatch):
+    def measure(model, folder, data):
+        refresh(folder, failures="Splashes become dust.")
+        return {"floor": {"nudge": 1e-6, "mse": 0.25}}
+
+    monkeypatch.setattr(index, "MEASURES", {"floor": measure})
+    refresh(goop, ["floor"])
+    card = yaml.safe_load((goop / "card.yaml").read_text())
+    assert (card["failures"], card["floor"]) == ("Splashes become dust.", {"nudge": 1e-6, "mse": 0.25})
+
+
+def test_a_measure_of_weights_that_are_replaced_meanwhile_is_not_written(goop, monkeypatch):
+    def measure(model, folder, data):
+        card = yaml.safe_load((folder / "card.yaml").read_text())
+        index.write_card(folder, card | {"sha256": "0" * 64})
+        return {"floor": {"nudge": 1e-6, "mse": 0.25}}
+
+    monkeypatch.setattr(index, "MEASURES", {"floor": measure})
+    with pytest.raises(ZooError, match="replaced while floor was measured"):
+        refresh(goop, ["floor"])
+    assert yaml.safe_load((goop / "card.yaml").read_text()).get("floor") != {"nudge": 1e-6, "mse": 0.25}
 
 
 def test_what_cannot_be_measured_is_named(goop, capsys):
