@@ -7,6 +7,7 @@ import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from nmpm._support.atomic import new_folder
 from nmpm._support.limits import EXPANSION, expansion_limit
 from nmpm._support.shipped import user_home
 from nmpm.data.archive_errors import ZIP_ERRORS
@@ -86,21 +87,19 @@ def _first_line(error: BaseException) -> str:
 
 def _unpack(downloaded: Path, archives: list[Path], target: Path) -> None:
     """Copies the data files of the archives, and those beside them, into a folder that appears when it is complete."""
-    part = target.with_name(f".{target.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
     try:
-        for archive in archives:
-            _unpack_one(archive, part / archive.parent.relative_to(downloaded))
-        for file in downloaded.rglob("*"):
-            if file.suffix in _DATA:
-                place = part / file.relative_to(downloaded)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, place)
-        part.rename(target)
+        with new_folder(target) as new:
+            for archive in archives:
+                _unpack_one(archive, new / archive.parent.relative_to(downloaded))
+            for file in downloaded.rglob("*"):
+                if file.suffix in _DATA:
+                    place = new / file.relative_to(downloaded)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(file, place)
+            if not any(new.iterdir()):
+                raise DataError(f"{target}: cannot be unpacked (no data files in {downloaded}).")
     except ZIP_ERRORS as error:
         raise DataError(f"{target}: cannot be unpacked ({_first_line(error)}).") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _unpack_one(archive: Path, target: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.data.hub import REPOSITORY, hub_folder
+from nmpm.data.hub import REPOSITORY, _unpack, hub_folder
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert.test_neuralmpm import write
 
@@ -91,3 +91,13 @@ def test_offline_error_gives_the_download_command(monkeypatch, tmp_path):
 def test_an_unknown_folder_is_named(hub):
     with pytest.raises(DataError, match="has no folder Treacle"):
         hub_folder("Treacle")
+
+
+def test_an_archive_without_data_is_refused_and_leaves_nothing(tmp_path):
+    source = tmp_path / "in"
+    source.mkdir()
+    with zipfile.ZipFile(source / "a.zip", "w") as archive:
+        archive.writestr("readme.txt", "no data")
+    with pytest.raises(DataError, match=r"cannot be unpacked \(no data files"):
+        _unpack(source, [source / "a.zip"], tmp_path / "out")
+    assert list(tmp_path.iterdir()) == [source]
