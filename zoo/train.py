@@ -120,7 +120,7 @@ def train(history: History, number: int, chosen: argparse.Namespace) -> bool:
     from nmpm.errors import NmpmError
 
     try:
-        simulate(history.dataset, chosen.threads)
+        simulate(history.dataset_of(number), chosen.threads)
         status = fit(history.open(number), chosen.device)
     except NmpmError as error:
         say(f"{history.dataset.name}: {error}")

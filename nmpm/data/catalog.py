@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -123,15 +123,25 @@ def find_simulated(name: str, test: int) -> Path | None:
     Raises:
         DataError: if there is no dataset of that name.
     """
-    wanted = simulation_request(name).to_dict()
+    found = _complete_folders(name, simulation_request(name))
+    return next((folder for folder, counts in found if counts.get("test", 0) >= test), None)
+
+
+def _complete_folders(name: str, request: SimulationRequest) -> Iterator[tuple[Path, Mapping[str, int]]]:
+    """Complete folders that differ from the request in their counts at most, with these counts."""
+    wanted = request.to_dict()
     for folder in sorted((dataset_home() / "datasets").glob(f"{name}-*")):
         if not (folder / METADATA_FILE).is_file():
             continue
         found = read_metadata(folder).extra.get("simulation", {})
-        same = all(found.get(key) == wanted[key] for key in ("preset", "seed", "revision"))
-        if same and found.get("counts", {}).get("test", 0) >= test:
-            return folder
-    return None
+        if all(found.get(key) == wanted[key] for key in ("preset", "seed", "revision")):
+            yield folder, found.get("counts", {})
+
+
+def _largest_folder(name: str, request: SimulationRequest) -> Path | None:
+    """The complete folder with the most trajectories of the request's kind."""
+    counts = dict(_complete_folders(name, request))
+    return max(counts, key=lambda folder: sum(counts[folder].values()), default=None)
 
 
 def ensure(
@@ -142,6 +152,8 @@ def ensure(
     workers: int | None = None,
 ) -> Path:
     """The folder of an embedded dataset, which is simulated now if it is missing.
+
+    Trajectories that another folder of it has, of fewer or more in all, are copied.
 
     Args:
         name: One of `catalog()`.
@@ -156,5 +168,6 @@ def ensure(
     """
     request = simulation_request(name, counts, frames, seed)
     folder = dataset_folder(name, request)
-    generate(request.preset, folder, request.counts, request.seed, workers)
+    known = None if (folder / METADATA_FILE).is_file() else _largest_folder(name, request)
+    generate(request.preset, folder, request.counts, request.seed, workers, known)
     return folder

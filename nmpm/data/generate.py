@@ -49,7 +49,12 @@ _log = logging.getLogger(__name__)
 
 
 def generate(
-    preset: Preset, folder: Path, counts: Mapping[str, int], seed: int = 0, workers: int | None = None
+    preset: Preset,
+    folder: Path,
+    counts: Mapping[str, int],
+    seed: int = 0,
+    workers: int | None = None,
+    known: Path | None = None,
 ) -> None:
     """Simulates a dataset into a folder, unless it is complete already.
 
@@ -61,16 +66,17 @@ def generate(
         counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
         seed: The seeds of all trajectories are derived from it.
         workers: Trajectories simulated at a time; one per processor core when left out.
+        known: A complete dataset of the same preset, revision of its simulator and seed, whose trajectories are copied.
 
     Raises:
         ConfigError: if preset or counts are invalid.
-        DataError: if the folder has other data than requested, or cannot be written.
+        DataError: if the folder has other data than requested, or cannot be written, or `known` cannot be read.
     """
     request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
         return
     with explain_write_errors(folder), lock_folder(folder):
-        _complete(request, folder, workers or os.cpu_count() or 1)
+        _complete(request, folder, workers or os.cpu_count() or 1, known)
 
 
 def generate_shard(
@@ -105,11 +111,13 @@ def generate_shard(
     return missing
 
 
-def _complete(request: SimulationRequest, folder: Path, workers: int) -> None:
+def _complete(request: SimulationRequest, folder: Path, workers: int, known: Path | None) -> None:
     if _is_complete(request, folder):
         return
     _prepare_parts(request, folder)
     _remove_stale_files(folder)
+    if known is not None:
+        _copy_parts(request, folder, known)
     _simulate_parts(request, folder, request.trajectories, workers)
     for split in request.splits:
         _assemble(request, folder, split)
@@ -153,6 +161,20 @@ def _remove_stale_files(folder: Path) -> None:
 def _missing(folder: Path, wanted: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
     """Those of the trajectories that are neither in their split's file nor in a part."""
     return [(s, i) for s, i in wanted if not (folder / f"{s}.h5").is_file() and not part_path(folder, s, i).is_file()]
+
+
+def _copy_parts(request: SimulationRequest, folder: Path, known: Path) -> None:
+    """Writes the missing parts of trajectories that another dataset has."""
+    files = {split: known / f"{split}.h5" for split in request.splits}
+    splits = {split: Split(path) for split, path in files.items() if path.is_file()}
+    missing = [(s, i) for s, i in _missing(folder, request.trajectories) if s in splits and i < len(splits[s])]
+    if not missing:
+        return
+    _log.info("Copying %d trajectories of %s from %s.", len(missing), request.preset.name, known)
+    with progress_bar(f"Copying trajectories of {known.name}", len(missing)) as advance:
+        for split, index in missing:
+            write_part(part_path(folder, split, index), splits[split].read(index))
+            advance()
 
 
 def _simulate_parts(request: SimulationRequest, folder: Path, wanted: Sequence[tuple[str, int]], workers: int) -> None:

@@ -23,7 +23,7 @@ def part_path(folder: Path, split: str, index: int) -> Path:
     return folder / PARTS / f"{split}-{index:05d}.npz"
 
 
-def write_part(path: Path, run: SimulatedTrajectory) -> None:
+def write_part(path: Path, run: SimulatedTrajectory | Trajectory) -> None:
     """Writes a simulated trajectory, atomically."""
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)

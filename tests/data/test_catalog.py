@@ -1,10 +1,12 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from nmpm.data import catalog
 from nmpm.data.format import Split, read_metadata
 from nmpm.errors import DataError
+from nmpm.sim import MpmPreset
 
 COUNTS = {"train": 1, "valid": 1, "test": 1}
 
@@ -63,3 +65,16 @@ def test_test_trajectories_are_found_whatever_they_were_simulated_for(home):
     folder = catalog.ensure("goop", counts={"train": 0, "valid": 0, "test": 2}, workers=1)
     assert catalog.find_simulated("goop", 1) == catalog.find_simulated("goop", 2) == folder
     assert catalog.find_simulated("goop", 3) is None
+
+
+def test_more_trajectories_are_copied_where_another_folder_has_them(home, monkeypatch):
+    few = catalog.ensure("goop", counts=COUNTS, frames=2)
+    catalog.ensure("goop", counts=COUNTS, frames=3)  # other trajectories
+    simulated: list[int] = []
+    simulate = MpmPreset.simulate
+    monkeypatch.setattr(MpmPreset, "simulate", lambda *all_: simulated.append(all_[1]) or simulate(*all_))
+    more = catalog.ensure("goop", counts=COUNTS | {"train": 3}, frames=2, workers=1)
+    assert len(simulated) == 2
+    first = [Split(folder / "train.h5").read(0).position for folder in (few, more)]
+    np.testing.assert_array_equal(*first)
+    assert len(Split(more / "train.h5")) == 3

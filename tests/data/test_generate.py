@@ -3,6 +3,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -92,6 +93,26 @@ def test_trajectories_do_not_depend_on_the_counts(made, tmp_path):
     np.testing.assert_array_equal(
         Split(tmp_path / "test.h5").read(1).position, Split(made / "test.h5").read(1).position
     )
+
+
+def test_a_dataset_grows_from_a_smaller_one_by_the_same_bytes(made, tmp_path, monkeypatch):
+    counts = {"train": 6, "valid": 0, "test": 1}
+    generate(TINY, tmp_path / "whole", counts, seed=5)
+    simulated: list[int] = []
+    simulate = MpmPreset.simulate
+    monkeypatch.setattr(MpmPreset, "simulate", lambda *all_: simulated.append(all_[1]) or simulate(*all_))
+    generate(TINY, tmp_path / "grown", counts, seed=5, known=made)
+    assert len(simulated) == 2
+    assert fingerprints(tmp_path / "grown") == fingerprints(tmp_path / "whole")
+
+
+def test_a_damaged_dataset_to_copy_from_is_named(made, tmp_path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(made, damaged)
+    content = (made / "train.h5").read_bytes()
+    (damaged / "train.h5").write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match=r"damaged.train\.h5"):
+        generate(TINY, tmp_path / "grown", {"train": 6, "valid": 1, "test": 2}, seed=5, known=damaged)
 
 
 def test_a_complete_dataset_is_not_rewritten(made):

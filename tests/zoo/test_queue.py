@@ -17,7 +17,7 @@ import yaml
 from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.zoo import Zoo
-from nmpm.zoo.queue.collection import simulator_facts
+from nmpm.zoo.queue.collection import describe_data, simulator_facts
 from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
 from nmpm.zoo.queue.trainings import History, Training
 
@@ -108,6 +108,36 @@ def test_an_extension_lowers_the_rate_of_the_options():
     words = continued_training(dataset, 1, 0.5, Path("best.ckpt"))
     assert words.count("--model.optimizer.init_args.lr") == 1
     assert float(words[words.index("--model.optimizer.init_args.lr") + 1]) == pytest.approx(0.002)
+
+
+def test_trainings_that_go_on_use_the_values_of_extensions(tmp_path):
+    more = {"data.generate": {"counts": {"train": 9, "valid": 1, "test": 2}}}
+    dataset = Dataset("goop", "goop.yaml", 0.5, options={"data.passes": 2}, extend=more)
+    history = History(dataset, tmp_path, Extension(hours=0.5))
+    first = json.loads((history.open(1).folder / "words.json").read_text())
+    assert "--data.generate" not in first
+    shutil.rmtree(tmp_path / "1")
+    finished(tmp_path, 0.5)
+    later = json.loads((history.open(2).folder / "words.json").read_text())
+    assert json.loads(later[later.index("--data.generate") + 1]) == more["data.generate"]
+    assert later[later.index("--data.passes") + 1] == "2"
+    assert history.dataset_of(1).generation() == ("goop", {})
+    assert history.dataset_of(2).generation() == ("goop", more["data.generate"])
+    about = describe_data(history.dataset_of(1), history.dataset_of(2))
+    assert about.startswith("9 trajectories to train on, 200 of them in the first hours, 1 to validate and 2 to test,")
+    assert describe_data(dataset, dataset).startswith("200 trajectories to train on, 10 to validate")
+
+
+def test_a_training_that_goes_on_from_an_entry_uses_the_values_of_extensions(tmp_path):
+    entry = tmp_path / "zoo" / "small"
+    entry.mkdir(parents=True)
+    card = {"training": {"seconds": 7200, "steps": 7}, "curve": [[900.0, 5, 0.2]]}
+    (entry / "card.yaml").write_text(yaml.safe_dump(card))
+    dataset = Dataset("small", "goop.yaml", 2.0, extend={"data.passes": 7})
+    history = History(dataset, tmp_path / "runs" / "small", Extension(), entry)
+    words = json.loads((history.open(1).folder / "words.json").read_text())
+    assert words[words.index("--data.passes") + 1] == "7"
+    assert "data.passes" not in History(dataset, tmp_path / "fresh", Extension()).dataset_of(1).options
 
 
 def test_the_shipped_queue_is_read_and_simulates_what_its_configurations_say():
@@ -213,6 +243,9 @@ def test_facts_of_the_simulator_stay_as_long_as_the_simulation_does():
     assert simulator_facts(former, {"simulation": {"seed": 0}}) == {"twin": {"mse": 0.1}, "floor": {"mse": 0.01}}
     assert simulator_facts(former, {"simulation": {"seed": 1}}) == {}
     assert simulator_facts({"twin": {"mse": 0.1}}, {}) == {}  # recorded
+    few, many, others = ({"seed": 0, "counts": {"train": n, "test": test}} for n, test in ((2, 3), (9, 3), (2, 4)))
+    assert simulator_facts(former | {"simulation": few}, {"simulation": many})["twin"] == {"mse": 0.1}
+    assert simulator_facts(former | {"simulation": few}, {"simulation": others}) == {}
     assert simulator_facts({}, {"simulation": {"seed": 0}}) == {}
 
 

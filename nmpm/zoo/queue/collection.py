@@ -60,10 +60,11 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
         former = read_card(zoo / name) if (zoo / name / CARD).is_file() else {}
-        replace(folder, name, zoo, history.dataset.about or _about(history.dataset))
+        dataset = history.dataset_of(history.trainings.index(best) + 1)
+        replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
         refresh(zoo / name, ["speed"])
         card = read_card(zoo / name)
-        write_card(zoo / name, card | _references(zoo / name, history, simulator_facts(former, card)))
+        write_card(zoo / name, card | _references(zoo / name, history, dataset, simulator_facts(former, card)))
         write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
 
@@ -84,25 +85,32 @@ def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
 
 
 def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
-    """How uncertain the simulator itself is, from the card of a former model of the same simulation."""
-    same = "simulation" in card and former.get("simulation") == card["simulation"]
+    """How uncertain the simulator itself is, from the card of a former model with the same simulated test scenes."""
+    same = "simulation" in card and _test_scenes(former) == _test_scenes(card)
     return {key: former[key] for key in ("twin", "floor") if same and key in former}
 
 
-def _references(entry: Path, history: History, known: Mapping[str, Any]) -> dict[str, Any]:
+def _test_scenes(card: Mapping[str, Any]) -> dict[str, Any]:
+    """What determines the simulated test scenes of a card, on which the number of others has no influence."""
+    simulation = dict(card.get("simulation", {}))
+    return simulation | {"counts": dict(simulation.get("counts", {})).get("test")}
+
+
+def _references(entry: Path, history: History, dataset: Dataset, known: Mapping[str, Any]) -> dict[str, Any]:
     """What a card states beside the errors of the model: the goal, and how uncertain the simulator itself is.
 
     Args:
         entry: Its folder.
         history: Of the dataset.
+        dataset: With the values of the training whose weights these are.
         known: From `simulator_facts`.
     """
-    goal = {} if history.dataset.goal is None else {"goal": history.dataset.goal}
-    if "twin" in known or history.dataset.generation() is None:  # the former card states it, or the data are recorded
+    goal = {} if dataset.goal is None else {"goal": dataset.goal}
+    if "twin" in known or dataset.generation() is None:  # the former card states it, or the data are recorded
         return {**known, **goal}
     kept = history.folder / "twin.json"
     if not kept.is_file():  # measured once, as it does not depend on the model
-        data = catalog.dataset_folder(*_request(history.dataset))
+        data = catalog.dataset_folder(*_request(dataset))
         twin = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None)
         with atomic_write(kept) as part:
             part.write_text(json.dumps(twin.to_dict(), indent=1), encoding="utf-8")
@@ -128,15 +136,17 @@ def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
     return report | {"training": training, "curve": history.curve()}
 
 
-def _about(dataset: Dataset) -> str:
-    """How the data were simulated; empty for recorded data."""
-    if dataset.generation() is None:
+def describe_data(first: Dataset, last: Dataset) -> str:
+    """How the data of the first and of the last training were simulated; empty for recorded data."""
+    if last.generation() is None:
         return ""
-    _, request = _request(dataset)
+    _, request = _request(last)
     counts, preset = request.counts, request.preset
+    at_first = _request(first)[1].counts["train"]
+    more = "" if at_first == counts["train"] else f", {at_first} of them in the first hours"
     return (
-        f"{counts['train']} trajectories to train on, {counts['valid']} to validate and {counts['test']} to test, of"
-        f" {preset.frames + 1} frames, from nmpm's own {preset.generator}, seed {request.seed}; figures on others'"
+        f"{counts['train']} trajectories to train on{more}, {counts['valid']} to validate and {counts['test']} to test,"
+        f" of {preset.frames + 1} frames, from nmpm's own {preset.generator}, seed {request.seed}; figures on others'"
         " data of that name are not comparable."
     )
 

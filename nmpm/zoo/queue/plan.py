@@ -50,6 +50,8 @@ class Dataset:
         hours: Of the first training.
         publish: Whether its model goes into the zoo.
         options: Further values of the configuration, by dotted keys.
+        extend: Values in place of these in trainings that go on from weights of the same dataset, such as more
+            trajectories.
         about: Description of the data on the card, beside their name.
         goal: What the full-rollout MSE on the test split is meant to be, in domain length squared; for the card.
         start: Another dataset of the queue, whose best weights the first training starts from, at the extension's rate,
@@ -61,6 +63,7 @@ class Dataset:
     hours: float
     publish: bool = True
     options: Mapping[str, Any] = field(default_factory=dict)
+    extend: Mapping[str, Any] = field(default_factory=dict)
     about: str = ""
     goal: float | None = None
     start: str = ""
@@ -71,6 +74,10 @@ class Dataset:
             raise ConfigError(f"{self.name}: hours = {self.hours} must be positive.")
         if self.goal is not None and self.goal <= 0:
             raise ConfigError(f"{self.name}: goal = {self.goal} must be positive.")
+
+    def extended(self) -> Dataset:
+        """The dataset as trainings see it that go on from its weights."""
+        return dataclasses.replace(self, options={**self.options, **self.extend}, extend={})
 
     def generation(self) -> tuple[str, dict[str, Any]] | None:
         """Name and options of the simulated data, as `nmpm.data.catalog.ensure` takes them; None for recorded data."""

@@ -231,16 +231,22 @@ class History:
         """Hours of the first training, after so many hours of the entry that it goes on from."""
         return max(self.dataset.hours - done, self.extension.hours) if done else self.dataset.hours
 
+    def dataset_of(self, number: int) -> Dataset:
+        """The dataset with the values of the training of that number."""
+        goes_on = number > 1 or self.starting_entry is not None
+        return self.dataset.extended() if goes_on else self.dataset
+
     def open(self, number: int) -> Training:
         """The training of that number, started if it has not been."""
         trainings = self.trainings
         if number <= len(trainings):
             return trainings[number - 1]
-        training, hours, weights = Training(self.folder / str(number)), self.hours_of(number), self._weights()
+        dataset, hours = self.dataset_of(number), self.hours_of(number)
+        training, weights = Training(self.folder / str(number)), self._weights()
         training.start(
-            new_training(self.dataset)
+            new_training(dataset)
             if weights is None
-            else continued_training(self.dataset, hours, self.extension.rate, weights)
+            else continued_training(dataset, hours, self.extension.rate, weights)
         )
         return training
 
