@@ -197,13 +197,13 @@ def remaining(plan: Plan, chosen: argparse.Namespace) -> str:
 
 def print_status(plan: Plan, chosen: argparse.Namespace) -> int:
     """A line per dataset."""
-    from nmpm.zoo.queue.validations import kept_mse, lowest_errors
+    from nmpm.zoo.queue.validations import lowest_errors, lowest_mse
 
     for history in histories(plan, chosen):
         curves = [stage.curve() for stage in history.stages]
         errors = lowest_errors(*curves)
         best = curves[errors.index(min(errors))] if any(curves) else []
-        error = f"validation MSE {1e3 * kept_mse(best):.4g} ×10⁻³" if best else "not validated"
+        error = f"validation MSE {1e3 * lowest_mse(best):.4g} ×10⁻³" if best else "not validated"
         state = "stopped" if history.next_round() is None else f"training {history.next_round()}"
         state = f"needs {history.waits_for()}" if history.waits_for() else state
         sys.stdout.write(f"{history.dataset.name:<22} {state:<27} {history.hours():5.2f} h  {error}\n")

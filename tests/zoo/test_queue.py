@@ -88,6 +88,17 @@ def test_the_curve_goes_on_over_the_trainings_and_the_best_of_them_is_taken(tmp_
     assert history.curve()[:4] == [[900.0, 5, 1.0], [1800.0, 10, 0.5], [2700.0, 15, 0.5], [3600.0, 20, 0.25]]
 
 
+def test_the_last_weights_are_taken_where_the_lowest_validation_is_chance(tmp_path):
+    finished(tmp_path, 0.5)
+    training = History(Dataset("small", "goop.yaml", 0.5), tmp_path, Extension()).best()
+    training.best.with_name("last.ckpt").touch()
+    assert training.best.name == "best.ckpt"
+    curve = [[float(at), at, error] for at, error in enumerate((0.9, 0.3, 0.8, 0.6, 0.5, 0.4, 0.4, 0.4))]
+    report = json.loads((training.folder / "report.json").read_text())
+    (training.folder / "report.json").write_text(json.dumps(report | {"curve": curve}))
+    assert training.best.name == "last.ckpt"
+
+
 def test_time_alone_ends_a_training_and_an_extension_starts_at_a_lower_rate():
     dataset = Dataset("goop", "goop.yaml", 26.5, options={"data.batch_size": 2})
     first = new_training(dataset)

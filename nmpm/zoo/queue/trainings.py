@@ -15,7 +15,7 @@ from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo.queue.plan import RATE, Dataset, Extension, continued_training, new_training
 from nmpm.zoo.queue.published import Published
-from nmpm.zoo.queue.validations import lowest_errors
+from nmpm.zoo.queue.validations import ends_lowest, lowest_errors
 from nmpm.zoo.runs import BEST
 
 LAST = BEST.with_name("last.ckpt")
@@ -42,8 +42,10 @@ class Training:
 
     @property
     def best(self) -> Path:
-        """The checkpoint of the lowest validation error; may not exist yet."""
-        return self.folder / BEST
+        """The checkpoint of the lowest validation error, see `ends_lowest`; may not exist yet."""
+        last = self.folder / LAST
+        ended = self.finished and last.is_file() and bool(self.curve())
+        return last if ended and ends_lowest(self.curve()) else self.folder / BEST
 
     def start(self, words: list[str]) -> None:
         """Write its command, and a copy of its configuration, so that changes of the shipped one do not reach it."""

@@ -1,6 +1,8 @@
 """Validations of trainings: points of seconds, steps, MSE and overall error (`nmpm.metrics.overall_error`).
 
-Points of earlier versions end with the MSE. Weights are compared by the overall error where all curves state it.
+Points of earlier versions end with the MSE. Weights are compared by the overall error where all curves state it. As
+validations have few scenes, so that a single one may be low by chance, an error is the mean of a validation and its
+neighbours.
 """
 
 from __future__ import annotations
@@ -13,22 +15,48 @@ _MSE, _OVERALL = 2, 3
 
 
 def lowest_errors(*curves: Curve) -> list[float]:
-    """The error of each curve's best weights, all by the same measure; infinite for an empty curve."""
-    measured = [curve for curve in curves if curve]
-    column = _OVERALL if all(_states_overall(curve) for curve in measured) else _MSE
-    return [float(_best(curve)[column]) if curve else float("inf") for curve in curves]
+    """The error where each curve is lowest, all by the same measure; infinite for an empty curve."""
+    overall = all(_states_overall(curve) for curve in curves if curve)
+    return [_lowest(curve)[_OVERALL if overall else _MSE] if curve else float("inf") for curve in curves]
 
 
-def kept_mse(curve: Curve) -> float:
-    """The full rollout's MSE of a curve's best weights; of a curve that is not empty."""
-    return float(_best(curve)[_MSE])
+def lowest_mse(curve: Curve) -> float:
+    """The full rollout's MSE where a curve, which is not empty, is lowest."""
+    return _lowest(curve)[_MSE]
 
 
-def _best(curve: Curve) -> Sequence[float]:
-    """The point whose weights were kept; of a curve that is not empty."""
-    if not _states_overall(curve):
-        return min(curve, key=lambda point: point[_MSE])
-    return min((point for point in curve if len(point) > _OVERALL), key=lambda point: point[_OVERALL])
+def ends_lowest(curve: Curve) -> bool:
+    """Whether a curve, which is not empty, is lower at its end than around its lowest single validation.
+
+    A training keeps the weights of that validation, and the last ones.
+    """
+    points, column = _measured(curve)
+    single = min(range(len(points)), key=lambda at: points[at][column])
+    return _mean(points[-3:], column) < _mean(_around(points, single), column)
+
+
+def _lowest(curve: Curve) -> list[float]:
+    """Means of the columns around the point where those of the error are lowest; of a curve that is not empty."""
+    points, column = _measured(curve)
+    groups = [_around(points, at) for at in range(len(points))]
+    lowest = min(groups, key=lambda group: _mean(group, column))
+    return [_mean(lowest, index) for index in range(column + 1)]
+
+
+def _around(points: Curve, at: int) -> Curve:
+    """A point and its neighbours."""
+    return points[max(at - 1, 0) : at + 2]
+
+
+def _mean(points: Curve, column: int) -> float:
+    return sum(point[column] for point in points) / len(points)
+
+
+def _measured(curve: Curve) -> tuple[Curve, int]:
+    """The points by whose errors weights were kept, and the column of these."""
+    if _states_overall(curve):
+        return [point for point in curve if len(point) > _OVERALL], _OVERALL
+    return curve, _MSE
 
 
 def _states_overall(curve: Curve) -> bool:
