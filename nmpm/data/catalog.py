@@ -16,7 +16,7 @@ from types import MappingProxyType
 from nmpm._support.shipped import user_home
 from nmpm.data.format import METADATA_FILE, read_metadata
 from nmpm.data.generate import generate
-from nmpm.data.simulation_request import SimulationRequest
+from nmpm.data.simulation_request import SimulationRequest, same_trajectories
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.sim import load_preset, preset_names
@@ -134,7 +134,7 @@ def _complete_folders(name: str, request: SimulationRequest) -> Iterator[tuple[P
         if not (folder / METADATA_FILE).is_file():
             continue
         found = read_metadata(folder).extra.get("simulation", {})
-        if all(found.get(key) == wanted[key] for key in ("preset", "seed", "revision")):
+        if same_trajectories(found, wanted):
             yield folder, found.get("counts", {})
 
 

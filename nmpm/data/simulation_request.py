@@ -81,6 +81,11 @@ class SimulationRequest:
             )
 
 
+def same_trajectories(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two requests, as `SimulationRequest.to_dict` states them, give the same trajectories, if not as many."""
+    return all(one.get(key) == other.get(key) for key in ("preset", "seed", "revision"))
+
+
 def _is_valid_counts(counts: object) -> bool:
     """Whether these are valid numbers of trajectories for all splits."""
     if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):

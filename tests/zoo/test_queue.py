@@ -257,6 +257,8 @@ def test_facts_of_the_simulator_stay_as_long_as_the_simulation_does():
     few, many, others = ({"seed": 0, "counts": {"train": n, "test": test}} for n, test in ((2, 3), (9, 3), (2, 4)))
     assert simulator_facts(former | {"simulation": few}, {"simulation": many})["twin"] == {"mse": 0.1}
     assert simulator_facts(former | {"simulation": few}, {"simulation": others}) == {}
+    redrawn = many | {"redrawn": {"train": {"5": 1}}}  # of the training trajectories that were added
+    assert simulator_facts(former | {"simulation": few}, {"simulation": redrawn})["twin"] == {"mse": 0.1}
     assert simulator_facts({}, {"simulation": {"seed": 0}}) == {}
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from nmpm._support.atomic import atomic_write
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
-from nmpm.data.simulation_request import SimulationRequest
+from nmpm.data.simulation_request import SimulationRequest, same_trajectories
 from nmpm.errors import ZooError
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import refresh, write_card, write_index
@@ -86,14 +86,10 @@ def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
 
 def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
     """How uncertain the simulator itself is, from the card of a former model with the same simulated test scenes."""
-    same = "simulation" in card and _test_scenes(former) == _test_scenes(card)
+    before, now = former.get("simulation", {}), card.get("simulation", {})
+    as_many = before.get("counts", {}).get("test") == now.get("counts", {}).get("test")
+    same = bool(now) and as_many and same_trajectories(before, now)
     return {key: former[key] for key in ("twin", "floor") if same and key in former}
-
-
-def _test_scenes(card: Mapping[str, Any]) -> dict[str, Any]:
-    """What determines the simulated test scenes of a card, on which the number of others has no influence."""
-    simulation = dict(card.get("simulation", {}))
-    return simulation | {"counts": dict(simulation.get("counts", {})).get("test")}
 
 
 def _references(entry: Path, history: History, dataset: Dataset, known: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,8 +44,8 @@ class Training:
     def best(self) -> Path:
         """The checkpoint of the lowest validation error, see `ends_lowest`; may not exist yet."""
         last = self.folder / LAST
-        ended = self.finished and last.is_file() and bool(self.curve())
-        return last if ended and ends_lowest(self.curve()) else self.folder / BEST
+        curve = self.curve() if self.finished and last.is_file() else []
+        return last if curve and ends_lowest(curve) else self.folder / BEST
 
     def start(self, words: list[str]) -> None:
         """Write its command, and a copy of its configuration, so that changes of the shipped one do not reach it."""
