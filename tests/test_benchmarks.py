@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import csv
 import dataclasses
 import io
 import json
@@ -37,7 +38,7 @@ WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "r
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
     "ensembles", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state", "installed_wheel", "kills",
     "random_commits", "recipe_pictures", "run_time_knob", "settled_shape", "simulators", "stable_substeps", "stiffness",
-    "trades", "where_emulation_pays",
+    "trade_tables", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 
@@ -432,9 +433,46 @@ def test_models_are_compared_with_the_simulator_at_equal_time_and_at_equal_error
     assert "**better**" in list(table_lines([better, worse]))[2]
 
 
-def test_results_show_the_table_of_the_committed_measurements():
-    results = ROOT.parent / "docs" / "results.md"
-    assert run_script("beside_simulator") in results.read_text(encoding="utf-8")
+def test_the_page_of_tables_is_that_of_the_committed_measurements(tmp_path):
+    run_script("trade_tables", "--page", str(tmp_path / "page.md"))
+    page = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert page == (ROOT / "trade_tables.md").read_text(encoding="utf-8")
+    assert run_script("beside_simulator") in page
+
+
+def test_a_table_has_stable_choices_errors_with_intervals_and_no_errors_of_unstable_ones(tmp_path):
+    from trade_tables import read_choices, section_lines
+
+    common = {
+        "dataset": "tiny",
+        "scenes": "5",
+        "particles": "9",
+        "threads": "1",
+        "clock": "CPU time",
+        "hardware": "here",
+    }
+    rows = [
+        common | {"name": name, "ms_per_frame": ms, "ratio_to_reference": "0.5", "error": error, "value": value}
+        | {"low": low, "high": high, "pareto": str(name == "goop"), "stable": str(name != "free"), "failed_scenes": "2"}
+        for name, ms, error, value, low, high in [
+            ("simulator, 6 substeps", "2.0", "mse", "2.00812", "1", "3"),
+            ("goop", "0.1234", "mse", "0.0123", "0.01", "0.02"),
+            ("goop", "0.1234", "height", "0.0061", "", ""),
+            ("free", "0.1", "mse", "0.5", "0.4", "0.6"),
+        ]
+    ]  # fmt: skip
+    with (tmp_path / "trade.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    lines = list(section_lines(read_choices(tmp_path / "trade.csv")))
+    assert lines[2:-1] == [
+        "| choice | ms | time | MSE | height |",
+        "|---|---:|---:|---:|---:|",
+        "| free: unstable in 2 of 5 scenes | 0.1 | 0.5 |  |  |",
+        "| **goop** | 0.123 | 0.5 | 12.3 (10 – 20) | 0.61% |",
+        "| 6 substeps | 2 | 0.5 | 2008 (1000 – 3000) |  |",
+    ]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "trade").glob("*.yaml")), ids=lambda path: path.stem)
