@@ -122,7 +122,8 @@ def _error(measure: str, value: str, low: str, high: str) -> str:
 
 def _digits(value: float, count: int = 3) -> str:
     """Significant digits, without an exponent for large values."""
-    return f"{value:.0f}" if value >= 10**count else f"{value:.{count}g}"
+    text = f"{value:.{count}g}"
+    return f"{value:.0f}" if "e+" in text else text
 
 
 def page_text(paths: Sequence[Path]) -> str:
