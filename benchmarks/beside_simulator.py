@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,10 +69,20 @@ class Rivals:
         return self.gain is None or self.gain > 1
 
 
-def read_rivals(path: Path, measure: str = "mse") -> list[Rivals]:
-    """The models of a table at batch 1, in order of their time; empty where it has no model or no simulator."""
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a table, one for each choice and measure."""
     with path.open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["error"] == measure and row["stable"] == "True"]
+        return list(csv.DictReader(file))
+
+
+def short_name(row: Mapping[str, str]) -> str:
+    """Name of a row's choice in a table whose rows are of the simulator where they are of no model."""
+    return row["name"].removeprefix("simulator, ")
+
+
+def find_rivals(rows: Iterable[Mapping[str, str]], measure: str = "mse") -> list[Rivals]:
+    """The models of a table at batch 1, in order of their time; empty where it has no model or no simulator."""
+    rows = [row for row in rows if row["error"] == measure and row["stable"] == "True"]
     simulators = [_setting(row) for row in rows if row["kind"] == "simulator" and row["value"]]
     models = [row for row in rows if row["kind"] == "model" and row["batch"] == "1" and row["value"]]
     found = []
@@ -87,8 +97,13 @@ def read_rivals(path: Path, measure: str = "mse") -> list[Rivals]:
     return found
 
 
-def _setting(row: dict[str, str]) -> Setting:
-    return Setting(row["name"].removeprefix("simulator, "), float(row["ms_per_frame"]), float(row["value"]))
+def read_rivals(path: Path, measure: str = "mse") -> list[Rivals]:
+    """`find_rivals` in the rows of a table's file."""
+    return find_rivals(read_rows(path), measure)
+
+
+def _setting(row: Mapping[str, str]) -> Setting:
+    return Setting(short_name(row), float(row["ms_per_frame"]), float(row["value"]))
 
 
 def table_lines(rivals: Iterable[Rivals]) -> Iterable[str]:

@@ -9,13 +9,12 @@ Nothing is measured here.
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from beside_simulator import TRADE, read_rivals, table_lines
+from beside_simulator import TRADE, find_rivals, read_rows, short_name, table_lines
 from timing import make_parser
 
 from nmpm._support.atomic import atomic_write
@@ -67,15 +66,14 @@ class Choice:
         return float(self.row["ms_per_frame"])
 
 
-def read_choices(path: Path) -> list[Choice]:
-    """The choices of a table, in order of their time."""
-    found: dict[str, list[dict[str, str]]] = {}
-    with path.open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            found.setdefault(row["name"], []).append(row)
+def group_choices(rows: Iterable[Mapping[str, str]]) -> list[Choice]:
+    """The choices of a table's rows, in order of their time."""
+    found: dict[str, list[Mapping[str, str]]] = {}
+    for row in rows:
+        found.setdefault(row["name"], []).append(row)
     choices = [
-        Choice(rows[0], {row["error"]: (row["value"], row["low"], row["high"]) for row in rows if row["value"]})
-        for rows in found.values()
+        Choice(own[0], {row["error"]: (row["value"], row["low"], row["high"]) for row in own if row["value"]})
+        for own in found.values()
     ]
     return sorted(choices, key=lambda choice: choice.milliseconds)
 
@@ -98,7 +96,7 @@ def section_lines(choices: Sequence[Choice]) -> Iterator[str]:
 
 
 def _line(choice: Choice, shown: Iterable[str]) -> str:
-    row, name = choice.row, choice.row["name"].removeprefix("simulator, ")
+    row, name = choice.row, short_name(choice.row)
     if row["pareto"] == "True":
         name = f"**{name}**"
     stable = row["stable"] == "True"
@@ -128,11 +126,10 @@ def _digits(value: float, count: int = 3) -> str:
 
 def page_text(paths: Sequence[Path]) -> str:
     """The page of these tables."""
-    lines = [INTRODUCTION]
-    for path in paths:
-        lines += section_lines(read_choices(path))
-    rivals = [one for path in paths for one in read_rivals(path)]
-    return "\n".join([*lines, RIVALS, *table_lines(rivals)]) + "\n"
+    tables = [read_rows(path) for path in paths]
+    sections = [line for rows in tables for line in section_lines(group_choices(rows))]
+    rivals = [one for rows in tables for one in find_rivals(rows)]
+    return "\n".join([INTRODUCTION, *sections, RIVALS, *table_lines(rivals)]) + "\n"
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 python benchmarks/where_emulation_pays.py                          table, and map.json and map.png in benchmarks/trade
 python benchmarks/where_emulation_pays.py goop dambreak2d --times 1 4 16
+python benchmarks/where_emulation_pays.py --redraw                 after the trade's tables were measured again
 
 Each preset is simulated in domains several times as wide, in which one of its initial states stands as often side by
 side, on one thread; the emulator is the zoo's model of it, or an untrained one of its configuration. The cost of both
@@ -289,19 +290,26 @@ def read_cases(path: Path) -> dict[str, list[Case]]:
 def main() -> None:
     """Measure, print, and write JSON and a picture."""
     parser = make_parser(__doc__)
-    parser.add_argument("names", nargs="*", default=list(WIDTHS), choices=[*WIDTHS], metavar="NAME", help="presets")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"presets (default: all), of {', '.join(WIDTHS)}")
     parser.add_argument("--times", type=int, nargs="+", help="widths of the domain (default: the preset's own list)")
     parser.add_argument("--rounds", type=int, default=7, help="timed runs of each")
     parser.add_argument("--out", type=Path, default=TRADE, help="folder of map.json and map.png")
+    parser.add_argument(
+        "--redraw", action="store_true", help="measure nothing: the figures kept, the tables' points anew"
+    )
     chosen: Namespace = parser.parse_args()
+    for name in set(chosen.names) - set(WIDTHS):  # (`choices` of `nargs="*"` would refuse that none is given)
+        parser.error(f"{name!r} is not one of {', '.join(WIDTHS)}.")
     torch.set_num_threads(1)
     cases = read_cases(chosen.out / "map.json")
-    for name in chosen.names:
+    for name in () if chosen.redraw else chosen.names or WIDTHS:
         cases[name] = []
         for times in chosen.times or WIDTHS[name]:
             cases[name].append(measure(name, times, chosen.rounds))
             write_json(chosen.out / "map.json", figures(cases))  # kept if a wider case is interrupted
-    sys.stdout.write("\n".join(table_lines(cases, figures(cases))) + "\n")
+    found = figures(cases)
+    write_json(chosen.out / "map.json", found)
+    sys.stdout.write("\n".join(table_lines(cases, found)) + "\n")
     write_map(cases, chosen.out / "map.png")
 
 

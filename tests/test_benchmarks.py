@@ -8,6 +8,7 @@ import io
 import json
 import runpy
 import shlex
+import shutil
 import sys
 import time
 from functools import partial
@@ -404,13 +405,28 @@ def test_random_commits_start_bundles_within_the_one_before():
     assert losses[1] == pytest.approx(losses[0], rel=1e-4)
 
 
+def test_the_committed_map_has_the_points_of_the_committed_tables(tmp_path):
+    shutil.copy(ROOT / "trade" / "map.json", tmp_path)
+    text = run_script("where_emulation_pays", "--redraw", "--out", str(tmp_path))
+    assert text.count("times as fast as") == len(list((ROOT / "trade").glob("*/trade.csv")))
+    drawn, committed = (json.loads((folder / "map.json").read_text()) for folder in (tmp_path, ROOT / "trade"))
+    assert (drawn["points"], drawn["cases"]) == (committed["points"], committed["cases"])
+
+
 # ---- time and error beside the simulator
 
 
+def write_rows(path, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def write_trade(path, rows):
-    names = ("dataset", "particles", "kind", "name", "batch", "ms_per_frame", "stable", "error", "value")
-    text = [",".join(names), *(",".join(map(str, ("tiny", 10, *row[:4], row[4], "mse", row[5]))) for row in rows)]
-    path.write_text("\n".join(text) + "\n")
+    names = ("kind", "name", "batch", "ms_per_frame", "stable", "value")
+    common = {"dataset": "tiny", "particles": 10, "error": "mse"}
+    write_rows(path, [common | dict(zip(names, row, strict=True)) for row in rows])
 
 
 def test_models_are_compared_with_the_simulator_at_equal_time_and_at_equal_error(tmp_path):
@@ -441,7 +457,8 @@ def test_the_page_of_tables_is_that_of_the_committed_measurements(tmp_path):
 
 
 def test_a_table_has_stable_choices_errors_with_intervals_and_no_errors_of_unstable_ones(tmp_path):
-    from trade_tables import read_choices, section_lines
+    from beside_simulator import read_rows
+    from trade_tables import group_choices, section_lines
 
     common = {
         "dataset": "tiny",
@@ -461,11 +478,8 @@ def test_a_table_has_stable_choices_errors_with_intervals_and_no_errors_of_unsta
             ("free", "0.1", "mse", "0.5", "0.4", "0.6"),
         ]
     ]  # fmt: skip
-    with (tmp_path / "trade.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    lines = list(section_lines(read_choices(tmp_path / "trade.csv")))
+    write_rows(tmp_path / "trade.csv", rows)
+    lines = list(section_lines(group_choices(read_rows(tmp_path / "trade.csv"))))
     assert lines[2:-1] == [
         "| choice | ms | time | MSE | height |",
         "|---|---:|---:|---:|---:|",
