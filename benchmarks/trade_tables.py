@@ -12,12 +12,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from beside_simulator import TRADE, find_rivals, read_rows, short_name, table_lines
 from timing import make_parser
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.digests import short_digest
+from nmpm.evaluation.trade.sweep import OTHER_SCENES
+from nmpm.zoo import Zoo
 
 PAGE = Path(__file__).parent / "trade_tables.md"
 INTRODUCTION = """\
@@ -28,7 +32,8 @@ they show. Milliseconds and time, relative to the simulator as shipped, are per 
 MSE and EMD (earth mover's distance of the last frame, of the domain's side) × 10⁻³; *field* is the share of the
 material that lies in another cell, of 3 particle spacings; height and kinetic energy are deviations. The bootstrap
 interval over scenes is in brackets. Choices of the Pareto set are bold; unstable ones count for nothing, and their
-errors are left out. All scenes are simulated by nmpm.
+errors are left out. *Weights* are the first digits of their SHA-256 (`nmpm._support.digests`), where the table has
+them. All scenes are simulated by nmpm.
 """
 RIVALS = """\
 ## Models beside the simulator
@@ -78,6 +83,28 @@ def group_choices(rows: Iterable[Mapping[str, str]]) -> list[Choice]:
     return sorted(choices, key=lambda choice: choice.milliseconds)
 
 
+@cache
+def zoo_weights() -> Mapping[str, str]:
+    """Digest of the weights of each of the zoo's models now."""
+    return {name: short_digest(Zoo.load(name).emulator.state_dict()) for name in Zoo.list()}
+
+
+def weights_line(choices: Iterable[Choice], zoo: Mapping[str, str]) -> str:
+    """Which weights were measured, and whether the zoo still has them; empty where the table does not say.
+
+    Args:
+        choices: Of a table.
+        zoo: Digests of the zoo's weights, by the models' names.
+    """
+    rows = [choice.row for choice in choices]
+    found = {row["model"].removesuffix(OTHER_SCENES): row["weights"] for row in rows if row.get("weights")}
+    parts = [
+        f"{model} {digest}" + ("" if zoo.get(model, digest) == digest else " (the zoo has others by now)")
+        for model, digest in sorted(found.items())
+    ]
+    return f"Weights: {', '.join(parts)}." if parts else ""
+
+
 def section_lines(choices: Sequence[Choice]) -> Iterator[str]:
     """Heading and table of a dataset."""
     first = choices[0].row
@@ -88,6 +115,8 @@ def section_lines(choices: Sequence[Choice]) -> Iterator[str]:
         f"{first['threads']} thread, {first['clock']}.\n"
         f"[Picture](trade/{first['dataset']}/trade.png), [page](trade/{first['dataset']}/trade.html).\n"
     )
+    if weights := weights_line(choices, zoo_weights()):
+        yield f"{weights}\n"
     yield " | ".join(["| choice", "ms", "time", *(FORMS[name][0] for name in shown)]) + " |"
     yield "|---|" + "---:|" * (2 + len(shown))
     for choice in choices:

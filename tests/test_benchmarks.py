@@ -489,6 +489,21 @@ def test_a_table_has_stable_choices_errors_with_intervals_and_no_errors_of_unsta
     ]
 
 
+def test_tables_name_the_weights_that_were_measured_and_those_that_the_zoo_has_replaced():
+    from trade_tables import Choice, weights_line
+
+    rows = [
+        {"model": "simulator", "weights": ""},
+        {"model": "goop", "weights": "aaa"},
+        {"model": "goop", "weights": "aaa"},
+        {"model": "goop/fast (of other scenes)", "weights": "bbb"},
+        {"model": "runs-mine", "weights": "ccc"},
+    ]
+    line = weights_line([Choice(row, {}) for row in rows], {"goop": "aaa", "goop/fast": "ddd"})
+    assert line == "Weights: goop aaa, goop/fast bbb (the zoo has others by now), runs-mine ccc."
+    assert weights_line([Choice({"model": "goop"}, {})], {"goop": "aaa"}) == ""
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "trade").glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_sweeps_have_choices_of_their_simulator(path):
     preset = load_preset(path.stem)

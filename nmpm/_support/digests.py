@@ -16,3 +16,8 @@ def weights_digest(weights: Mapping[str, Tensor]) -> str:
         digest.update(f"{name} {values.dtype} {tuple(values.shape)};".encode())
         digest.update(values.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
+
+
+def short_digest(weights: Mapping[str, Tensor]) -> str:
+    """The first 12 digits of `weights_digest`, for tables."""
+    return weights_digest(weights)[:12]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from nmpm._support.digests import weights_digest
+from nmpm._support.digests import short_digest, weights_digest
 from nmpm.errors import ConfigError
 from nmpm.evaluation.gns import TrainedGraph
 from nmpm.evaluation.trade.choice import Choice, Kind, Rollout
@@ -58,6 +58,7 @@ def graph_choices(graphs: Mapping[str, TrainedGraph], scenes: Scenes) -> list[Ch
             )
         settings: dict[str, str | int | float] = {
             "model": "GNS",
+            "weights": short_digest(graph.simulator.state_dict()),
             "precision": "float32",
             "runtime": "eager",
             "training_minutes": graph.minutes,

@@ -13,6 +13,7 @@ from types import MappingProxyType
 import torch
 import yaml
 
+from nmpm._support.digests import short_digest
 from nmpm._support.messages import counted
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
@@ -33,6 +34,9 @@ from nmpm.evaluation.trade.timing import Timing
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
 from nmpm.sim import Preset
 from nmpm.sim.config import from_section, section_entries
+
+OTHER_SCENES = " (of other scenes)"
+"""Added to the names of models that were trained on other scenes."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +192,9 @@ def make_choices(
         choices += _floors(sweep.floors, scenes.preset)
     for name, emulator in models.items():
         over = over_scenes(name, emulator, scenes)
-        shown = name if over is emulator else f"{name} (of other scenes)"
-        choices += _without_repetitions(_models(sweep.models, shown, over, device))
+        shown = name if over is emulator else name + OTHER_SCENES
+        known = {"model": shown, "weights": short_digest(emulator.state_dict())}
+        choices += _without_repetitions(_models(sweep.models, known, over, device))
     choices += graph_choices(graphs, scenes)
     choices += [TrivialChoice(name) for name in sweep.trivial]
     return choices
@@ -242,7 +247,17 @@ def _floors(floors: Floors, preset: Preset) -> Iterator[Choice]:
         yield SimulatorChoice(name, preset, settings, floors.nudge, kind=Kind.FLOOR)
 
 
-def _models(settings: ModelSettings, name: str, emulator: Emulator, device: torch.device) -> Iterator[Choice]:
+def _models(
+    settings: ModelSettings, known: Mapping[str, str], emulator: Emulator, device: torch.device
+) -> Iterator[Choice]:
+    """All forms of a model.
+
+    Args:
+        settings: Of the forms.
+        known: Columns that all of them share: the model's name and weights.
+        emulator: On the CPU.
+        device: Where they compute.
+    """
     forms = product(settings.precision, settings.constraints, settings.cells, settings.runtime)
     for precision, constraints, cells, runtime in forms:
         plain = with_cells(with_constraints(with_precision(emulator, precision), constraints), cells)
@@ -257,10 +272,10 @@ def _models(settings: ModelSettings, name: str, emulator: Emulator, device: torc
                 counted(threads, "thread"): threads != settings.threads[0],
             }
             yield ModelChoice(
-                name=", ".join([name, *(part for part, shown in parts.items() if shown)]),
+                name=", ".join([known["model"], *(part for part, shown in parts.items() if shown)]),
                 emulator=form,
                 settings={
-                    "model": name,
+                    **known,
                     "precision": precision,
                     "constraints": constraints,
                     "cells": "×".join(map(str, form.grid.shape)),

@@ -15,7 +15,10 @@ from nmpm.evaluation.trade.frontier import describe_measure, standings
 from nmpm.evaluation.trade.points import Point, measure_names
 from nmpm.evaluation.trade.scenes import Scenes
 
-SETTINGS = ("model", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime", "training_minutes")
+SETTINGS = (
+    "model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime",
+    "training_minutes",
+)  # fmt: skip
 """Columns of what was chosen; empty where it does not apply."""
 
 COLUMNS = (

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from nmpm._support.digests import short_digest
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall
 from nmpm.evaluation.gns import GraphRecipe, TrainedGraph
@@ -226,8 +227,10 @@ def test_a_model_that_cannot_take_the_scenes_is_rejected(scenes):
 
 def test_a_model_of_other_scenes_is_rebuilt_for_these_and_named_so(scenes):
     finer = dataclasses.replace(scenes.scene, particle_volume=scenes.scene.particle_volume / 2)
-    found = [c for c in make_choices(tiny_sweep(), scenes, {"one": tiny_emulator(finer)}) if c.kind is Kind.MODEL]
+    one = tiny_emulator(finer)
+    found = [c for c in make_choices(tiny_sweep(), scenes, {"one": one}) if c.kind is Kind.MODEL]
     assert {choice.settings["model"] for choice in found} == {"one (of other scenes)"}
+    assert {choice.settings["weights"] for choice in found} == {short_digest(one.state_dict())}
     assert all(choice.emulator.scene == scenes.scene for choice in found)
 
 
@@ -253,6 +256,8 @@ def test_the_table_is_tidy(scenes, choices, tmp_path):
     assert len({(row["name"], row["error"]) for row in table}) == len(table) == 7 * len(points)
     first = next(row for row in table if row["name"] == "carried, batch 2" and row["error"] == "mse")
     assert (first["kind"], first["batch"], first["constraints"]) == ("model", "2", "held")
+    assert first["weights"] == short_digest(tiny_emulator(scenes.scene).state_dict())
+    assert {row["weights"] for row in table if row["kind"] != "model"} == {""}
     assert float(first["low"]) <= float(first["value"]) <= float(first["high"])
     assert np.isclose(float(first["frames_per_second"]) * float(first["ms_per_frame"]), 1000, rtol=1e-3)
 
