@@ -20,7 +20,7 @@ from timing import make_parser
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.digests import short_digest
-from nmpm.evaluation.trade.sweep import OTHER_SCENES
+from nmpm.evaluation.trade.choice import OTHER_SCENES
 from nmpm.zoo import Zoo
 
 PAGE = Path(__file__).parent / "trade_tables.md"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import counted
-from nmpm.evaluation.trade.choice import Kind
+from nmpm.evaluation.trade.choice import OTHER_SCENES, Kind
 from nmpm.evaluation.trade.frontier import Standing, describe_measure, standings
 from nmpm.evaluation.trade.labels import Box, boxes_along, boxes_around, choose_boxes
 from nmpm.evaluation.trade.points import Point
@@ -25,7 +26,11 @@ _MARKERS: Mapping[Kind, dict[str, Any]] = MappingProxyType(
         Kind.SIMULATOR: {"marker": "s", "color": "#c8642a", "markerfacecolor": "none", "label": "simulator"},
     }
 )
-_MARK = 10  # half of a marker with its ring, pixels
+_OTHER_SCENES: Mapping[str, Any] = MappingProxyType(
+    _MARKERS[Kind.MODEL] | {"markerfacecolor": "none", "label": "emulator of other scenes"}
+)
+_DPI = 130  # names are measured at the resolution of the file: glyphs have whole pixels
+_MARK = 13  # half of a marker with its ring, pixels
 _FAR = 100  # a line further below all points than this factor is named in the title, not drawn
 _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
     {
@@ -50,10 +55,10 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
     near = [p for p in lines if where[p.name].mean > least / _FAR]
     far = "; ".join(f"{p.name}: {where[p.name].mean:.1g}" for p in lines if p not in near)
 
-    figure = Figure(figsize=(9, 5.8), layout="constrained")
+    figure = Figure(figsize=(9, 5.8), dpi=_DPI, layout="constrained")
     axes = figure.subplots()
-    for kind, style in _MARKERS.items():
-        _draw_points(axes, [p for p in marked if p.kind is kind], where, style)
+    for style, group in itertools.groupby(sorted(marked, key=_rank), key=_style):
+        _draw_points(axes, list(group), where, style)
     for point in near:
         axes.axhline(where[point.name].mean, lw=1, **_LINES[point.kind])
     exact = [_draw_exact(axes, p) for p in shown if p.exact and p.kind is Kind.SIMULATOR]
@@ -61,17 +66,24 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
     below = f"\n(below the picture: {far})" if far else ""
     axes.set_title(f"{scenes.name}: time and error on {len(scenes)} test scenes{below}")
     if marked:
-        figure.legend(loc="outside lower center", ncols=len(_MARKERS), frameon=False)
+        figure.legend(loc="outside lower center", ncols=len(_MARKERS) + 1, frameon=False)
     figure.draw_without_rendering()  # decides where the axes are, which names depend on
     _write_names(axes, marked, near, where, exact)
     with atomic_write(path) as part:
-        figure.savefig(part, dpi=130, format="png")
+        figure.savefig(part, format="png")
+
+
+def _rank(point: Point) -> tuple[int, bool]:
+    """Order of the kinds in the legend; models of other scenes come after those of these scenes."""
+    return list(_MARKERS).index(point.kind), point.of_other_scenes
+
+
+def _style(point: Point) -> Mapping[str, Any]:
+    return _OTHER_SCENES if point.of_other_scenes else _MARKERS[point.kind]
 
 
 def _draw_points(axes: Any, points: Sequence[Point], where: Mapping[str, Standing], style: Mapping[str, Any]) -> None:
     """Means with bootstrap intervals and time quartiles; members of the Pareto set in a ring."""
-    if not points:
-        return
     times = [point.milliseconds for point in points]
     means = [where[point.name].mean for point in points]
     ends = [(where[p.name].mean - where[p.name].low, where[p.name].high - where[p.name].mean) for p in points]
@@ -167,4 +179,5 @@ def _join(axes: Any, x: float, y: float, box: Box, colour: str) -> None:
 
 
 def _short(point: Point) -> str:
-    return point.name.removeprefix("simulator, ").replace(" resolution", "").replace("bfloat16", "bf16")
+    shown = point.name.removeprefix("simulator, ").replace(OTHER_SCENES, "")
+    return shown.replace(" resolution", "").replace("bfloat16", "bf16")

@@ -19,6 +19,9 @@ Rollout = Callable[[int], Tensor]
 
 CPU = torch.device("cpu")
 
+OTHER_SCENES = " (of other scenes)"
+"""Ends the name of a model that was trained on other scenes, in the settings."""
+
 
 class Kind(StrEnum):
     """The kind of a choice; floors are drawn beside the others and never advised."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.evaluation.trade.accuracy import FAILED, PICTURE, known_accuracy
-from nmpm.evaluation.trade.choice import Choice, Kind
+from nmpm.evaluation.trade.choice import OTHER_SCENES, Choice, Kind
 from nmpm.evaluation.trade.errors import GAIN, Measures
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
@@ -94,6 +94,11 @@ class Point:
     def exact(self) -> bool:
         """Whether it repeats the data: the simulator as it made them."""
         return self.mean("mse") < 1e-14
+
+    @property
+    def of_other_scenes(self) -> bool:
+        """Whether it is a model that was trained on other scenes."""
+        return str(self.settings.get("model", "")).endswith(OTHER_SCENES)
 
 
 def collect_points(

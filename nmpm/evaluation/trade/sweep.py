@@ -18,7 +18,7 @@ from nmpm._support.messages import counted
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.evaluation.gns import TrainedGraph
-from nmpm.evaluation.trade.choice import CPU, Choice, Kind, digest
+from nmpm.evaluation.trade.choice import CPU, OTHER_SCENES, Choice, Kind, digest
 from nmpm.evaluation.trade.errors import Measures
 from nmpm.evaluation.trade.graphs import graph_choices
 from nmpm.evaluation.trade.models import (
@@ -34,9 +34,6 @@ from nmpm.evaluation.trade.timing import Timing
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
 from nmpm.sim import Preset
 from nmpm.sim.config import from_section, section_entries
-
-OTHER_SCENES = " (of other scenes)"
-"""Added to the names of models that were trained on other scenes."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import io
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from nmpm.data.loading.recording import Recording
@@ -132,3 +133,24 @@ def test_the_picture_is_drawn(tmp_path):
     pixels = np.asarray(Image.open(tmp_path / "trade.png").convert("RGB")).astype(int)
     for colour in ((38, 112, 200), (138, 74, 176), (200, 100, 42)):
         assert (np.abs(pixels - colour).sum(-1) < 60).sum() > 50
+
+
+def test_models_of_other_scenes_are_hollow_in_the_picture_and_names_stay_inside(tmp_path, monkeypatch):
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *args, **kwargs: (drawn.append(figure), save(figure, *args, **kwargs))
+    )
+    foreign = point("theirs (of other scenes), openvino", time=0.7, errors=(0.9, 1.1), model="theirs (of other scenes)")
+    floor = point("twin: 6 of 12 substeps", Kind.FLOOR, 4.0, (0.4, 0.6))
+    draw_chart(tmp_path / "trade.png", [*made_up_points(), foreign, floor], made_up_scenes())
+    (figure,) = drawn
+    axes = figure.axes[0]
+    fillings = {line.get_label(): line.lines[0].get_markerfacecolor() for line in axes.containers}
+    assert fillings["emulator of other scenes"] == "none"
+    assert fillings["emulator"] != "none"
+    names = {text.get_text(): text.get_window_extent() for text in axes.texts}
+    assert {"theirs, openvino", "twin: 6 of 12 substeps"} <= set(names)
+    inside = axes.get_window_extent()
+    assert all(inside.x0 <= box.x0 and box.x1 <= inside.x1 for box in names.values())
+    assert Image.open(tmp_path / "trade.png").width == round(figure.bbox.width)  # or else names have other sizes
