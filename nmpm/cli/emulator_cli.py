@@ -14,7 +14,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from nmpm._support.devices import device_name
+from nmpm._support.devices import device_name, find_device
 from nmpm.cli.options import check_folder
 from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
@@ -30,6 +30,7 @@ from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.compatibility import check_same_recipe
 from nmpm.training.module import OVERALL, EmulatorModule
 from nmpm.training.optimization import check_learning_rate
+from nmpm.training.precision import fitting_precision
 from nmpm.training.run_folder import RunFolder
 from nmpm.zoo.registry import load_model
 
@@ -53,6 +54,7 @@ class EmulatorCLI(LightningCLI):
 
     def __init__(self, words: list[str], locks: list[int], **options: Any) -> None:
         self.words, self.locks = words, locks
+        self.replaced_precision = ""
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # (static there)
@@ -106,6 +108,7 @@ class EmulatorCLI(LightningCLI):
                 )
             if config.get("verbose"):
                 config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
+        self._choose_precision(trainer)
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
         for saver in ("checkpoint", "resume"):
             folder = Path(trainer["default_root_dir"]) / "checkpoints"
@@ -113,6 +116,13 @@ class EmulatorCLI(LightningCLI):
         optimizer = config["model"].get("optimizer")
         if isinstance(optimizer, dict) or hasattr(optimizer, "get"):
             check_learning_rate((optimizer.get("init_args") or {}).get("lr"))
+
+    def _choose_precision(self, trainer: Any) -> None:
+        """Compute in float32 on a CPU that has no instructions for a configured bfloat16."""
+        configured = trainer["precision"]
+        if isinstance(configured, str) and trainer["accelerator"] in ("auto", "cpu"):
+            trainer["precision"] = fitting_precision(configured, find_device(trainer["accelerator"]))
+            self.replaced_precision = configured if trainer["precision"] != configured else ""
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
@@ -178,6 +188,11 @@ class EmulatorCLI(LightningCLI):
             f"Data: {self.datamodule.description}. Model: {type(self.model.emulator.recipe.processor).__name__},"
             f" {weights:,} parameters, on {device_name(self.trainer.strategy.root_device)}.\n"
         )
+        if self.replaced_precision:
+            sys.stdout.write(
+                f"Computed in {self.trainer.precision}: this processor has no instructions for bfloat16, without which"
+                f" {self.replaced_precision} takes many times as long.\n"
+            )
         sys.stdout.flush()
 
     def before_validate(self) -> None:

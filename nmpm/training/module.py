@@ -40,6 +40,7 @@ from nmpm.training.compatibility import (
 )
 from nmpm.training.losses import FieldError, TrainingError
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
+from nmpm.training.precision import warn_of_slow_precision
 from nmpm.training.schedules import Schedule
 from nmpm.training.unrolling import Discount, direct, unroll_training
 
@@ -176,6 +177,7 @@ class EmulatorModule(LightningModule):
         if self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
             compile_network(self.emulator.processor, example)
+        warn_of_slow_precision(self.trainer)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """State the format, the digest of the weights, and which optimizer the stored state belongs to."""

@@ -112,8 +112,11 @@ class Training:
         return int(record.get("training", record).get("steps", record.get("trained_steps", 0)))
 
     def precision(self) -> str:
-        """Precision of the training, as its command or else its configuration states it."""
-        return str(self._stated("trainer.precision") or "32-true")
+        """Precision of the training so far, as of its last checkpoint; before, what its configuration states."""
+        record = self._record()
+        found = record.get("training", record)
+        known = found.get("precision") or found.get("trained_precision")
+        return str(known or self._stated("trainer.precision") or "32-true")
 
     def _stated(self, key: str) -> Any:
         """The value of a key of the configuration in its command, or else in its configuration; None in neither."""
