@@ -39,8 +39,8 @@ SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__m
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
     "ensembles", "former_entries", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state",
-    "installed_wheel", "kills", "random_commits", "recipe_pictures", "run_time_knob", "settled_shape", "simulators",
-    "stable_substeps", "stiffness", "trade_tables", "trades", "where_emulation_pays",
+    "installed_wheel", "kills", "precision_steps", "random_commits", "recipe_pictures", "run_time_knob",
+    "settled_shape", "simulators", "stable_substeps", "stiffness", "trade_tables", "trades", "where_emulation_pays",
 }  # fmt: skip
 """These measure the CPU alone: export runtimes, kernels, recipes and batches on one thread, and the simulators."""
 

@@ -74,7 +74,7 @@ _TRAINER = {
     "default_root_dir": "folder of the run's files",
     "max_steps, max_time": "end of the training: steps, or DD:HH:MM:SS, whichever is first",
     "accelerator, devices": "where to compute: auto, cpu, gpu; how many devices, see docs/scaling.md",
-    "precision": "of the network, such as 32-true or bf16-mixed",
+    "precision": "of the network: bf16-mixed, or 32-true, which CPUs without bfloat16 take in its place",
     "val_check_interval": "steps from validation to validation",
     "enable_progress_bar": "false for none",
 }
