@@ -177,6 +177,9 @@ class EmulatorModule(LightningModule):
         if self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
             compile_network(self.emulator.processor, example)
+
+    def on_train_start(self) -> None:
+        """Warn of a precision that the processor has no instructions for."""
         warn_of_slow_precision(self.trainer)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
