@@ -375,6 +375,14 @@ def test_a_diverged_training_goes_back_and_slows_down(tmp_path, trained):
     assert command.count("--model.optimizer.init_args.lr") == 1
 
 
+def test_the_precision_is_what_was_computed_in_and_before_that_what_is_configured(tmp_path):
+    training = Training(tmp_path / "1")
+    training.start(new_training(Dataset("small", "goop.yaml", 1.0)))
+    assert training.precision() == "bf16-mixed"
+    (tmp_path / "1" / "report.json").write_text(json.dumps({"training": {"precision": "32-true"}}))
+    assert training.precision() == "32-true"
+
+
 @pytest.mark.parametrize(("divergences", "done"), [(1, True), (4, False)])
 def test_the_queue_slows_a_diverging_training_down(queue, monkeypatch, capsys, divergences, done):
     path, rates = queue(1 / 3600), []
