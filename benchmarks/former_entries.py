@@ -13,15 +13,15 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
-import numpy as np
 import yaml
 from timing import make_parser
 
 from nmpm.data.simulation_request import same_trajectories
 from nmpm.errors import ConfigError
-from nmpm.evaluation.bootstrap import resampled_means
+from nmpm.evaluation.bootstrap import ratio_interval
 from nmpm.zoo.entries import CARD, read_card
 
 ZOO = Path(__file__).parent.parent / "zoo"
@@ -44,19 +44,6 @@ def former_card(name: str, revision: str) -> dict[str, Any]:
     return card
 
 
-def paired_ratio(before: Sequence[float], now: Sequence[float]) -> tuple[float, float, float]:
-    """Ratio of the mean errors, now over before, with its interval of 95% over scenes.
-
-    Raises:
-        ConfigError: if they are not of as many scenes.
-    """
-    if len(before) != len(now):
-        raise ConfigError(f"{len(before)} test scenes before, {len(now)} now: they cannot be paired.")
-    means = resampled_means(np.asarray([before, now], dtype=np.float64))
-    low, high = np.percentile(means[:, 1] / means[:, 0], (2.5, 97.5))
-    return float(np.mean(now) / np.mean(before)), float(low), float(high)
-
-
 def table_lines(pairs: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Iterator[str]:
     """The table of former and present cards, by name.
 
@@ -68,16 +55,18 @@ def table_lines(pairs: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]]
     for name, (before, now) in pairs.items():
         if not same_trajectories(before.get("simulation", {}), now.get("simulation", {})):
             raise ConfigError(f"{name}: the simulated test scenes are others than before.")
+        former, present = before["per_trajectory"], now["per_trajectory"]
+        if len(former) != len(present):
+            raise ConfigError(f"{name}: {len(former)} test scenes before, {len(present)} now: they cannot be paired.")
         hours = [f"{card['training']['seconds'] / 3600:.1f}" for card in (before, now)]
-        cells = [_cell(before["per_trajectory"], now["per_trajectory"], figure) for figure in FIGURES]
+        cells = [_cell(former, present, figure) for figure in FIGURES]
         yield f"| `{name}` | {' | '.join([*hours, *cells])} |"
 
 
 def _cell(before: Sequence[Mapping[str, float]], now: Sequence[Mapping[str, float]], figure: str) -> str:
-    errors = [[scene[figure] for scene in scenes] for scenes in (before, now)]
-    former, present = (f"{1e3 * float(np.mean(values)):.3g}" for values in errors)
-    ratio, low, high = paired_ratio(*errors)
-    return f"{former} → {present} ({ratio:.2f}: {low:.2f}–{high:.2f})"
+    former, present = ([scene[figure] for scene in scenes] for scenes in (before, now))
+    ratio, low, high = ratio_interval(present, former)
+    return f"{1e3 * mean(former):.3g} → {1e3 * mean(present):.3g} ({ratio:.2f}: {low:.2f}–{high:.2f})"
 
 
 def main(words: Sequence[str] | None = None) -> None:

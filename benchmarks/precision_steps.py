@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import statistics
 import sys
-import time
 from collections.abc import Sequence
+from functools import partial
 
 import torch
-from timing import make_parser
+from timing import clock_for, make_parser, time_alternating
 
 from nmpm._support.devices import device_name
 from nmpm.particles import Window
@@ -38,13 +38,11 @@ def make_window(name: str, batch: int) -> tuple[EmulatorModule, Window]:
     return module, one.map(lambda values: values.repeat(batch, *[1] * (values.ndim - 1)))
 
 
-def time_step(module: EmulatorModule, window: Window, mixed: bool) -> float:
-    """CPU seconds of a step's error and gradients."""
-    start = time.process_time()
+def take_step(module: EmulatorModule, window: Window, mixed: bool) -> None:
+    """The error and the gradients of a step."""
     with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
         error = module.training_step(window, 0)
     error.backward()
-    return time.process_time() - start
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -60,9 +58,10 @@ def main(words: Sequence[str] | None = None) -> None:
     sys.stdout.write(f"{device_name(cpu)}, which {known} instructions for bfloat16\n")
     for name in chosen.names:
         module, window = make_window(name, chosen.batch)
-        rounds = [[time_step(module, window, mixed) for mixed in (False, True)] for _ in range(chosen.rounds + 1)][1:]
-        float32, mixed = (statistics.median(column) for column in zip(*rounds, strict=True))
-        ratio = statistics.median(after / before for before, after in rounds)
+        steps = {mixed: partial(take_step, module, window, mixed) for mixed in (False, True)}
+        seconds = time_alternating(steps, chosen.rounds, clock_for(cpu), warm_up=1)
+        float32, mixed = (statistics.median(seconds[key]) for key in (False, True))
+        ratio = statistics.median(after / before for before, after in zip(seconds[False], seconds[True], strict=True))
         sys.stdout.write(f"{name}: float32 {float32:.3f} s, mixed bfloat16 {mixed:.3f} s, {ratio:.2f} times\n")
 
 

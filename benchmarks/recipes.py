@@ -43,7 +43,7 @@ from nmpm._support.atomic import atomic_write
 from nmpm.data.catalog import dataset_home
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Emulator, rollout
-from nmpm.evaluation.bootstrap import resampled_means
+from nmpm.evaluation.bootstrap import ratio_interval
 from nmpm.evaluation.stress.settling import compare_shapes
 from nmpm.evaluation.stress.subject import Subject, simulate_window
 from nmpm.metrics import MSE, earth_mover_of_materials
@@ -192,14 +192,6 @@ def time_runs(runs: Mapping[Path, Run], rounds: int) -> dict[Path, float]:
     return {path: 1e3 * statistics.median(values) / TIMED_FRAMES for path, values in seconds.items()}
 
 
-def ratio_interval(ours: Sequence[float], theirs: Sequence[float]) -> tuple[float, float, float]:
-    """Ratio of means over the same scenes, and the ends of its 95% interval by a paired bootstrap."""
-    values = np.array([ours, theirs])
-    means = resampled_means(values, resamples=RESAMPLES)
-    low, high = np.percentile(means[:, 0] / means[:, 1], [2.5, 97.5])
-    return float(values[0].mean() / values[1].mean()), float(low), float(high)
-
-
 def mean_over_seeds(rows: Sequence[Mapping[str, Any]], metric: str) -> dict[str, Any]:
     """Mean of each figure of a metric over runs, for lists element by element; empty where a run lacks the metric."""
     found = [row[metric] for row in rows if metric in row]
@@ -259,7 +251,7 @@ def format_error(ours: Sequence[float] | None, theirs: Sequence[float] | None) -
     mean = f"{1e3 * statistics.fmean(ours):.3g}"
     if theirs is None:
         return mean
-    ratio, low, high = ratio_interval(ours, theirs)
+    ratio, low, high = ratio_interval(ours, theirs, RESAMPLES)
     return f"{mean} ({ratio:.2f}: {low:.2f}–{high:.2f})"
 
 

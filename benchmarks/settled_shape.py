@@ -25,7 +25,7 @@ from timing import make_parser, write_json
 
 from nmpm.data.progress import progress_bar
 from nmpm.emulator import Emulator
-from nmpm.evaluation.bootstrap import resampled_means
+from nmpm.evaluation.bootstrap import ratio_interval
 from nmpm.evaluation.stress.settling import Shapes, predicted_shapes, recorded_shapes
 from nmpm.evaluation.stress.subject import Subject, simulate_beside
 from nmpm.sim import load_preset
@@ -68,9 +68,7 @@ def as_array(shapes: Shapes, frames: Sequence[int]) -> Array:
 
 def ratio(ours: Array, theirs: Array) -> str:
     """Ratio of the means of measures (scenes,), and its 95% interval by a paired bootstrap."""
-    means = resampled_means(np.array([ours, theirs]), resamples=10_000)
-    low, high = np.percentile(means[:, 0] / means[:, 1], [2.5, 97.5])
-    return f"{ours.mean() / theirs.mean():.2f} ({low:.2f}–{high:.2f})"
+    return "{:.2f} ({:.2f}–{:.2f})".format(*ratio_interval(list(ours), list(theirs), resamples=10_000))
 
 
 def print_table(measured: dict[str, Array], frames: Sequence[int]) -> None:

@@ -10,7 +10,7 @@ Nothing is measured here.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -84,22 +84,22 @@ def group_choices(rows: Iterable[Mapping[str, str]]) -> list[Choice]:
 
 
 @cache
-def zoo_weights() -> Mapping[str, str]:
-    """Digest of the weights of each of the zoo's models now."""
-    return {name: short_digest(Zoo.load(name).emulator.state_dict()) for name in Zoo.list()}
+def zoo_digest(name: str) -> str | None:
+    """Digest of the weights of the zoo's model of that name now; None if there is none."""
+    return short_digest(Zoo.load(name).emulator.state_dict()) if name in Zoo.list() else None
 
 
-def weights_line(choices: Iterable[Choice], zoo: Mapping[str, str]) -> str:
+def weights_line(choices: Iterable[Choice], now: Callable[[str], str | None] = zoo_digest) -> str:
     """Which weights were measured, and whether the zoo still has them; empty where the table does not say.
 
     Args:
         choices: Of a table.
-        zoo: Digests of the zoo's weights, by the models' names.
+        now: Digest of the zoo's weights by a model's name, None for one that it does not have.
     """
     rows = [choice.row for choice in choices]
     found = {row["model"].removesuffix(OTHER_SCENES): row["weights"] for row in rows if row.get("weights")}
     parts = [
-        f"{model} {digest}" + ("" if zoo.get(model, digest) == digest else " (the zoo has others by now)")
+        f"{model} {digest}" + ("" if now(model) in (None, digest) else " (the zoo has others by now)")
         for model, digest in sorted(found.items())
     ]
     return f"Weights: {', '.join(parts)}." if parts else ""
@@ -115,7 +115,7 @@ def section_lines(choices: Sequence[Choice]) -> Iterator[str]:
         f"{first['threads']} thread, {first['clock']}.\n"
         f"[Picture](trade/{first['dataset']}/trade.png), [page](trade/{first['dataset']}/trade.html).\n"
     )
-    if weights := weights_line(choices, zoo_weights()):
+    if weights := weights_line(choices):
         yield f"{weights}\n"
     yield " | ".join(["| choice", "ms", "time", *(FORMS[name][0] for name in shown)]) + " |"
     yield "|---|" + "---:|" * (2 + len(shown))

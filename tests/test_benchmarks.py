@@ -500,9 +500,9 @@ def test_tables_name_the_weights_that_were_measured_and_those_that_the_zoo_has_r
         {"model": "goop/fast (of other scenes)", "weights": "bbb"},
         {"model": "runs-mine", "weights": "ccc"},
     ]
-    line = weights_line([Choice(row, {}) for row in rows], {"goop": "aaa", "goop/fast": "ddd"})
+    line = weights_line([Choice(row, {}) for row in rows], {"goop": "aaa", "goop/fast": "ddd"}.get)
     assert line == "Weights: goop aaa, goop/fast bbb (the zoo has others by now), runs-mine ccc."
-    assert weights_line([Choice({"model": "goop"}, {})], {"goop": "aaa"}) == ""
+    assert weights_line([Choice({"model": "goop"}, {})], {"goop": "aaa"}.get) == ""
 
 
 # ---- former entries of the zoo

@@ -30,3 +30,13 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
     """Bootstrap interval of 95% of the mean of one figure over scenes; the value itself where there is one scene."""
     low, high = intervals(np.asarray([values], dtype=np.float64))[0]
     return float(low), float(high)
+
+
+def ratio_interval(
+    ours: Sequence[float], theirs: Sequence[float], resamples: int = RESAMPLES
+) -> tuple[float, float, float]:
+    """Ratio of the means of two figures over the same scenes, and its interval of 95%, paired: both resampled alike."""
+    values = np.array([ours, theirs])
+    means = resampled_means(values, resamples=resamples)
+    low, high = np.percentile(means[:, 0] / means[:, 1], _LEVELS)
+    return float(values[0].mean() / values[1].mean()), float(low), float(high)

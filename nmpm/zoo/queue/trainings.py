@@ -103,20 +103,20 @@ class Training:
 
     def seconds(self) -> float:
         """Seconds of training so far, as of its last checkpoint."""
-        record = self._record()
-        return float(record.get("training", record).get("seconds", record.get("trained_seconds", 0.0)))
+        return float(self._trained("seconds") or 0.0)
 
     def steps(self) -> int:
         """Steps of training so far, as of its last checkpoint."""
-        record = self._record()
-        return int(record.get("training", record).get("steps", record.get("trained_steps", 0)))
+        return int(self._trained("steps") or 0)
 
     def precision(self) -> str:
         """Precision of the training so far, as of its last checkpoint; before, what its configuration states."""
+        return str(self._trained("precision") or self._stated("trainer.precision") or "32-true")
+
+    def _trained(self, figure: str) -> Any:
+        """What the report states of the training, or before there is one the last checkpoint; None in neither."""
         record = self._record()
-        found = record.get("training", record)
-        known = found.get("precision") or found.get("trained_precision")
-        return str(known or self._stated("trainer.precision") or "32-true")
+        return record.get("training", record).get(figure, record.get(f"trained_{figure}"))
 
     def _stated(self, key: str) -> Any:
         """The value of a key of the configuration in its command, or else in its configuration; None in neither."""
