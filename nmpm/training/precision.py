@@ -15,7 +15,7 @@ def computes_bfloat16(device: torch.device) -> bool:
     """Whether a device computes convolutions in bfloat16 by instructions for it.
 
     A CPU does with AVX-512 or Arm's bfloat16, by oneDNN. Without, torch's own loops take over, in which a training step
-    takes eight to nine times as long as in float32 (`benchmarks/precision_steps.py`).
+    takes eight to ten times as long as in float32 (`benchmarks/precision_steps.py`).
     """
     if device.type != "cpu":
         return True
