@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-_DISTANCES = (14, 23, 36, 55, 78, 109)  # of a name's edge from its point, pixels
+_DISTANCES = (14, 23, 36, 55, 78, 109, 150)  # of a name's edge from its point, pixels
 _DIRECTIONS = tuple(math.radians(degrees) for degrees in (30, 330, 150, 210, 0, 180, 60, 300, 120, 240, 90, 270))
 _GAP = 4  # between a line and its name
 _STOPS = 16  # places along a line
