@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +24,22 @@ GOOP = load_preset("goop")
 TINY = dataclasses.replace(GOOP, frames=30, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
 COUNTS = {"train": 4, "valid": 1, "test": 2}
 
-KILLED = """
+SIMULATE = """
 import json, sys
 from pathlib import Path
 from nmpm.data.generate import generate
 from nmpm.sim import preset_from_dict
-generate(preset_from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), json.loads(sys.argv[3]), workers=2)
+generate(preset_from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), json.loads(sys.argv[3]), seed=5, workers=2)
 """
 
 
 def fingerprints(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
+
+
+def start_simulation(folder: Path, counts: dict[str, int]) -> subprocess.Popen[bytes]:
+    arguments = [json.dumps(TINY.to_dict()), str(folder), json.dumps(counts)]
+    return subprocess.Popen([sys.executable, "-c", SIMULATE, *arguments], stderr=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="module")
@@ -124,8 +128,7 @@ def test_a_complete_dataset_is_not_rewritten(made):
 def test_a_killed_simulation_resumes_with_the_same_bytes(tmp_path):
     counts = {"train": 60, "valid": 1, "test": 1}
     killed = tmp_path / "killed"
-    arguments = [json.dumps(TINY.to_dict()), str(killed), json.dumps(counts)]
-    process = subprocess.Popen([sys.executable, "-c", KILLED, *arguments], stderr=subprocess.DEVNULL)
+    process = start_simulation(killed, counts)
     deadline = time.monotonic() + 60
     while len(list(killed.glob(".parts/*.npz"))) < 3 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -136,8 +139,8 @@ def test_a_killed_simulation_resumes_with_the_same_bytes(tmp_path):
     assert 3 <= len(finished) < 60
     assert not (killed / "metadata.json").exists()
 
-    generate(TINY, killed, counts)
-    generate(TINY, tmp_path / "whole", counts)
+    generate(TINY, killed, counts, seed=5)
+    generate(TINY, tmp_path / "whole", counts, seed=5)
     assert fingerprints(killed) == fingerprints(tmp_path / "whole")
 
 
@@ -218,9 +221,9 @@ def test_a_preset_that_is_always_unstable_is_an_error(tmp_path, monkeypatch):
         generate(TINY, tmp_path, COUNTS, seed=5)
 
 
-def test_concurrent_calls_give_the_same_bytes(made, tmp_path):
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(lambda _: generate(TINY, tmp_path, COUNTS, seed=5, workers=1), range(2)))
+def test_concurrent_processes_give_the_same_bytes(made, tmp_path):
+    processes = [start_simulation(tmp_path, COUNTS) for _ in range(2)]
+    assert [process.wait(timeout=120) for process in processes] == [0, 0]
     assert fingerprints(tmp_path) == fingerprints(made)
 
 

@@ -2,8 +2,10 @@
 
 import dataclasses
 import hashlib
+import json
 import shutil
-from concurrent.futures import ThreadPoolExecutor
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,17 @@ from nmpm.sim import load_preset
 GOOP = load_preset("goop")
 TINY = dataclasses.replace(GOOP, frames=10, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
 COUNTS = {"train": 4, "valid": 1, "test": 2}
+
+SIMULATE = """
+import json, sys
+from pathlib import Path
+from nmpm.data.generate import generate_shard
+from nmpm.data.shard import Shard
+from nmpm.sim import preset_from_dict
+preset, folder, counts, index, count = sys.argv[1:]
+shard = Shard(int(index), int(count))
+print(generate_shard(preset_from_dict(json.loads(preset)), Path(folder), json.loads(counts), shard, seed=5, workers=1))
+"""
 
 
 def fingerprints(folder: Path) -> dict[str, str]:
@@ -51,8 +64,9 @@ def test_the_last_shard_completes_the_bytes_of_one_process(whole, tmp_path):
 
 
 def test_shards_at_the_same_time_give_the_same_bytes(whole, tmp_path):
-    with ThreadPoolExecutor(3) as pool:
-        missing = list(pool.map(lambda index: run_shard(tmp_path, index, 3), (1, 2, 3)))
+    arguments = [sys.executable, "-c", SIMULATE, json.dumps(TINY.to_dict()), str(tmp_path), json.dumps(COUNTS)]
+    processes = [subprocess.Popen([*arguments, str(index), "3"], stdout=subprocess.PIPE) for index in (1, 2, 3)]
+    missing = [int(process.communicate(timeout=120)[0]) for process in processes]
     assert 0 in missing
     assert fingerprints(tmp_path) == fingerprints(whole)
 
