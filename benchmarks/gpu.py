@@ -1,7 +1,8 @@
 """Run all that needs a GPU with one command: a training, the tests, the benchmarks, the zoo's models.
 
 python benchmarks/gpu.py --out runs/gpu
-python benchmarks/gpu.py --out runs/gpu --dry-run       print the commands
+python benchmarks/gpu.py --out runs/gpu --dry-run            print the commands
+python benchmarks/gpu.py --only tests training_step zoo      some of the steps
 
 Each step writes its output to OUT/STEP.log, whose last line is the exit status. Run the same command again to continue:
 steps that ended with status 0 are skipped. Exits with 1 if a step fails; the others run nevertheless.
@@ -13,15 +14,18 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from timing import make_parser
 
 from nmpm._support.devices import DEVICES, find_device
+from nmpm.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parent.parent
 STATUS = "exit status "
+TESTS = ("tests/test_on_device.py", "tests/processors", "tests/transfer")
+"""What `--device` changes."""
 LARGE_GRIDS = ("64x64", "256x256", "1024x1024", "64x64x64", "128x128x128")
 
 
@@ -32,7 +36,7 @@ def list_steps(device: str, out: Path) -> dict[str, list[str]]:
     ablation = ["benchmarks/sweeps/parts.yaml", "--minutes", "3", "--out", str(out / "parts")]
     return {
         "fit": _python("-m", "nmpm", "fit", "--config", "goop.yaml"),
-        "tests": _python("-m", "pytest", "--device", device),
+        "tests": _python("-m", "pytest", "--device", device, *TESTS),
         "training_step": _benchmark("training_step", device, "--batch", "128", "--rounds", "20"),
         "rollout_call": _benchmark("rollout_call", device, "--batch", "128"),
         "rollout_call_one_scene": _benchmark("rollout_call", device),
@@ -44,8 +48,20 @@ def list_steps(device: str, out: Path) -> dict[str, list[str]]:
         "compare": _python("-m", "nmpm", *compared, "--wider", "2", "--device", device, "--out", str(out / "compare")),
         "streaming": _python("benchmarks/streaming.py"),
         "ablation": _benchmark("ablation", device, *ablation),
+        "zoo_speed": _python("-m", "nmpm", "zoo", "refresh", "--root", "zoo", "--measure", "speed", "--device", device),
         "zoo": _benchmark("zoo_on_device", device),
     }
+
+
+def select_steps(steps: Mapping[str, list[str]], names: Sequence[str] | None) -> dict[str, list[str]]:
+    """The steps of these names in their own order; all where no names are given.
+
+    Raises:
+        ConfigError: if there is no step of a name.
+    """
+    if unknown := sorted(set(names or ()) - set(steps)):
+        raise ConfigError(f"There is no step {', '.join(unknown)}; there are {', '.join(steps)}.")
+    return {name: command for name, command in steps.items() if not names or name in names}
 
 
 def _python(*words: str) -> list[str]:
@@ -111,10 +127,11 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the logs (default: runs/gpu)")
     parser.add_argument("--device", choices=DEVICES, default="cuda")
+    parser.add_argument("--only", nargs="+", metavar="STEP", help="run these steps (default: all)")
     parser.add_argument("--dry-run", action="store_true", help="print the commands and run nothing")
     chosen = parser.parse_args()
     out = chosen.out.resolve()
-    steps = list_steps(chosen.device, out)
+    steps = select_steps(list_steps(chosen.device, out), chosen.only)
     if chosen.dry_run:
         sys.stdout.write("".join(f"{name}: {shlex.join(command)}\n" for name, command in steps.items()))
         return

@@ -10,7 +10,10 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from nmpm._support.devices import find_device
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
+from nmpm.errors import ConfigError
+from nmpm.testing import ProcessorContract, TransferContract
 
 # The same examples in every run, however slow the machine; `pytest --hypothesis-profile default` looks for others.
 settings.register_profile("repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -25,16 +28,21 @@ CHROMIUM_OPTIONS = (
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", default="cpu", help="where tests that take the fixture `device` run, e.g. cuda")
+    parser.addoption("--device", default="cpu", help="where contracts and tests that take `device` run, e.g. cuda")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    try:
+        chosen = find_device(config.getoption("--device"))
+    except ConfigError as error:
+        raise pytest.UsageError(f"--device: {error}") from error
+    ProcessorContract.device = TransferContract.device = str(chosen)
 
 
 @pytest.fixture(scope="session")
 def device(pytestconfig: pytest.Config) -> torch.device:
-    """Where contracts of emulators, transfers and processors are tested."""
-    chosen = torch.device(pytestconfig.getoption("--device"))
-    if chosen.type == "cuda" and not torch.cuda.is_available():
-        pytest.skip("--device cuda: this machine has no GPU that torch can use")
-    return chosen
+    """The device of `--device`."""
+    return find_device(pytestconfig.getoption("--device"))
 
 
 @pytest.fixture(scope="session")

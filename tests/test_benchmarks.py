@@ -274,11 +274,18 @@ def test_gpu_dry_run_prints_all_steps_in_order_and_runs_nothing(tmp_path):
     assert list(steps)[:2] == ["fit", "tests"]
     assert list(steps)[-1] == "zoo"
     assert steps["fit"].endswith("nmpm fit --config goop.yaml")
-    assert steps["tests"].endswith("pytest --device cuda")
+    assert "pytest --device cuda tests/test_on_device.py" in steps["tests"]
     assert not (tmp_path / "logs").exists()
     started = {word for step in steps.values() for word in shlex.split(step) if word.startswith("benchmarks/")}
     own_data = {"seen_scenes"}  # given by the user as a folder
     assert {f"benchmarks/{name}.py" for name in set(SCRIPTS) - WITHOUT_DEVICE - own_data - {"gpu"}} <= started
+
+
+def test_gpu_runs_only_the_steps_that_are_named(tmp_path):
+    lines = run_script("gpu", "--out", str(tmp_path), "--dry-run", "--only", "zoo", "fit").splitlines()
+    assert [line.split(": ")[0] for line in lines] == ["fit", "zoo"]
+    with pytest.raises(ConfigError, match="There is no step zou; there are fit, tests"):
+        run_script("gpu", "--dry-run", "--only", "zou")
 
 
 class ParsedError(Exception):

@@ -49,6 +49,11 @@ def device_name(device: torch.device) -> str:
     return device.type
 
 
+def join_hardware(*names: str) -> str:
+    """Results of `device_name`, or of this function, as one text that names each device once, in their order."""
+    return "; ".join(dict.fromkeys(part for name in names for part in name.split("; ") if part))
+
+
 def same_hardware(one: str, other: str) -> bool:
     """Whether two results of `device_name` name the same; earlier versions of it wrote "1 threads"."""
     return one.replace(", 1 threads", ", 1 thread") == other.replace(", 1 threads", ", 1 thread")

@@ -26,9 +26,11 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--root", type=Path, help="look the name up in this zoo's folder alone")
 
 
-def add_device_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--device`."""
-    parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda or mps; cuda:1 for the second GPU")
+def add_device_option(parser: argparse.ArgumentParser, purpose: str = "") -> None:
+    """Add the option `--device`; `purpose` begins its help."""
+    parser.add_argument(
+        "--device", default="cpu", help=f"{purpose}auto, cpu (default), cuda or mps; cuda:1 for the second GPU"
+    )
 
 
 def add_runtime_option(parser: argparse.ArgumentParser) -> None:

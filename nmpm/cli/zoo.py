@@ -83,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     refresh.add_argument(
         "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
     )
+    add_device_option(refresh, "where the speed is measured: ")
     push = add_command("push", "upload a model to the Hugging Face hub")
     push.add_argument("name")
     push.add_argument("repository", help="owner/repository, created if missing")
@@ -190,11 +191,12 @@ def _refresh(chosen: argparse.Namespace) -> None:
         raise ConfigError("--data is the folder of one model's data: give the model's NAME too.")
     if chosen.failures is not None and chosen.name is None:
         raise ConfigError("--failures is about one model: give the model's NAME too.")
+    check_device(chosen.device)
     root = user_zoo() if chosen.root is None else chosen.root
     for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
         if chosen.half:
             halve(Zoo.folder(name, root))
-        refresh(Zoo.folder(name, root), chosen.measure, chosen.data, chosen.failures)
+        refresh(Zoo.folder(name, root), chosen.measure, chosen.data, chosen.failures, chosen.device)
     sys.stdout.write(f"wrote {write_index(root)}\n")
 
 

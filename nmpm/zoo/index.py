@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from nmpm._support.atomic import atomic_write
@@ -48,7 +49,13 @@ def write_index(root: Path) -> Path:
     return path
 
 
-def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None, failures: str | None = None) -> None:
+def refresh(
+    folder: Path,
+    measures: Sequence[str] = (),
+    data: Path | None = None,
+    failures: str | None = None,
+    device: torch.device | str = "cpu",
+) -> None:
     """Rewrite what is derived from an entry's card and weights: lifecycle, README and chart.
 
     A golden rollout is added where the card has none; an existing one is kept, as replacing it would hide a change
@@ -61,10 +68,11 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
         failures: What the entry's pictures show to be wrong in its rollouts, in sentences, for the card; empty to state
             nothing, None to leave what the card states. New weights make a new card, without it: their pictures have
             to be looked at again.
+        device: Where the speed is measured, as for `Zoo.load`; everything else is measured on the CPU.
 
     Raises:
         ZooError: if a file is missing or damaged, a measure is unknown, or the weights are replaced meanwhile.
-        ConfigError: if what is to be measured needs a simulator or data that are not there.
+        ConfigError: if what is to be measured needs a simulator, data or a device that are not there.
     """
     unknown = sorted(set(measures) - set(MEASURES))
     if unknown:
@@ -78,7 +86,8 @@ def refresh(folder: Path, measures: Sequence[str] = (), data: Path | None = None
         card |= {"failures": " ".join(failures.split())} if failures.strip() else {}
     write_card(folder, card)
     for name in measures:
-        facts, now = MEASURES[name](model, folder, data), read_card(folder)
+        measured = model.to(device) if name == "speed" else model
+        facts, now = MEASURES[name](measured, folder, data), read_card(folder)
         if now.get("sha256") != card.get("sha256"):
             raise ZooError(f"{folder}: its weights were replaced while {name} was measured; measure it again.")
         write_card(folder, now | facts)

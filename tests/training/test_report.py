@@ -6,6 +6,18 @@ import torch
 from nmpm._support.devices import device_name
 from nmpm.training.callbacks.report import ReportWriter
 
+EMULATOR = SimpleNamespace(frames=8, parameters=lambda: iter(()))
+
+
+def trainer_on(device: str) -> SimpleNamespace:
+    return SimpleNamespace(
+        strategy=SimpleNamespace(root_device=torch.device(device)),
+        datamodule=SimpleNamespace(description="made up"),
+        callback_metrics={"test/mse": torch.tensor(1.0)},
+        precision="32-true",
+        world_size=1,
+    )
+
 
 def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -22,13 +34,19 @@ def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
 def test_a_report_names_the_device_that_the_trainer_used(monkeypatch, device, name):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
-    emulator = SimpleNamespace(frames=8, parameters=lambda: iter(()))
-    trainer = SimpleNamespace(
-        strategy=SimpleNamespace(root_device=torch.device(device)),
-        datamodule=SimpleNamespace(description="made up"),
-        callback_metrics={"test/mse": torch.tensor(1.0)},
-        precision="32-true",
-        world_size=1,
-    )
-    figures = ReportWriter()._figures(trainer, SimpleNamespace(emulator=emulator, unroll=2), {})
+    figures = ReportWriter()._figures(trainer_on(device), SimpleNamespace(emulator=EMULATOR, unroll=2), {})
     assert name in figures["training"]["hardware"]
+
+
+def test_a_report_names_all_that_a_training_ran_on_and_not_what_tests_it(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
+    written = ReportWriter()
+    for device in ("cuda:0", "cuda:1", "cuda:0"):
+        writer = ReportWriter()
+        writer.load_state_dict(written.state_dict())
+        writer.on_train_start(trainer_on(device), None)
+        written = writer
+    tested = ReportWriter()
+    tested.load_state_dict(written.state_dict())
+    figures = tested._figures(trainer_on("cpu"), SimpleNamespace(emulator=EMULATOR, unroll=2), {})
+    assert figures["training"]["hardware"] == "GPU of cuda:0; GPU of cuda:1"

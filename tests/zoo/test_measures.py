@@ -122,6 +122,18 @@ def test_stress_tests_held_and_free_are_counted_and_settling_is_simulated_once(g
     assert card["stress_free"] == {"size": "quick", "passed": 0, "failed": free}
 
 
+def test_the_speed_is_measured_on_the_device_that_is_given(goop, monkeypatch, capsys):
+    places = []
+    monkeypatch.setattr("nmpm.zoo.pretrained.Pretrained.to", lambda model, device: places.append(device) or model)
+    refresh(goop, ["speed"], device="cuda")
+    assert places == ["cuda"]
+    places.clear()
+    command = ["zoo", "refresh", "goop", "--measure", "speed", "--root", str(goop.parent)]
+    assert main([*command, "--device", "cuda:77"]) == 1
+    assert "has no device 'cuda:77'" in capsys.readouterr().err
+    assert not places
+
+
 def test_invariants_are_tested_without_the_simulator(goop, monkeypatch):
     presets = []
 

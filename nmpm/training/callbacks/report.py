@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.collectives import all_gather
-from nmpm._support.devices import device_name
+from nmpm._support.devices import device_name, join_hardware
 from nmpm._support.version import __version__
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.evaluation.figures import PREDICTORS, figure_names, table_row
@@ -39,6 +39,7 @@ class ReportWriter(Callback):
         self.trained_seconds = 0.0
         self.trained_steps = 0
         self.trained_precision = ""
+        self.trained_hardware = ""
         self.curve: list[list[float]] = []  # seconds of training, steps, MSE and overall error of each validation
         self._since: float | None = None
         self._trained = False
@@ -53,6 +54,7 @@ class ReportWriter(Callback):
             "trained_seconds": self._elapsed(),
             "trained_steps": self.trained_steps,
             "trained_precision": self.trained_precision,
+            "trained_hardware": self.trained_hardware,
             "curve": list(self.curve),
         }
 
@@ -62,11 +64,13 @@ class ReportWriter(Callback):
         self.trained_seconds = float(state_dict["trained_seconds"])
         self.trained_steps = int(state_dict.get("trained_steps", 0))
         self.trained_precision = str(state_dict.get("trained_precision", ""))
+        self.trained_hardware = str(state_dict.get("trained_hardware", ""))
         self.curve = list(state_dict.get("curve", []))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self._since, self._trained = time.monotonic(), True
         self.trained_precision = str(trainer.precision)
+        self.trained_hardware = join_hardware(self.trained_hardware, device_name(trainer.strategy.root_device))
 
     def on_train_batch_end(
         self,
@@ -139,7 +143,7 @@ class ReportWriter(Callback):
                 "seconds": round(self.trained_seconds, 1),
                 "precision": self.trained_precision or str(trainer.precision),
                 "devices": trainer.world_size,
-                "hardware": device_name(trainer.strategy.root_device),
+                "hardware": self.trained_hardware or device_name(trainer.strategy.root_device),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "curve": self.curve,

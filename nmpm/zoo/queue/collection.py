@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.devices import join_hardware
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.simulation_request import SimulationRequest, same_trajectories
@@ -128,6 +129,7 @@ def _merged(report: dict[str, Any], history: History) -> dict[str, Any]:
         "steps": sum(stage.steps() for stage in until),
         "seconds": round(sum(stage.seconds() for stage in until), 1),
         "precision": best.precision(),
+        "hardware": join_hardware(*(stage.hardware() for stage in until)) or report["training"]["hardware"],
     }
     return report | {"training": training, "curve": history.curve()}
 

@@ -51,3 +51,7 @@ class Published:
     def steps(self) -> int:
         """Steps of training."""
         return int(self.card.get("training", {}).get("steps", 0))
+
+    def hardware(self) -> str:
+        """What it was trained on."""
+        return str(self.card.get("training", {}).get("hardware", ""))

@@ -113,6 +113,10 @@ class Training:
         """Precision of the training so far, as of its last checkpoint; before, what its configuration states."""
         return str(self._trained("precision") or self._stated("trainer.precision") or "32-true")
 
+    def hardware(self) -> str:
+        """What it was trained on so far, as of its last checkpoint; empty before, or where an earlier version ran."""
+        return str(self._trained("hardware") or "")
+
     def _trained(self, figure: str) -> Any:
         """What the report states of the training, or before there is one the last checkpoint; None in neither."""
         record = self._record()
