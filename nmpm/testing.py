@@ -25,6 +25,8 @@ from nmpm.transfer import Transfer
 class ProcessorContract:
     """What every processor promises.
 
+    Tolerances are those of float32: on an NVIDIA GPU set `torch.backends.cudnn.allow_tf32 = False`.
+
     Args:
         recipe: The processor under test.
         shapes: Grids that it takes, among them odd and elongated ones.

@@ -37,6 +37,8 @@ def pytest_configure(config: pytest.Config) -> None:
     except ConfigError as error:
         raise pytest.UsageError(f"--device: {error}") from error
     ProcessorContract.device = TransferContract.device = str(chosen)
+    if chosen.type == "cuda":
+        torch.backends.cudnn.allow_tf32 = False  # tolerances are those of float32
 
 
 @pytest.fixture(scope="session")
