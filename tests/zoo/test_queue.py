@@ -249,6 +249,20 @@ def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
     assert Zoo.card("small", "zoo")["about"] == about
 
 
+def test_few_validations_do_not_replace_an_entry_of_many(queue, capsys):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    folder = Path("zoo/small")
+    card = yaml.safe_load((folder / "card.yaml").read_text())
+    assert len(card["curve"]) < 3
+    bad = [[float(at), at, 1e9] for at in range(1, 4)]
+    (folder / "card.yaml").write_text(yaml.safe_dump(card | {"curve": bad}))
+    capsys.readouterr()
+    assert train(path, "--collect") == 0
+    assert f"has too few validations to be compared, {len(card['curve'])} of 3" in capsys.readouterr().out
+    assert Zoo.card("small", "zoo")["curve"] == bad
+
+
 def test_facts_of_the_simulator_stay_as_long_as_the_simulation_does():
     former = {"simulation": {"seed": 0}, "twin": {"mse": 0.1}, "floor": {"mse": 0.01}, "quality": {"emd": 1.0}}
     assert simulator_facts(former, {"simulation": {"seed": 0}}) == {"twin": {"mse": 0.1}, "floor": {"mse": 0.01}}

@@ -20,6 +20,7 @@ LUCKY = [[float(at), at, 10 * error, error] for at, error in enumerate((0.9, 0.3
         ([STEADY, []], [0.05, math.inf]),
         ([[], EARLIER], [math.inf, 0.2]),
         ([LUCKY], [0.4]),
+        ([[*LUCKY, [8.0, 8, 1.0, 0.1]]], [0.3]),  # at the end, too, a low one counts for a third
     ],
 )
 def test_curves_are_compared_where_neighbouring_validations_are_lowest_by_what_all_state(curves, expected):

@@ -21,7 +21,7 @@ from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.publish import replace
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.trainings import History, Training
-from nmpm.zoo.queue.validations import Curve, lowest_errors
+from nmpm.zoo.queue.validations import GROUP, Curve, lowest_errors
 from nmpm.zoo.registry import Zoo
 from nmpm.zoo.runs import BEST
 
@@ -34,8 +34,9 @@ Command = Callable[[list[str]], int]
 def collect(history: History, zoo: Path, run: Command) -> str:
     """Test a dataset's best weights and make its entry of them, also while its training goes on.
 
-    An entry whose validation error is lower is kept, so that the test split chooses nothing. Only for an entry whose
-    card has no validation errors, from before the queue, those of the test are compared.
+    An entry whose validation error is lower is kept, so that the test split chooses nothing; so is one that has more
+    validations than a training whose few may be low by chance. Only for an entry whose card has no validation errors,
+    from before the queue, those of the test are compared.
 
     Args:
         history: Of the dataset.
@@ -153,8 +154,11 @@ def _reason_to_keep(name: str, zoo: Path, validations: Curve, test: float) -> st
     """Why the published entry is better than weights with these errors; None if it is not, or there is none."""
     try:
         card = Zoo.card(name, zoo)
-        split, (published, found) = "validation", lowest_errors(card.get("curve", []), validations)
-        if not card.get("curve"):
+        curve = card.get("curve", [])
+        if len(validations) < min(GROUP, len(curve)):
+            return f"the training has too few validations to be compared, {len(validations)} of {GROUP}"
+        split, (published, found) = "validation", lowest_errors(curve, validations)
+        if not curve:
             split, found, published = "test", test, float(card["test"]["mse"])
     except (ZooError, KeyError, TypeError, ValueError, IndexError):
         return None

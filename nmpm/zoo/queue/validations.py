@@ -1,8 +1,8 @@
 """Validations of trainings: points of seconds, steps, MSE and overall error (`nmpm.metrics.overall_error`).
 
 Points of earlier versions end with the MSE. Weights are compared by the overall error where all curves state it. As
-validations have few scenes, so that a single one may be low by chance, an error is the mean of a validation and its
-neighbours.
+validations have few scenes, so that a single one may be low by chance, an error is the mean of `GROUP` validations in a
+row.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 Curve = Sequence[Sequence[float]]
 
+GROUP = 3
 _MSE, _OVERALL = 2, 3
 
 
@@ -32,7 +33,7 @@ def ends_lowest(curve: Curve) -> bool:
     """
     points, column = _measured(curve)
     single = min(range(len(points)), key=lambda at: points[at][column])
-    return _mean(points[-3:], column) < _mean(_around(points, single), column)
+    return _mean(points[-GROUP:], column) < _mean(_around(points, single), column)
 
 
 def _lowest(curve: Curve) -> list[float]:
@@ -44,8 +45,9 @@ def _lowest(curve: Curve) -> list[float]:
 
 
 def _around(points: Curve, at: int) -> Curve:
-    """A point and its neighbours."""
-    return points[max(at - 1, 0) : at + 2]
+    """The group with a point in its middle, or the first or last one; all points where they are fewer."""
+    start = max(0, min(at - GROUP // 2, len(points) - GROUP))
+    return points[start : start + GROUP]
 
 
 def _mean(points: Curve, column: int) -> float:
