@@ -17,6 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from nmpm.data.compression import FILTERS, write_compressed
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5, writable_hdf5
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
@@ -77,19 +78,11 @@ def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
 def _write_trajectory(group: Any, trajectory: Trajectory) -> None:
     frames, particles, dim = trajectory.position.shape
     chunk = min(frames, max(1, _CHUNK_BYTES // (4 * particles * dim)))
-    group.create_dataset(
-        "position",
-        data=trajectory.position,
-        chunks=(chunk, particles, dim),
-        shuffle=True,
-        compression="gzip",
-        compression_opts=1,
-    )
+    write_compressed(group, "position", trajectory.position, chunk)
     group.create_dataset("particle_type", data=trajectory.particle_type)
     for name in sorted(trajectory.fields):
-        packed = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
         values = np.asarray(trajectory.fields[name])
-        group.create_dataset(name, data=values, **(packed if values.size > 1 else {}))
+        group.create_dataset(name, data=values, **(FILTERS if values.size > 1 else {}))
     for name in sorted(trajectory.attributes):
         try:
             group.attrs[name] = trajectory.attributes[name]
