@@ -7,6 +7,7 @@
     python zoo/train.py goop --fresh         # from random weights, not from those of the zoo's entry
     python zoo/train.py --status
     python zoo/train.py --collect            # make entries of the best weights so far, also while others train
+    python zoo/train.py wbcsph --simulate    # only simulate what is missing, e.g. before a GPU is rented
 
 A dataset is simulated first if it is missing. Where the zoo has an entry with the curve of its training, training goes
 on from its weights, and the hours that it took count. Everything lies in `runs/zoo/NAME`; after any interruption,
@@ -56,6 +57,9 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--fresh", action="store_true", help="start from random weights where nothing has been started")
     parser.add_argument("--status", action="store_true", help="print how far each dataset is, and train nothing")
     parser.add_argument("--collect", action="store_true", help="make entries of the best weights, and train nothing")
+    parser.add_argument(
+        "--simulate", action="store_true", help="simulate the data of the next trainings, train nothing"
+    )
     return parser.parse_args(words)
 
 
@@ -75,6 +79,10 @@ def main(words: list[str] | None = None) -> int:
             return print_status(plan, chosen)
         if chosen.collect:
             return max([collect_entry(history, chosen.zoo) for history in histories(plan, chosen)], default=0)
+        if chosen.simulate:
+            for history, number in ready(plan, chosen, set()):
+                simulate(history.dataset_of(number), chosen.threads)
+            return 0
         with interruptions(chosen.hours):
             return train_all(plan, chosen)
     except NmpmError as error:

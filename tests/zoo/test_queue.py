@@ -326,6 +326,24 @@ def test_datasets_that_lack_hours_come_first(tmp_path):
     assert order == ["short", "new", "long"]
 
 
+def test_data_of_the_next_trainings_are_simulated_and_nothing_is_trained(tmp_path, monkeypatch, capsys):
+    made = []
+    monkeypatch.setattr("nmpm.data.catalog.ensure", lambda name, **options: made.append((name, options)) or tmp_path)
+    monkeypatch.chdir(tmp_path)
+    more = {"data.generate": {"counts": {"train": 9}}}
+    entries = [{"name": name, "config": "goop.yaml", "hours": 1, "extend": more} for name in ("goop", "done", "again")]
+    for name, seconds in {"done": 7200, "again": 3600}.items():
+        (tmp_path / "zoo" / name).mkdir(parents=True)
+        card = {"training": {"seconds": seconds, "steps": 7}, "curve": [[900.0, 5, 0.2]]}
+        (tmp_path / "zoo" / name / "card.yaml").write_text(yaml.safe_dump(card))
+    path = tmp_path / "queue.yaml"
+    path.write_text(json.dumps({"extension": {"hours": 1, "limit": 2}, "datasets": entries}))
+    assert train(path, "--simulate") == 0
+    assert [name for name, _ in made] == ["goop", "goop"]
+    assert ["counts" in options for _, options in made] == [False, True]  # the second goes on from weights
+    assert not list((tmp_path / "runs").rglob("words.json"))
+
+
 def test_fresh_trainings_ignore_the_published_entry(queue):
     path = queue(1 / 3600)
     assert train(path) == 0
