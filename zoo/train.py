@@ -31,8 +31,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from nmpm.zoo.queue.history import History
     from nmpm.zoo.queue.plan import Dataset, Plan
-    from nmpm.zoo.queue.trainings import History, Training
+    from nmpm.zoo.queue.training import Training
 
 HERE = Path(__file__).parent
 RETREATS = 3
@@ -190,7 +191,7 @@ def device_options(device: str) -> list[str]:
 
 def histories(plan: Plan, chosen: argparse.Namespace) -> list[History]:
     """How far each dataset is."""
-    from nmpm.zoo.queue.trainings import History
+    from nmpm.zoo.queue.history import History
 
     entries = {d.name: None if chosen.fresh or not d.publish else chosen.zoo / d.name for d in plan.datasets}
     return [History(d, chosen.runs / d.name, plan.extension, entries[d.name]) for d in plan.datasets]

@@ -18,8 +18,9 @@ from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.zoo import Zoo
 from nmpm.zoo.queue.collection import describe_data, simulator_facts
+from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
-from nmpm.zoo.queue.trainings import History, Training
+from nmpm.zoo.queue.training import Training
 
 SCRIPT = Path(__file__).parents[2] / "zoo" / "train.py"
 if not SCRIPT.is_file():

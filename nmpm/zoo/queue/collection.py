@@ -19,8 +19,9 @@ from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import refresh, write_card, write_index
 from nmpm.zoo.measures.simulator import measure_twin
 from nmpm.zoo.publish import replace
+from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset
-from nmpm.zoo.queue.trainings import History, Training
+from nmpm.zoo.queue.training import Training
 from nmpm.zoo.queue.validations import GROUP, Curve, lowest_errors
 from nmpm.zoo.registry import Zoo
 from nmpm.zoo.runs import BEST
