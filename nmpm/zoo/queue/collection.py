@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import filecmp
 import json
+import math
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -155,16 +156,15 @@ def _reason_to_keep(name: str, zoo: Path, validations: Curve, test: float) -> st
     """Why the published entry is better than weights with these errors; None if it is not, or there is none."""
     try:
         card = Zoo.card(name, zoo)
-        curve = card.get("curve", [])
-        if len(validations) < min(GROUP, len(curve)):
-            return f"the training has too few validations to be compared, {len(validations)} of {GROUP}"
-        split, (published, found) = "validation", lowest_errors(curve, validations)
-        if not curve:
+        split, (published, found) = "validation", lowest_errors(card.get("curve", []), validations)
+        if not card.get("curve"):
             split, found, published = "test", test, float(card["test"]["mse"])
     except (ZooError, KeyError, TypeError, ValueError, IndexError):
         return None
     if published >= found:
         return None
+    if not math.isfinite(found):
+        return f"the training has too few validations to be compared, {len(validations)} of {GROUP}"
     return f"its {split} error {1e3 * published:.4g} ×10⁻³ is below {1e3 * found:.4g}"
 
 

@@ -16,9 +16,15 @@ _MSE, _OVERALL = 2, 3
 
 
 def lowest_errors(*curves: Curve) -> list[float]:
-    """The error where each curve is lowest, all by the same measure; infinite for an empty curve."""
+    """The error where each curve is lowest, all by the same measure.
+
+    Infinite for an empty curve, and for one with less than a group of validations where another has a group: it may be
+    low by chance.
+    """
     overall = all(_states_overall(curve) for curve in curves if curve)
-    return [_lowest(curve)[_OVERALL if overall else _MSE] if curve else float("inf") for curve in curves]
+    least = GROUP if any(len(curve) >= GROUP for curve in curves) else 1
+    column = _OVERALL if overall else _MSE
+    return [_lowest(curve)[column] if len(curve) >= least else float("inf") for curve in curves]
 
 
 def lowest_mse(curve: Curve) -> float:
