@@ -196,7 +196,8 @@ class Split:
     def _entries(self) -> tuple[_Entry, ...]:
         with open_hdf5(self.path) as file:
             check_self_contained(file, self.path)
-            entries = tuple(_entry(group, name, self.path) for name, group in file.items())
+            # By names: an error within `items()` would keep HDF5 locked for other threads as long as its traceback.
+            entries = tuple(_entry(file.get(name), name, self.path) for name in file)
         for entry in entries:
             if entry.dim != entries[0].dim:
                 raise DataError(

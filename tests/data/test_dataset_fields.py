@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from conftest import made_up_metadata, made_up_trajectory
+from made_up import made_up_metadata, made_up_trajectory
 
 from nmpm.data.convert.arrays import write_trajectories
 from nmpm.data.datamodule import TrajectoryDataModule

@@ -1,4 +1,5 @@
 import pickle
+import threading
 import time
 from pathlib import Path
 
@@ -134,6 +135,17 @@ class TestBadFiles:
         message = error_of(file)
         assert f"trajectory 00001: the key '{key}' is missing" in message
         assert "other" in message
+
+    def test_an_error_that_is_kept_leaves_hdf5_to_other_threads(self, file):
+        """An iteration over h5py's `items()` that an error ends holds HDF5's lock as long as the error's traceback."""
+        with h5py.File(file, "a") as opened:
+            opened["00000"].move("position", "other")
+        with pytest.raises(DataError) as kept:
+            Split(file)
+        thread = threading.Thread(target=lambda: h5py.File(file).close(), daemon=True)
+        thread.start()
+        thread.join(20)
+        assert not thread.is_alive(), f"HDF5 is locked while {kept.value!r} is kept"
 
     def test_not_a_group(self, file):
         with h5py.File(file, "a") as opened:

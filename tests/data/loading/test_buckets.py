@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import made_up_metadata, made_up_trajectory
+from made_up import made_up_metadata, made_up_trajectory
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, write_metadata, write_split

@@ -1,0 +1,37 @@
+"""Tiny trajectories that nothing simulated, and their metadata."""
+
+import numpy as np
+
+from nmpm.data.format import Metadata, Trajectory
+
+
+def made_up_trajectory(
+    frames: int, particles: int, seed: int = 0, statics: int = 0, dim: int = 2, fields: tuple[str, ...] = ()
+) -> Trajectory:
+    """Goop (7) that drifts slowly through the middle of [0.1, 0.9] ** dim, and boundary particles (3) that rest.
+
+    Fields evolve; those of particles that rest are NaN.
+    """
+    rng = np.random.default_rng((seed, frames, particles))
+    start = rng.uniform(0.3, 0.7, size=(1, particles + statics, dim))
+    drift = rng.normal(scale=1e-3, size=(frames, particles + statics, dim)).cumsum(axis=0)
+    drift[:, particles:] = 0
+    types = np.r_[np.full(particles, 7), np.full(statics, 3)]
+    values = {name: 1 + 0.01 * rng.normal(size=(frames, len(types))).cumsum(axis=0) for name in fields}
+    for own in values.values():
+        own[:, particles:] = np.nan
+    return Trajectory((start + drift).astype(np.float32), types, {"seed": seed}, values)
+
+
+def made_up_metadata(dim: int = 2, **changes: object) -> Metadata:
+    """DeepMind's box and time step, goop and boundary particles, gravity downwards."""
+    known: dict = {
+        "bounds": ((0.1, 0.9),) * dim,
+        "dt": 0.0025,
+        "dim": dim,
+        "sequence_length": 12,
+        "particle_types": {3: "boundary", 7: "goop"},
+        "static_types": frozenset({3}),
+        "gravity": (0.0,) * (dim - 1) + (-9.81,),
+    }
+    return Metadata(**(known | changes))
