@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
-from made_up import made_up_metadata, made_up_trajectory
 
 from nmpm._support.devices import find_device
 from nmpm.data.format import write_metadata, write_split
 from nmpm.errors import ConfigError
 from nmpm.testing import ProcessorContract, TransferContract
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 # The same examples in every run, however slow the machine; `pytest --hypothesis-profile default` looks for others.
 settings.register_profile("repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -4,7 +4,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from made_up import made_up_metadata, made_up_trajectory
 
 from nmpm.data.convert.arrays import write_trajectories
 from nmpm.data.datamodule import TrajectoryDataModule
@@ -15,6 +14,7 @@ from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import FolderSource, StatedFacts
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 COUNTS = (5, 8, 6)
 

@@ -12,7 +12,7 @@ from nmpm.data.convert import FORMATS, Options
 from nmpm.data.format import METADATA_FILE, Split, Trajectory, read_metadata, write_split
 from nmpm.data.hdf5 import check_self_contained, open_hdf5, writable_hdf5
 from nmpm.errors import DataError
-from tests.conftest import made_up_trajectory
+from tests.made_up import made_up_trajectory
 
 
 def trajectories(count: int = 3, frames: int = 40, particles: int = 500) -> list[Trajectory]:

@@ -3,7 +3,7 @@ import pytest
 
 from nmpm.data.format import Trajectory
 from nmpm.data.statistics import MotionStatistics, find_disagreements, first_moving_particle
-from tests.conftest import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 
 def test_equal_those_computed_at_once():

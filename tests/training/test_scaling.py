@@ -18,7 +18,7 @@ from nmpm.data.format import Split, write_metadata, write_split
 from nmpm.emulator.calibration import calibrate
 from nmpm.training import EmulatorModule
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
-from tests.conftest import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 SIZES = ((30, 9), (24, 7), (18, 8), (21, 6), (16, 5))
 QUIET = {"position_noise": 0.0, "grid_noise": 0.0, "mirror": (), "jitter": 0.0}

@@ -15,7 +15,7 @@ from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.viz import LabelledTrajectories
 from nmpm.viz.viewer.packing import STEPS, pack_positions, quantize
-from tests.conftest import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 
 def unpack(text: str, shape: tuple[int, ...]) -> np.ndarray:

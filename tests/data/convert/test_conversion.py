@@ -15,7 +15,7 @@ from nmpm.data.convert.conversion import write_native
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
-from tests.conftest import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 
 def source_of(*trajectories: Trajectory, **changes) -> ForeignDataset:
@@ -48,7 +48,7 @@ from pathlib import Path
 from nmpm.data.convert import ForeignDataset
 from nmpm.data.convert.base import Rereadable
 from nmpm.data.convert.conversion import write_native
-from tests.conftest import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory
 def slow():
     yield made_up_trajectory(5, 3)
     print("begun", flush=True)

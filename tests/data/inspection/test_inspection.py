@@ -12,7 +12,7 @@ from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.data.inspection import Inspection, inspect
 from nmpm.data.loading.sources import FolderSource, StatedFacts
 from nmpm.errors import DataError
-from tests.conftest import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 UNIT = {"bounds": ((0.0, 1.0),) * 2, "domain": ((0.0, 1.0),) * 2, "particle_volume": 1e-4}
 

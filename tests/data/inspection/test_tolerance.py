@@ -13,9 +13,9 @@ from nmpm.data.inspection import inspect
 from nmpm.data.inspection.tolerance import guess_family
 from nmpm.data.loading.sources import FolderSource, StatedFacts
 from nmpm.sim import load_preset
-from tests.conftest import made_up_trajectory
 from tests.data.convert import records
 from tests.data.convert.test_deepmind import METADATA, made
+from tests.made_up import made_up_trajectory
 
 KEYS = {"bounds": [[0.1, 0.9]] * 2, "dt": 0.0025, "dim": 2, "sequence_length": 12}
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_up import made_up_metadata, made_up_trajectory
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, write_metadata, write_split
@@ -15,6 +14,7 @@ from nmpm.data.loading.buffer import TrajectoryBuffer
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 SIZES = (3, 4, 40, 5, 6, 30)
 PLAN = WindowPlan(frames=(12,) * 6, length=6, batch_size=2, buffer_size=4, passes=2.0, seed=1, bucket=4)
