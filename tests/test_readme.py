@@ -145,6 +145,9 @@ def test_configurations_of_trainings_are_valid(words, make_dataset, workplace, c
 def test_scripts_and_their_options_exist(words):
     text = (ROOT / words[1]).read_text("utf-8")
     assert all(f'"{word}"' in text for word in words if word.startswith("--"))
+    arguments = text.split("add_argument(")[1:]
+    required = [re.findall(r'"(--[\w-]+)"', argument)[0] for argument in arguments if "required=True" in argument]
+    assert set(required) <= set(words)
 
 
 @pytest.mark.parametrize("block", blocks("yaml"), ids=str)

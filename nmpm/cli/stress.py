@@ -31,7 +31,7 @@ examples:
   nmpm stress goop                          all tests, in minutes
   nmpm stress goop --groups long settling   some of them
   nmpm stress runs/goop --free              a run's best checkpoint, without constraints
-  nmpm stress goop --full --report stress   as zoo cards quote it, with a table and a picture
+  nmpm stress goop --full --report stress   longer and larger, with a table and a picture
 """
 
 
@@ -61,7 +61,9 @@ def _parser() -> argparse.ArgumentParser:
     add_model_options(parser)
     add_device_option(parser)
     add_runtime_option(parser)
-    parser.add_argument("--full", action="store_true", help="longer and larger, as zoo cards quote (default: minutes)")
+    parser.add_argument(
+        "--full", action="store_true", help="longer and larger: tens of minutes (default: minutes, as zoo cards quote)"
+    )
     parser.add_argument("--preset", help="simulator of its scenes (default: of the training data; none if recorded)")
     parser.add_argument("--free", action="store_true", help="without the model's constraints: the network alone")
     parser.add_argument(

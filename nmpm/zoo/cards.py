@@ -164,7 +164,8 @@ def _quality_lines(card: Mapping[str, Any]) -> list[str]:
     texts = [f"{text} {_range(figure, factor)}{unit}" for figure, text, factor, unit in known]
     worst = quality["worst"]
     return [
-        f"On the test scenes, mean and its 95% interval: {'; '.join(texts)}. The largest error is that of scene"
+        f"On the test scenes, mean and its 95% interval: {'; '.join(texts)}. Of rollouts of one scene"
+        " at a time, whose rounding differs from that of the table's batches, the largest error is that of scene"
         f" {worst['scene']}, {1e3 * worst['mse']:.3g} ×10⁻³.",
         "",
     ]

@@ -42,6 +42,12 @@ class Pretrained:
     emulator: Emulator
     card: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        """One line: name, data, network and device; the card is long."""
+        weights = sum(values.numel() for values in self.emulator.parameters())
+        network = f"{type(self.emulator.recipe.processor).__name__} of {weights:,} parameters on {self.emulator.device}"
+        return f"<{type(self).__name__} {self.name}: {self.card.get('dataset', 'unknown data')}, {network}>"
+
     @property
     def scene(self) -> Scene:
         """The facts of the scenes that the model was trained for."""

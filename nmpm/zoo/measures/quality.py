@@ -48,7 +48,7 @@ def _summary(values: list[float]) -> dict[str, Any]:
 
 def _draw(model: Pretrained, window: Window, predicted: Tensor, path: Path) -> None:
     moving = window.mask[0]
-    positions = {"data": window.target[0, :, moving].numpy(), "prediction": predicted[0, :, moving].numpy()}
+    positions = {"truth": window.target[0, :, moving].numpy(), "prediction": predicted[0, :, moving].numpy()}
     initial = window.initial
     obstacle = None if initial.obstacle is None else initial.obstacle[0, initial.obstacle_mask[0]].numpy()
     material = window.material[0, moving].numpy()
