@@ -28,7 +28,9 @@ again, `nmpm zoo add RUN NAME` adds one and `python zoo/train.py` trains them al
 
 Errors are full-rollout MSE ×10⁻³ in domain length², over test scenes, with the 95% interval of their mean; beside them
 the goal of `queue.yaml` and the better of two trivial predictors, nothing moves and free fall. *At 100*: the error
-over the first 100 frames. *Twins*: the error over that of the simulator with other time steps beside itself.
+over the first 100 frames. *Twins*: the error divided by that of the simulator's *twin*, its own result
+with other time steps (mostly half as many): at 1, a model is as accurate as the data are sure. `docs/concepts.md` explains the
+terms.
 Milliseconds are per frame of one scene.
 """
 COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "trivial", "trained", "ms per frame")
