@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from nmpm._support.atomic import atomic_write
-from nmpm.errors import ZooError
+from nmpm.errors import DataError, ZooError
 from nmpm.zoo.cards import intervals, readme, twin_ratio
 from nmpm.zoo.charts import write_chart
 from nmpm.zoo.entries import CARD, load_entry, read_card
@@ -18,6 +18,7 @@ from nmpm.zoo.golden import golden_rollout
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
 from nmpm.zoo.measures import MEASURES
 from nmpm.zoo.registry import Zoo
+from nmpm.zoo.scene_table import scene_row, scene_table
 
 HEAD = """\
 # The zoo
@@ -28,26 +29,28 @@ again, `nmpm zoo add RUN NAME` adds one and `python zoo/train.py` trains them al
 
 Errors are full-rollout MSE ×10⁻³ in domain length², over test scenes, with the 95% interval of their mean; beside them
 the goal of `queue.yaml` and the better of two trivial predictors, nothing moves and free fall. *At 100*: the error
-over the first 100 frames. *Twins*: the error divided by that of the simulator's *twin*, its own result
-with other time steps (mostly half as many): at 1, a model is as accurate as the data are sure. `docs/concepts.md` explains the
-terms.
-Milliseconds are per frame of one scene.
+over the first 100 frames. *Twins*: the error divided by that of the simulator's *twin*, its own result with other time
+steps (mostly half as many): at 1, a model is as accurate as the data themselves. Milliseconds are per frame of one
+scene. `docs/concepts.md` explains the terms.
 """
 COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "trivial", "trained", "ms per frame")
 
 
 def write_index(root: Path) -> Path:
     """Write the table of a zoo's models, `README.md` in its folder; entries with a damaged card are left out."""
-    rows = []
+    rows, scenes = [], []
     for name in Zoo.list(root):
         try:
-            rows.append(_row(name, Zoo.card(name, root)))
-        except ZooError:
+            card = Zoo.card(name, root)
+            row, scene = _row(name, card), scene_row(name, root / name, card)
+        except (ZooError, DataError):
             continue
+        rows.append(row)
+        scenes.append(scene)
     table = [f"| {' | '.join(COLUMNS)} |", f"|{'---|' * len(COLUMNS)}", *rows]
     path = root / "README.md"
     with atomic_write(path) as part:
-        part.write_text("\n".join([HEAD, *table]) + "\n", encoding="utf-8")
+        part.write_text("\n".join([HEAD, *table, "", *scene_table(scenes)]) + "\n", encoding="utf-8")
     return path
 
 

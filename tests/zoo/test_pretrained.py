@@ -46,3 +46,8 @@ def test_over_a_wider_domain_the_same_weights_get_more_cells_of_the_same_size(mo
 def test_scenes_that_a_model_cannot_take_are_refused(model, change, message):
     with pytest.raises(ConfigError, match=message):
         model.over(dataclasses.replace(model.scene, **change))
+
+
+def test_a_model_prints_as_one_line(model):
+    weights = sum(values.numel() for values in model.emulator.parameters())
+    assert repr(model) == f"<Pretrained small: unknown data, UNet of {weights:,} parameters on cpu>"
