@@ -65,7 +65,7 @@ _EXAMPLES = {
 }
 _OPTIONS = {
     "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
-    "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, other commands judge it",
+    "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, the other commands run it",
     "--start_from MODEL": "fit only: start with the weights of a zoo model, a run or a checkpoint of the same parts",
     "--seed_everything N": "seed of all random numbers (default: 0)",
     "--print_config": "print the configuration that results, and stop",

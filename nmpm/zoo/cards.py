@@ -61,7 +61,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
     lines = [
         f"# {card['name']}",
         "",
-        f"An emulator of: {card['dataset']}. {card.get('about', '')}".rstrip(),
+        f"An emulator of {card['dataset']}. {card.get('about', '')}".rstrip(),
         "",
         *_lifecycle_lines(card),
         f"Test error ×10⁻³ of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
@@ -142,7 +142,7 @@ def _floor_lines(card: Mapping[str, Any]) -> list[str]:
         return []
     figures = ", ".join(f"`{name}` {1e3 * floor[name]:.2g} ×10⁻³" for name in ("mse@100", "mse") if name in floor)
     unstable = floor.get("unstable")
-    left_out = f" Without test scenes {unstable}, which the nudge makes unstable." if unstable else ""
+    left_out = f" Left out as the nudge makes them unstable: test scenes {unstable}." if unstable else ""
     return [
         f"Predictability: the simulator beside itself, started from positions that differ by {floor['nudge']:g} of the"
         f" domain's side: {figures}.{left_out}",

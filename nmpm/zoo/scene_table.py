@@ -14,8 +14,8 @@ COLUMNS = ("model", "materials", "box", "particles", "ms between frames", "gravi
 TEXT = """\
 What scenes the models were made for: size of the box and gravity in the units of the data (length, length / s²), the
 usual number of particles, cells of the grid, and the frames m that one call predicts. Another box, other numbers of
-particles and, where there is a wall or an obstacle already, other obstacles are possible (`model.over(scene)`); materials,
-gravity and the time between frames are not.
+particles and, where there is a wall or an obstacle already, other obstacles are possible (`model.over(scene)`); other
+materials, gravity or time between frames are not.
 """
 
 

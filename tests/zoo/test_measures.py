@@ -81,7 +81,7 @@ def test_scenes_that_the_nudge_makes_unstable_are_named(goop, monkeypatch):
     second = yaml.safe_load((goop / "card.yaml").read_text())["floor"]
     assert (first.unstable, second["unstable"]) == ((1,), [0])
     assert (first.errors["mse"] + second["mse"]) / 2 == pytest.approx(both)
-    assert "Without test scenes [0], which the nudge makes unstable." in (goop / "README.md").read_text()
+    assert "Left out as the nudge makes them unstable: test scenes [0]." in (goop / "README.md").read_text()
     monkeypatch.setattr(simulator, "nudge", nudge_all_but(set()))
     with pytest.raises(UnstableError, match="all test scenes of goop unstable"):
         measure_floor(model)
