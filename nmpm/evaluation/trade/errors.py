@@ -9,7 +9,9 @@
 | height | deviation of the mean height above the floor in the last frame, relative |
 | crowding | deviation of the particles per occupied cell in the last frame, relative |
 
-`gain` is the energy gained beyond the initial one, as a share of it: no error, but a mark of instability.
+`gain` is the energy gained beyond the initial one, as a share of it: no error, but a mark of instability. Where a
+choice simulates other particles than the recorded ones it is that of its own, see `choice.Prediction`: recorded ones
+that follow them weigh them unevenly, and seem to gain energy that no simulated particle has.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
 
-REVISION = 2
+REVISION = 3
 """Increased whenever the same prediction gets other errors."""
 
 GAIN = "gain"
@@ -114,21 +116,35 @@ def _evenly_spaced(frames: int, count: int) -> NDArray[np.int64]:
 
 def _energies(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> dict[str, float]:
     moving = window.mask[0]
-    densities = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)
-    mass = densities[window.material[0, moving]]
-    share = mass / mass.sum()
+    material, gravity = window.material[0, moving], window.gravity[0].double()
     start = window.frames[0, :2, moving].double()
-    kinetic, total = _energy(scene, torch.cat([start, ours]), share, window.gravity[0].double())
-    truth, _ = _energy(scene, torch.cat([start, theirs]), share, window.gravity[0].double())
-    initial = float(total[0])
+    kinetic, total = _energy(scene, torch.cat([start, ours]), material, gravity)
+    truth, _ = _energy(scene, torch.cat([start, theirs]), material, gravity)
     found = {"kinetic": float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))}
-    if initial > 0:
-        found[GAIN] = float(total.max() / initial - 1)
-    return found
+    return found | {GAIN: _gain(total)}
 
 
-def _energy(scene: Scene, path: Tensor, share: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
+def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> float:
+    """Most energy in a path beyond that between its first two frames, as a share of that; 0 where that has none.
+
+    Args:
+        scene: Gives bounds and densities.
+        path: (T, N, D) positions of all moving particles, which have the same volume.
+        material: (N,) index into the scene's materials.
+        gravity: (D,) in length per frame squared.
+    """
+    return _gain(_energy(scene, path.double(), material, gravity.double())[1])
+
+
+def _gain(total: Tensor) -> float:
+    initial = float(total[0])
+    return float(total.max() / initial - 1) if initial > 0 else 0.0
+
+
+def _energy(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
     """Kinetic, and kinetic and potential energy per mass between frames, (T - 1,), of a path (T, N, D)."""
+    mass = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)[material]
+    share = mass / mass.sum()
     steps = path.diff(dim=0)
     kinetic = (steps.square().sum(-1) * share).sum(-1) / 2
     middle = (path[1:] + path[:-1]) / 2

@@ -10,15 +10,19 @@ import pytest
 import torch
 
 from nmpm._support.digests import short_digest
+from nmpm.data.generate import generate
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall
 from nmpm.evaluation.gns import GraphRecipe, TrainedGraph
-from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure
-from nmpm.evaluation.trade.accuracy import measure_accuracy
+from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure, read_scenes
+from nmpm.evaluation.trade.accuracy import known_accuracy, measure_accuracy
 from nmpm.evaluation.trade.errors import field_error, measure_errors
 from nmpm.evaluation.trade.simulators import SimulatorChoice, follow_nearest
 from nmpm.evaluation.trade.table import COLUMNS, csv_text
 from nmpm.evaluation.trade.trivial import TrivialChoice
+from nmpm.sim import load_preset
+from nmpm.sim.sph.preset import SphPreset
+from nmpm.sim.trajectory import SimulatedTrajectory
 from tests.evaluation.trade.made_up import tiny_emulator, tiny_scenes, tiny_sweep
 
 
@@ -104,6 +108,84 @@ def test_stored_predictions_give_other_errors_without_predicting(scenes, tmp_pat
     monkeypatch.setattr(TrivialChoice, "prepare", lambda *_: pytest.fail("predicted again"))
     list(measure_accuracy(choice, scenes, dataclasses.replace(measures, horizons=(2,)), store))
     assert len(list(tmp_path.glob("predictions/*/*.npz"))) == 2
+
+
+@pytest.fixture(scope="module")
+def drops(tmp_path_factory):
+    """One test scene of a few drops of SPH water, of 16 frames, and the choice that simulates it coarser."""
+    preset = load_preset("wbcsph").coarsened(4).with_frames(16)
+    folder = tmp_path_factory.mktemp("drops")
+    generate(preset, folder, {"train": 0, "valid": 0, "test": 1}, workers=1)
+    return read_scenes("drops", folder, 1), SimulatorChoice("coarser", preset.coarsened(2), {})
+
+
+def simulate_as(path, monkeypatch):
+    """Let SPH presets simulate `path`, from the initial positions (M, D) and a number of frames."""
+
+    def simulate_from(self, start, frames, progress=None):
+        position = path(start.position, frames).astype(np.float32)
+        return SimulatedTrajectory(position, np.full(position.shape[1], 5), {})
+
+    monkeypatch.setattr(SphPreset, "simulate_from", simulate_from)
+
+
+def rise_and_fall(start, frames):
+    """The particle nearest to the floor rises like all others fall: the energy stays, unless it counts more often."""
+    rise = 5e-4 * np.arange(frames + 1) ** 2
+    path = np.repeat(start[None], frames + 1, axis=0)
+    path[..., 1] -= rise[:, None] / (len(start) - 1)
+    path[:, np.argmin(start[:, 1]), 1] = start[:, 1].min() + rise
+    return path
+
+
+def test_a_simulation_of_larger_particles_is_judged_by_their_own_energy(drops, tmp_path, monkeypatch):
+    scenes, coarser = drops
+    first = scenes.recordings[0].frames[0].clone()
+    start = coarser.preset.draw(scenes.seeds[0]).position
+    crowd = torch.from_numpy(start[np.argmin(start[:, 1])]).float()
+    first[: len(first) // 2] = crowd  # half of the recorded particles follow the one that rises
+    frames = first.expand_as(scenes.recordings[0].frames)
+    crowded = dataclasses.replace(scenes, recordings=(dataclasses.replace(scenes.recordings[0], frames=frames),))
+    simulate_as(rise_and_fall, monkeypatch)
+    predicted = coarser.predict(crowded, 0, crowded.frames(0))
+    followed = measure_errors(scenes.scene, crowded.window([0]), predicted.position, tiny_sweep().measures)["gain"]
+    assert followed > 0.05 > abs(predicted.gain)
+    (point,) = measure([coarser], crowded, tiny_sweep(), Store(tmp_path), lambda _: None)
+    assert point.stable
+
+
+def test_a_simulation_of_larger_particles_that_gains_energy_is_unstable(drops, tmp_path, monkeypatch):
+    scenes, coarser = drops
+    simulate_as(lambda start, frames: start + 0.002 * np.arange(frames + 1)[:, None, None] ** 2, monkeypatch)
+    store = Store(tmp_path, keep_predictions=True)
+    measures = tiny_sweep().measures
+    for judged in (measures, dataclasses.replace(measures, horizons=(2,))):  # anew, then of the stored prediction
+        list(measure_accuracy(coarser, scenes, judged, store))
+        assert "of energy" in known_accuracy(coarser, scenes, judged, store)[0]["failed"]
+        monkeypatch.setattr(SphPreset, "simulate_from", lambda *_: pytest.fail("simulated again"))
+
+
+def test_stored_predictions_keep_the_energy_gain_of_other_particles(drops, tmp_path, monkeypatch):
+    scenes, coarser = drops
+    store, measures = Store(tmp_path, keep_predictions=True), tiny_sweep().measures
+    list(measure_accuracy(coarser, scenes, measures, store))
+    (first,) = known_accuracy(coarser, scenes, measures, store)
+    other = dataclasses.replace(measures, horizons=(2,))
+    with monkeypatch.context() as patch:
+        patch.setattr(SphPreset, "simulate_from", lambda *_: pytest.fail("simulated again"))
+        list(measure_accuracy(coarser, scenes, other, store))
+    (again,) = known_accuracy(coarser, scenes, other, store)
+    assert again["gain"] == first["gain"]
+    assert "failed" not in again
+
+
+def test_a_stored_prediction_without_energy_gain_is_not_used(drops, tmp_path):
+    scenes, coarser = drops
+    store = Store(tmp_path, keep_predictions=True)
+    list(measure_accuracy(coarser, scenes, tiny_sweep().measures, store))
+    (path,) = tmp_path.glob("predictions/*/*.npz")
+    np.savez_compressed(path, position=np.load(path)["position"])  # as a former version wrote it
+    assert store.read_prediction(dict(coarser.identity), scenes.digests[0], scenes.frames(0)) is None
 
 
 class Made(Choice):
