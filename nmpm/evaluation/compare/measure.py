@@ -15,7 +15,7 @@ from nmpm.evaluation.compare.outcome import Floats, Outcome
 from nmpm.evaluation.compare.predictors import Candidate
 from nmpm.evaluation.trade.accuracy import FAILED
 from nmpm.evaluation.trade.choice import Choice, Kind
-from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, measure_errors
+from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 from nmpm.evaluation.trade.timing import Timing, known_times, measure_times
@@ -96,7 +96,7 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int) -> dict[str, Any]
     if gain > MOST_GAIN:
         found[FAILED] = f"gains {gain:.0%} of energy"
     if index == 0:
-        found["frames"] = _pack(ours[shown_frames(scenes)])
+        found["frames"] = _pack(into_domain(scenes.scene, ours[shown_frames(scenes)]))
     return found
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from nmpm._support.messages import one_line
 from nmpm.errors import NmpmError
 from nmpm.evaluation.trade.choice import Choice, Prediction
-from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, measure_errors
+from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 
@@ -78,6 +78,7 @@ def shown_frame(scenes: Scenes) -> int:
 def thumbnail(scenes: Scenes, position: Tensor) -> str:
     """Positions (N, D) along the first two axes in 256 steps of the domain, as base64; a part of many particles."""
     every = -(-position.shape[0] // _SHOWN)
+    inside = into_domain(scenes.scene, position[::every])
     low, high = position.new_tensor(scenes.scene.domain)[:2].T
-    steps = ((position[::every, :2] - low) / (high - low) * 255).round().clamp(0, 255).to(torch.uint8)
+    steps = ((inside[:, :2] - low) / (high - low) * 255).round().clamp(0, 255).to(torch.uint8)
     return base64.b64encode(steps.numpy().tobytes()).decode("ascii")

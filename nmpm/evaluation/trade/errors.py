@@ -89,19 +89,27 @@ def field_error(scene: Scene, ours: Tensor, theirs: Tensor, material: Tensor) ->
 
     Args:
         scene: Gives domain and particle spacing.
-        ours: (T, N, D) positions; those outside of the domain count at its border.
+        ours: (T, N, D) positions; those outside of the domain count as `into_domain` moves them.
         theirs: (T, N, D) likewise.
         material: (N,) index into the scene's materials.
     """
     chosen = _evenly_spaced(len(ours), _FIELD_FRAMES)
     grid, kinds = _counting_grid(scene), torch.nn.functional.one_hot(material, len(scene.materials)).to(ours.dtype)
-    low, high = ours.new_tensor(scene.domain).T
     values = kinds.expand(len(chosen), -1, -1)
     first, second = (
-        Linear().p2g(values, grid.to_cells(path[chosen].clamp(low, high), path.dtype), grid) for path in (ours, theirs)
+        Linear().p2g(values, grid.to_cells(into_domain(scene, path[chosen]), path.dtype), grid)
+        for path in (ours, theirs)
     )
     wrong = (first - second).abs().flatten(1).sum(1)
     return float((wrong / (first + second).flatten(1).sum(1)).mean())
+
+
+def into_domain(scene: Scene, position: Tensor) -> Tensor:
+    """Positions (..., D) moved into the domain: by whole periods, and to the border at walls."""
+    columns = []
+    for along, (low, high), periodic in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True):
+        columns.append(low + (along - low).remainder(high - low) if periodic else along.clamp(low, high))
+    return torch.stack(columns, dim=-1)
 
 
 def _earth_mover(ours: Tensor, theirs: Tensor, material: Tensor, count: int) -> float:
@@ -155,8 +163,7 @@ def _energy(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> tu
 
 def _shapes(scene: Scene, state: Particles, ours: Tensor, theirs: Tensor) -> dict[str, float]:
     grid = _counting_grid(scene)
-    low, high = ours.new_tensor(scene.domain).T
-    shapes = [measure_shape(scene, grid, state, position.clamp(low, high)) for position in (ours, theirs)]
+    shapes = [measure_shape(scene, grid, state, into_domain(scene, position)) for position in (ours, theirs)]
     relative = shapes[0].relative_to(shapes[1])
     return {name: abs(relative[name] - 1) for name in ("height", "crowding")}
 

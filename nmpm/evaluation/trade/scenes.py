@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
@@ -56,7 +56,7 @@ class Scenes:
 
     def moving_frames(self, index: int) -> int:
         """Predicted frames until the scene comes to rest, see `MOVING`; at least 1."""
-        steps = self.recordings[index].frames[1:].diff(dim=0)
+        steps = displacements(self.recordings[index].frames[1:], self.scene)
         speed = steps.square().sum(-1).mean(-1).sqrt()
         moving = (speed >= MOVING * speed.max()).nonzero()
         return int(moving[-1]) + 1 if len(moving) else 1

@@ -1,5 +1,6 @@
 """Choices over a tiny simulated dataset: what they predict, and that stored measurements are taken up."""
 
+import base64
 import csv
 import dataclasses
 import json
@@ -11,15 +12,17 @@ import torch
 
 from nmpm._support.digests import short_digest
 from nmpm.data.generate import generate
+from nmpm.data.loading.recording import Recording
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall
 from nmpm.evaluation.gns import GraphRecipe, TrainedGraph
-from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure, read_scenes
-from nmpm.evaluation.trade.accuracy import known_accuracy, measure_accuracy
-from nmpm.evaluation.trade.errors import field_error, measure_errors
+from nmpm.evaluation.trade import Choice, Kind, Scenes, Store, count_steps, make_choices, measure, read_scenes
+from nmpm.evaluation.trade.accuracy import known_accuracy, measure_accuracy, thumbnail
+from nmpm.evaluation.trade.errors import field_error, into_domain, measure_errors
 from nmpm.evaluation.trade.simulators import SimulatorChoice, follow_nearest
 from nmpm.evaluation.trade.table import COLUMNS, csv_text
 from nmpm.evaluation.trade.trivial import TrivialChoice
+from nmpm.scene import Scene
 from nmpm.sim import load_preset
 from nmpm.sim.sph.preset import SphPreset
 from nmpm.sim.trajectory import SimulatedTrajectory
@@ -354,3 +357,51 @@ def test_the_field_error_asks_where_material_is_and_not_which_particle(scenes):
     half = torch.cat([left[:, ::2], right[:, 1::2]], dim=1)[:, : left.shape[1]]
     share = 1 - left[:, ::2].shape[1] / left.shape[1]
     np.testing.assert_allclose(field_error(scenes.scene, half, left, material), share, rtol=1e-6)
+
+
+def flow(start, steps):
+    """Scenes of 100 particles in a square of period 1 along x, that start at x = `start` and move by `steps` (T,)."""
+    scene = Scene(
+        bounds=((0.0, 1.0),) * 2, domain=((0.0, 1.0),) * 2, dt=0.01, materials=("water",), particle_volume=1e-3,
+        boundary=("periodic", "wall"), gravity=(0.0, -9.81),
+    )  # fmt: skip
+    places = np.stack(np.meshgrid(np.linspace(start, start + 0.2, 10), np.linspace(0.1, 0.4, 10)), -1).reshape(-1, 2)
+    shift = np.stack([np.concatenate([[0], np.cumsum(steps)]), np.zeros(len(steps) + 1)], -1)
+    frames = torch.from_numpy(places + shift[:, None]).float()
+    frames[..., 0] = frames[..., 0].remainder(1.0)
+    gravity = torch.tensor([0.0, -9.81e-4])
+    recording = Recording(frames, torch.zeros(100, dtype=torch.long), torch.zeros(0, 2), gravity)
+    return Scenes("flow", scene, (recording,))
+
+
+@pytest.mark.parametrize("turns", [-2, 1])
+def test_errors_of_fields_and_shapes_do_not_depend_on_whole_periods(turns):
+    scenes = flow(0.7, [0.02] * 30)  # across the border
+    window, measures = scenes.window([0]), tiny_sweep().measures
+    slower = flow(0.7, [0.02] + [0.015] * 29).window([0]).target
+    found = measure_errors(scenes.scene, window, slower, measures)
+    turned = measure_errors(scenes.scene, window, slower + torch.tensor([float(turns), 0.0]), measures)
+    assert 0.1 < found["field"] < 0.9
+    for name in ("field", "crowding", "height"):
+        np.testing.assert_allclose(turned[name], found[name], rtol=1e-3, atol=1e-6)
+
+
+def test_positions_beyond_a_wall_count_at_the_border_and_beyond_a_period_on_the_other_side():
+    scene = flow(0.0, [0.01]).scene
+    inside = into_domain(scene, torch.tensor([[1.25, 0.5], [-2.25, 1.5], [0.5, -0.5]]))
+    torch.testing.assert_close(inside, torch.tensor([[0.25, 0.5], [0.75, 1.0], [0.5, 0.0]]))
+
+
+def test_thumbnails_show_particles_within_the_period():
+    scenes = flow(0.7, [0.02] * 30)
+    position = scenes.recordings[0].frames[-1]
+    turned, shown = (
+        np.frombuffer(base64.b64decode(thumbnail(scenes, position + shift)), np.uint8).astype(int)
+        for shift in (torch.tensor([3.0, 0.0]), torch.zeros(2))
+    )
+    assert np.abs(turned - shown).max() <= 1  # of 256 steps, by rounding
+
+
+def test_rest_is_found_across_a_periodic_border():
+    slowing = 0.02 * 0.8 ** np.arange(40)
+    assert flow(0.9, slowing).moving_frames(0) == flow(0.1, slowing).moving_frames(0) < 30
