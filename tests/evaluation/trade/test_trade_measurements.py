@@ -405,3 +405,36 @@ def test_thumbnails_show_particles_within_the_period():
 def test_rest_is_found_across_a_periodic_border():
     slowing = 0.02 * 0.8 ** np.arange(40)
     assert flow(0.9, slowing).moving_frames(0) == flow(0.1, slowing).moving_frames(0) < 30
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"bounds": ((0.0, 1.0), (0.05, 1.0))},
+        {"domain": ((0.0, 1.0), (-0.1, 1.1))},
+        {"boundary": ("wall", "wall")},
+        {"particle_volume": 2e-3},
+        {"dt": 0.02},
+    ],
+    ids=lambda facts: next(iter(facts)),
+)
+def test_errors_are_measured_anew_where_a_fact_of_the_scene_is_another(facts, tmp_path):
+    scenes, store, measures = flow(0.1, [0.01] * 8), Store(tmp_path), tiny_sweep().measures
+    choice = TrivialChoice("free fall")
+    list(measure_accuracy(choice, scenes, measures, store))
+    assert known_accuracy(choice, scenes, measures, store)[0]
+    other = dataclasses.replace(scenes, scene=dataclasses.replace(scenes.scene, **facts))
+    assert known_accuracy(choice, other, measures, store) == [{}]
+
+
+def test_digests_tell_fields_apart():
+    scenes = flow(0.1, [0.01] * 8)
+
+    def with_fields(**fields):
+        heated = dataclasses.replace(scenes.recordings[0], fields=fields)
+        return dataclasses.replace(scenes, recordings=(heated,)).digests
+
+    cold, warm = torch.zeros(9, 100), torch.ones(9, 100)
+    found = [with_fields(**fields) for fields in ({}, {"heat": cold}, {"heat": warm}, {"salt": warm})]
+    assert len(set(found)) == 4
+    assert with_fields(heat=warm, salt=cold) == with_fields(salt=cold, heat=warm)
