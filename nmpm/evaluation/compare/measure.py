@@ -13,6 +13,7 @@ from nmpm._support.messages import one_line
 from nmpm.errors import NmpmError
 from nmpm.evaluation.compare.outcome import Floats, Outcome
 from nmpm.evaluation.compare.predictors import Candidate
+from nmpm.evaluation.machine import is_machine_failure
 from nmpm.evaluation.trade.accuracy import FAILED
 from nmpm.evaluation.trade.choice import Choice, Kind
 from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
@@ -84,6 +85,8 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int) -> dict[str, Any]
     try:
         prediction = choice.predict(scenes, index, scenes.frames(index))
     except NmpmError as error:
+        if is_machine_failure(error):
+            raise
         return {FAILED: one_line(error)}
     predicted, moving = prediction.position, window.mask[0]
     ours, theirs = predicted[0, :, moving], window.target[0, :, moving]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nmpm._support.messages import one_line
 from nmpm.errors import NmpmError
+from nmpm.evaluation.machine import is_machine_failure
 from nmpm.evaluation.trade.choice import Choice, Prediction
 from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
@@ -49,6 +50,8 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
     try:
         predicted = _predict(choice, scenes, index, frames, store)
     except NmpmError as error:
+        if is_machine_failure(error):
+            raise
         return {FAILED: one_line(error)}
     found: dict[str, Any] = dict(measure_errors(scenes.scene, scenes.window([index]), predicted.position, measures))
     if predicted.gain is not None:

@@ -81,6 +81,10 @@ class Choice(ABC):
             Predicts the frames after each scene's first two. It raises an NmpmError where it fails.
         """
 
+    def computed_frames(self, frames: int) -> int:
+        """Frames that a rollout of so many frames computes: the time of a frame is its time over these."""
+        return frames
+
     def predict(self, scenes: Scenes, index: int, frames: int) -> Prediction:
         """Predict one scene, which is not timed.
 

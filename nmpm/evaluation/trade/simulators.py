@@ -54,6 +54,9 @@ class SimulatorChoice(Choice):
         follow = follow_nearest(scenes.recordings[index].frames[0], start.position)
         return lambda frames: follow(self._simulate(start, frames))[2:].unsqueeze(0)
 
+    def computed_frames(self, frames: int) -> int:
+        return frames + 1  # from the initial state on, of which a rollout leaves out two frames
+
     def predict(self, scenes: Scenes, index: int, frames: int) -> Prediction:
         start, recording = self._draw(scenes, index), scenes.recordings[index]
         simulated = self._simulate(start, frames)

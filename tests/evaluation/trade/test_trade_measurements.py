@@ -3,6 +3,7 @@
 import base64
 import csv
 import dataclasses
+import itertools
 import json
 from importlib.util import find_spec
 
@@ -21,6 +22,7 @@ from nmpm.evaluation.trade.accuracy import known_accuracy, measure_accuracy, thu
 from nmpm.evaluation.trade.errors import field_error, into_domain, measure_errors
 from nmpm.evaluation.trade.simulators import SimulatorChoice, follow_nearest
 from nmpm.evaluation.trade.table import COLUMNS, csv_text
+from nmpm.evaluation.trade.timing import Timing, known_times, measure_times
 from nmpm.evaluation.trade.trivial import TrivialChoice
 from nmpm.scene import Scene
 from nmpm.sim import load_preset
@@ -438,3 +440,28 @@ def test_digests_tell_fields_apart():
     found = [with_fields(**fields) for fields in ({}, {"heat": cold}, {"heat": warm}, {"salt": warm})]
     assert len(set(found)) == 4
     assert with_fields(heat=warm, salt=cold) == with_fields(salt=cold, heat=warm)
+
+
+def test_times_are_per_frame_that_is_computed(scenes, choices, monkeypatch, tmp_path):
+    timed = [choices[0], named(choices, "carried"), named(choices, "carried, batch 2"), named(choices, "free fall")]
+    ticks = itertools.count()  # each rollout takes a second
+    monkeypatch.setattr("nmpm.evaluation.trade.timing.clock_for", lambda *_: ("a clock", lambda: next(ticks)))
+    timing, store = Timing(rounds=1, frames=3), Store(tmp_path)
+    list(measure_times(timed, timed[0], scenes, timing, store))
+    frames = [1e3 / known_times(choice, scenes, timing, store).milliseconds[0] for choice in timed]
+    assert frames == pytest.approx([4, 4, 8, 3])  # one more; a bundle of 2 more, of one and of two scenes; as asked
+
+
+def test_what_the_machine_cannot_do_is_raised_and_tried_again(scenes, tmp_path):
+    def exhaust(_):
+        raise ConfigError("the network cannot be compiled") from MemoryError()
+
+    sweep, store = tiny_sweep(), Store(tmp_path)
+    bad = Made("machine", exhaust)
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        list(measure_accuracy(bad, scenes, sweep.measures, store))
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        list(measure_times([bad], bad, scenes, sweep.timing, store))
+    bad.make = lambda target: target
+    (point,) = measure([bad], scenes, sweep, store, lambda _: None)
+    assert point.competes
