@@ -32,7 +32,8 @@ class Scene:
 
     Args:
         bounds: Where particles may be, (lower, upper) per axis, in domain length.
-        domain: What the grid covers, (lower, upper) per axis; contains the bounds and, at walls, a wall layer.
+        domain: What the grid covers, (lower, upper) per axis; contains the bounds and, at walls, a wall layer. On
+            a periodic axis both are the same, the period.
         dt: Time between frames, in seconds.
         materials: Names of the moving materials, in the order of their channels.
         particle_volume: Volume of one particle, in length ** dim.

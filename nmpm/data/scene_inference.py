@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -162,12 +162,21 @@ def _densities(materials: tuple[str, ...], metadata: Metadata) -> tuple[float, .
 
 
 def _gravities(split: Split, metadata: Metadata) -> tuple[tuple[float, ...], ...]:
-    """The gravities of the trajectories, one if all are the same; a trajectory without its own has the dataset's.
+    """The distinct gravities of the trajectories."""
+    return distinct_gravities(trajectory_gravity(split, index, metadata) for index in range(len(split)))
+
+
+def trajectory_gravity(split: Split, index: int, metadata: Metadata) -> tuple[float, ...] | None:
+    """A trajectory's own gravity, or else the dataset's; None if neither is stated."""
+    stated = split.attributes(index).get("gravity")
+    return metadata.gravity if stated is None else tuple(np.ravel(stated).tolist())
+
+
+def distinct_gravities(known: Iterable[tuple[float, ...] | None]) -> tuple[tuple[float, ...], ...]:
+    """The different ones among gravities, without None; one if all are the same.
 
     Numbers are compared as `check_gravity` does: a float32 attribute beside the metadata's float64 is no other gravity.
     """
-    stated = [split.attributes(index).get("gravity") for index in range(len(split))]
-    known = [tuple(np.atleast_1d(value).tolist()) if value is not None else metadata.gravity for value in stated]
     distinct = tuple(dict.fromkeys(value for value in known if value is not None))
     return distinct[:1] if all(_same_gravity(distinct[0], other) for other in distinct) else distinct
 
