@@ -96,7 +96,9 @@ class Grid:
                 name = str(dtype).removeprefix("torch.")
                 raise DataError(
                     f"{name} numbers have a spacing of {step:g} near {reach:g}, where axis {axis} of the domain ends,"
-                    f" and a cell is {h:g} wide: give positions in float64, or move the origin into the domain."
+                    f" and a cell is {h:g} wide. Move the origin into the domain: subtract its lower corner from"
+                    " positions, bounds and domain. Only positions passed from Python may be float64 instead; those of"
+                    " files are read as float32."
                 )
 
     def _steps(self, dtype: torch.dtype) -> list[tuple[float, float, float]]:

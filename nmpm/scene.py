@@ -22,13 +22,18 @@ Interval = tuple[float, float]
 _RESERVED = frozenset({"position", "particle_type", "velocity", "volume", "solid", "gravity"})
 
 
+_SAME = 1e-6
+"""Share of a domain's extent by which the ends of a period may differ, as by rounding."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """The fixed facts of a family of scenes, in the dataset's physical units.
 
     Args:
         bounds: Where particles may be, (lower, upper) per axis, in domain length.
-        domain: What the grid covers, (lower, upper) per axis; contains the bounds and, at walls, a wall layer.
+        domain: What the grid covers, (lower, upper) per axis; contains the bounds and, at walls, a wall layer. On
+            a periodic axis both are the same, the period.
         dt: Time between frames, in seconds.
         materials: Names of the moving materials, in the order of their channels.
         particle_volume: Volume of one particle, in length ** dim.
@@ -78,6 +83,13 @@ class Scene:
         for kind in self.boundary:
             if kind not in get_args(Boundary):
                 raise ConfigError(f"Boundary {kind!r} is not one of {', '.join(get_args(Boundary))}.")
+        for axis, wraps in enumerate(self.periodic):
+            bounds, domain = self.bounds[axis], self.domain[axis]
+            if wraps and max(abs(a - b) for a, b in zip(bounds, domain, strict=True)) > _SAME * (domain[1] - domain[0]):
+                raise ConfigError(
+                    f"Axis {axis} is periodic: the bounds {bounds} and the domain {domain} must be the same, one period"
+                    " apart."
+                )
         if not (self.dt > 0 and self.particle_volume > 0):
             raise ConfigError(f"dt = {self.dt} and particle_volume = {self.particle_volume} must be positive.")
         if not self.materials or len(set(self.materials)) != len(self.materials):

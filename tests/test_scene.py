@@ -44,7 +44,8 @@ def test_volume_is_that_of_the_bounds_and_spacing_that_of_a_lattice():
 
 
 def test_survives_as_plain_data():
-    scene = dataclasses.replace(BOX, boundary=("periodic", "wall"), obstacles=True)
+    channel = {"boundary": ("periodic", "wall"), "domain": ((0.1, 0.9), (0.08, 0.92))}
+    scene = dataclasses.replace(BOX, **channel, obstacles=True)
     assert Scene.from_dict(scene.to_dict()) == scene
     assert "densities" not in scene.to_dict()  # as in files from before there were any
     weighed = dataclasses.replace(BOX, densities=(1000.0,))
@@ -67,6 +68,7 @@ def test_densities_change_neither_channels_nor_what_a_model_suits():
         ({"materials": ()}, "material"),
         ({"materials": ("goop", "goop")}, "once"),
         ({"boundary": ("wall", "mirror")}, "mirror"),
+        ({"boundary": ("wall", "periodic")}, "Axis 1 is periodic.* must be the same, one period apart"),
         ({"particle_volume": float("nan")}, "particle_volume"),
         ({"densities": (1.0, 2.0)}, "densities"),
         ({"densities": (0.0,)}, "positive and finite"),

@@ -183,29 +183,27 @@ def _simulate_parts(request: SimulationRequest, folder: Path, wanted: Sequence[t
         return
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
     # Threads suffice, as the simulators' compiled loops release the GIL.
-    pool, interrupted = ThreadPoolExecutor(min(workers, len(missing))), threading.Event()
+    pool, stopped = ThreadPoolExecutor(min(workers, len(missing))), threading.Event()
     try:
         with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
             for future in as_completed(
-                [pool.submit(_simulate_part, request, folder, s, i, interrupted) for s, i in missing]
+                [pool.submit(_simulate_part, request, folder, s, i, stopped) for s, i in missing]
             ):
                 future.result()
                 advance()
-    except KeyboardInterrupt:
-        interrupted.set()
+    except BaseException:  # Ctrl-C, or a simulation that failed: the others need not end before it shows
+        stopped.set()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _simulate_part(
-    request: SimulationRequest, folder: Path, split: str, index: int, interrupted: threading.Event
-) -> None:
-    def stop_if_interrupted(_: int) -> None:
-        if interrupted.is_set():
+def _simulate_part(request: SimulationRequest, folder: Path, split: str, index: int, stopped: threading.Event) -> None:
+    def stop_early(_: int) -> None:
+        if stopped.is_set():
             raise CancelledError
 
-    run = simulate_first_stable(request.preset, request.entropy(split, index), stop_if_interrupted)
+    run = simulate_first_stable(request.preset, request.entropy(split, index), stop_early)
     write_part(part_path(folder, split, index), run)
 
 

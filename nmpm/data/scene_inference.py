@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,8 +48,9 @@ def infer_scene(
         fields: Names, instead of the metadata's.
 
     Raises:
-        DataError: if files are missing or wrong, a trajectory lacks a field, or a position lies outside the domain that
-            the metadata states.
+        DataError: if files are missing or wrong, a trajectory lacks a field, a position lies outside the domain that
+            the metadata states, that domain is not the period of a periodic axis, or all trajectories contradict the
+            metadata's gravity.
         ConfigError: if an argument does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
     folder = Path(folder)
@@ -78,7 +79,7 @@ def infer_scene(
         materials=materials,
         particle_volume=metadata.particle_volume or _volume(observed, metadata, folder),
         boundary=tuple("periodic" if flag else "wall" for flag in metadata.periodic),
-        gravity=metadata.gravity or (gravities[0] if len(gravities) == 1 else None),
+        gravity=_common_gravity(gravities, metadata, split),
         gravity_varies=len(gravities) > 1,
         obstacles=bool(types & metadata.static_types),
         densities=_densities(materials, metadata),
@@ -122,7 +123,7 @@ def check_gravity(given: tuple[float, ...] | None, stated: tuple[float, ...] | N
     Raises:
         ConfigError: naming both, if they differ.
     """
-    if stated is not None and not (len(given or ()) == len(stated) and np.allclose(given or (), stated, atol=1e-6)):
+    if stated is not None and not _same_gravity(given or (), stated):
         raise ConfigError(
             f"gravity = {list(given or ())} contradicts {path}, which states gravity {list(stated)}. Leave the option"
             " out to use the file's; if the file is wrong, write a corrected copy with nmpm convert FOLDER NEW"
@@ -161,10 +162,46 @@ def _densities(materials: tuple[str, ...], metadata: Metadata) -> tuple[float, .
 
 
 def _gravities(split: Split, metadata: Metadata) -> tuple[tuple[float, ...], ...]:
-    """The distinct gravities of the trajectories; one without its own has the dataset's."""
-    stated = [split.attributes(index).get("gravity") for index in range(len(split))]
-    known = [tuple(np.atleast_1d(value).tolist()) if value is not None else metadata.gravity for value in stated]
-    return tuple(dict.fromkeys(value for value in known if value is not None))
+    """The distinct gravities of the trajectories."""
+    return distinct_gravities(trajectory_gravity(split, index, metadata) for index in range(len(split)))
+
+
+def trajectory_gravity(split: Split, index: int, metadata: Metadata) -> tuple[float, ...] | None:
+    """A trajectory's own gravity, or else the dataset's; None if neither is stated."""
+    stated = split.attributes(index).get("gravity")
+    return metadata.gravity if stated is None else tuple(np.ravel(stated).tolist())
+
+
+def distinct_gravities(known: Iterable[tuple[float, ...] | None]) -> tuple[tuple[float, ...], ...]:
+    """The different ones among gravities, without None; one if all are the same.
+
+    Numbers are compared as `check_gravity` does: a float32 attribute beside the metadata's float64 is no other gravity.
+    """
+    distinct = tuple(dict.fromkeys(value for value in known if value is not None))
+    return distinct[:1] if all(_same_gravity(distinct[0], other) for other in distinct) else distinct
+
+
+def _same_gravity(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    return len(one) == len(other) and np.allclose(one, other, atol=1e-6)
+
+
+def _common_gravity(
+    gravities: tuple[tuple[float, ...], ...], metadata: Metadata, split: Split
+) -> tuple[float, ...] | None:
+    """The metadata's gravity, or else that of all trajectories; None if neither is known.
+
+    Raises:
+        DataError: if all trajectories state one that is not the metadata's: models would learn theirs, and fall by the
+            metadata's.
+    """
+    only = gravities[0] if len(gravities) == 1 else None
+    if metadata.gravity and only is not None and not _same_gravity(metadata.gravity, only):
+        raise DataError(
+            f"{split.path}: all trajectories have the attribute gravity {list(only)}, but {METADATA_FILE} states"
+            f" {list(metadata.gravity)}. If the trajectories are right, write a corrected copy with nmpm convert FOLDER"
+            f" NEW --gravity={','.join(f'{value:g}' for value in only)}; otherwise remove their attribute."
+        )
+    return metadata.gravity or only
 
 
 @dataclass(frozen=True)
@@ -237,7 +274,7 @@ def _extents(
     """Bounds and domain, (lower, upper) per axis."""
     stated = metadata.domain or (None,) * metadata.dim
     pairs = [
-        _periodic_extent(metadata.bounds[axis], stated[axis])
+        _periodic_extent(metadata.bounds[axis], stated[axis], axis, folder)
         if metadata.periodic[axis]
         else _walled_extent(metadata.bounds[axis], stated[axis], observed, axis, folder)
         for axis in range(metadata.dim)
@@ -245,7 +282,13 @@ def _extents(
     return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
 
 
-def _periodic_extent(bounds: Interval, stated: Interval | None) -> tuple[Interval, Interval]:
+def _periodic_extent(bounds: Interval, stated: Interval | None, axis: int, folder: Path) -> tuple[Interval, Interval]:
+    if stated is not None and not np.allclose(bounds, stated, rtol=0, atol=1e-6 * (stated[1] - stated[0])):
+        raise DataError(
+            f"{folder / METADATA_FILE}: axis {axis} is periodic, but its bounds {list(bounds)} and domain"
+            f" {list(stated)} have different ends. Make them the same, one period apart, or leave the domain out, so"
+            " that the bounds are the period."
+        )
     return stated or bounds, stated or bounds
 
 

@@ -74,6 +74,15 @@ def _process_status(name: str) -> int:
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
 
 
+def is_machine_failure(error: BaseException) -> bool:
+    """Whether an error was caused by the machine: memory, a file or a missing package. It may succeed the next time."""
+    cause = error.__cause__
+    if isinstance(cause, (MemoryError, OSError, ImportError, torch.OutOfMemoryError)):
+        return True
+    # torch raises a plain RuntimeError where the host's memory runs out.
+    return cause is not None and ("can't allocate memory" in str(cause) or is_machine_failure(cause))
+
+
 def describe_device(device: torch.device) -> str:
     """Name of the processor or GPU."""
     if device.type == "cuda":

@@ -73,6 +73,14 @@ class TestExtents:
         assert scene.domain[0] == scene.bounds[0] == (0.1, 0.9)
         assert scene.domain[1] != scene.bounds[1]
 
+    def test_a_domain_that_is_not_the_period_is_refused(self, scene_of):
+        stated = replace(BOX, periodic=(True, False), domain=((0.08, 0.92),) * 2)
+        with pytest.raises(DataError, match=r"metadata.json: axis 0 is periodic.*\[0.1, 0.9\].*\[0.08, 0.92\].*same"):
+            scene_of(run(lattice(0.01)), metadata=stated)
+        period = replace(stated, bounds=((0.08, 0.92), (0.1, 0.9)))
+        assert scene_of(run(lattice(0.01)), metadata=period).domain == stated.domain
+        assert scene_of(run(lattice(0.01)), metadata=stated, bounds=[(0, 1)] * 2).domain[0] == (0, 1)
+
     def test_arguments_override_the_metadata(self, scene_of):
         scene = scene_of(run(lattice(0.01)), bounds=[(0, 2), (0, 1)], gravity=[0, -1])
         assert scene.bounds == ((0, 2), (0, 1))
@@ -162,6 +170,21 @@ class TestGravity:
         scene = scene_of(run(lattice(0.01)), run(lattice(0.01), gravity=[0.0, -2.0]), metadata=known)
         assert scene.gravity == (0, -9.81)
         assert scene.gravity_varies
+
+    def test_float32_is_no_other_gravity(self, scene_of):
+        known = replace(BOX, gravity=(0.0, -9.81))
+        single = run(lattice(0.01), gravity=np.array([0, -9.81], np.float32))
+        scene = scene_of(single, run(lattice(0.01)), metadata=known)
+        assert scene.gravity == (0, -9.81)
+        assert not scene.gravity_varies
+
+    def test_trajectories_that_all_contradict_the_metadata_are_refused(self, scene_of):
+        known = replace(BOX, gravity=(0.0, -9.81))
+        other = [run(lattice(0.01), gravity=[0.0, -5.0])] * 2
+        with pytest.raises(
+            DataError, match=r"train.h5.*\[0.0, -5.0\].*metadata.json states \[0.0, -9.81\].*--gravity=0,-5.*attribute"
+        ):
+            scene_of(*other, metadata=known)
 
     def test_a_gravity_that_contradicts_the_files_is_refused(self, scene_of):
         known = replace(BOX, gravity=(0.0, -9.81))

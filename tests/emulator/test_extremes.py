@@ -134,7 +134,9 @@ def test_an_origin_too_far_for_float32_is_refused_by_name():
     scene = far_away(1e8)
     particles = cloud(box(gravity=None))
     particles = particles.with_motion(particles.position + 1e8, particles.velocity)
-    with pytest.raises(DataError, match=r"float32 numbers have a spacing of 8 near 1e\+08.*give positions in float64"):
+    with pytest.raises(
+        DataError, match=r"float32 numbers have a spacing of 8 near 1e\+08.*subtract its lower corner.*float64"
+    ):
         rollout(emulator_of(scene), particles, 2)
 
 

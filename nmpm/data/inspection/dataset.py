@@ -16,6 +16,7 @@ from nmpm.data.inspection.survey import Survey
 from nmpm.data.inspection.tolerance import open_splits, tolerant_metadata, with_guessed_family
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.progress import progress_bar
+from nmpm.data.scene_inference import distinct_gravities, trajectory_gravity
 from nmpm.data.statistics import MotionStatistics, find_disagreements
 from nmpm.errors import DataError, NmpmError
 from nmpm.scene import Scene
@@ -32,7 +33,7 @@ class _Tally:
     moving: dict[str, list[int]] = field(default_factory=dict)
     static: dict[str, list[int]] = field(default_factory=dict)
     materials: dict[str, list[int]] = field(default_factory=dict)
-    gravities: set[tuple[float, ...] | None] = field(default_factory=set)
+    gravities: list[tuple[float, ...] | None] = field(default_factory=list)
 
 
 def inspect(origin: FolderSource, trajectories: int | None = None) -> Inspection:
@@ -144,8 +145,7 @@ def _tally(splits: Mapping[str, Split], metadata: Metadata) -> _Tally:
             for number in np.unique(types).tolist():
                 material = metadata.particle_types.get(number, f"type {number}")
                 tally.materials.setdefault(material, []).append(int((types == number).sum()))
-            gravity = split.attributes(index).get("gravity")
-            tally.gravities.add(None if gravity is None else tuple(np.ravel(gravity).tolist()))
+            tally.gravities.append(trajectory_gravity(split, index, metadata))
     return tally
 
 
@@ -181,7 +181,7 @@ def _split_facts(name: str, tally: _Tally, inspected: int) -> SplitFacts:
 def _varies(tally: _Tally) -> tuple[str, ...]:
     total = sum(map(len, tally.frames.values()))
     differing = {
-        "gravity": len(tally.gravities) > 1,
+        "gravity": len(distinct_gravities(tally.gravities)) > 1,
         "materials": any(len(counts) < total for counts in tally.materials.values()),
         "particles": len({n for counts in tally.moving.values() for n in counts}) > 1,
         "frames": len({n for counts in tally.frames.values() for n in counts}) > 1,

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from nmpm.data.loading.background import run_in_thread
-from nmpm.data.loading.padded_batch import PaddedRecordings
+from nmpm.data.loading.padded_batch import PaddedRecordings, displacements
 from nmpm.data.loading.recording import Recording
 from nmpm.data.loading.window_plan import Drawn, WindowPlan
 from nmpm.particles import Window
@@ -46,11 +46,12 @@ class MotionSampler:
 
     Args:
         recordings: By index of the trajectory.
+        scene: Their scene.
         length: Frames of a window.
     """
 
-    def __init__(self, recordings: Mapping[int, Recording], length: int) -> None:
-        distances = {index: _window_distances(recording, length) for index, recording in recordings.items()}
+    def __init__(self, recordings: Mapping[int, Recording], scene: Scene, length: int) -> None:
+        distances = {index: _window_distances(recording, scene, length) for index, recording in recordings.items()}
         self.windows = [(index, start) for index, distance in distances.items() for start in range(len(distance))]
         self.cumulative = np.cumsum(np.concatenate(list(distances.values())))
 
@@ -63,10 +64,10 @@ class MotionSampler:
         return self.windows[min(int(np.searchsorted(self.cumulative, distance, side="right")), len(self.windows) - 1)]
 
 
-def _window_distances(recording: Recording, length: int) -> np.ndarray:
+def _window_distances(recording: Recording, scene: Scene, length: int) -> np.ndarray:
     """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
-    frames = recording.frames.numpy()
-    speed = np.linalg.norm(np.diff(frames, axis=0), axis=-1).mean(axis=-1, dtype=np.float64)
+    steps = displacements(recording.frames, scene).numpy()
+    speed = np.linalg.norm(steps, axis=-1).mean(axis=-1, dtype=np.float64)
     total = np.concatenate([[0.0], np.cumsum(speed)])
     return np.asarray(total[length - 1 :] - total[: len(total) - length + 1])
 
@@ -167,5 +168,5 @@ class TrajectoryBuffer:
         padded = PaddedRecordings.stack(loaded, self.provider.scene)
         # Views of the padded tensor, so that the memory of the loaded recordings is freed.
         recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}
-        motion = MotionSampler(recordings, self.plan.length) if self.plan.emphasis else None
+        motion = MotionSampler(recordings, self.provider.scene, self.plan.length) if self.plan.emphasis else None
         return _BufferContents(padded.to(self.device), recordings, motion)

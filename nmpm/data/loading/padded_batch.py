@@ -130,6 +130,16 @@ def unwrap(frames: Tensor, scene: Scene) -> None:
             along[:, 1:] -= turns * period
 
 
+def displacements(frames: Tensor, scene: Scene) -> Tensor:
+    """Displacements (T - 1, N, D) between frames (T, N, D), by minimum image on periodic axes."""
+    found = frames.diff(dim=0)
+    for axis, (low, high) in enumerate(scene.domain):
+        if scene.periodic[axis]:
+            period, along = high - low, found[..., axis]
+            along -= torch.round(along / period) * period
+    return found
+
+
 def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
     """By name (S, T, N), (S, 1, N) or (S, 1, 1); zero in padding."""
     stacked = {}

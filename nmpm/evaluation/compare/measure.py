@@ -10,12 +10,13 @@ import numpy as np
 from torch import Tensor
 
 from nmpm._support.messages import one_line
-from nmpm.errors import DataError, NmpmError
+from nmpm.errors import NmpmError
 from nmpm.evaluation.compare.outcome import Floats, Outcome
 from nmpm.evaluation.compare.predictors import Candidate
+from nmpm.evaluation.machine import is_machine_failure
 from nmpm.evaluation.trade.accuracy import FAILED
 from nmpm.evaluation.trade.choice import Choice, Kind
-from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, measure_errors
+from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 from nmpm.evaluation.trade.timing import Timing, known_times, measure_times
@@ -82,28 +83,24 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int) -> dict[str, Any]
     """Errors, the error's curve and, of the first scene, the shown frames; "failed" with the reason."""
     window = scenes.window([index])
     try:
-        predicted = choice.prepare(scenes, [index])(scenes.frames(index)).cpu().float()
-        _require_finite(predicted)
+        prediction = choice.predict(scenes, index, scenes.frames(index))
     except NmpmError as error:
+        if is_machine_failure(error):
+            raise
         return {FAILED: one_line(error)}
-    moving = window.mask[0]
+    predicted, moving = prediction.position, window.mask[0]
     ours, theirs = predicted[0, :, moving], window.target[0, :, moving]
     errors: dict[str, float] = measure_errors(scenes.scene, window, predicted, _MEASURES)
     errors["emd"] = earth_mover_of_materials(ours[-1:], theirs[-1:], window.material[0, moving], MATCHED)
-    gain = errors.pop(GAIN, 0.0)
+    followed = errors.pop(GAIN)
+    gain = followed if prediction.gain is None else prediction.gain
     curve = (ours - theirs).double().square().mean((1, 2))
     found: dict[str, Any] = {"errors": errors, "curve": [float(f"{value:.5g}") for value in curve.tolist()]}
     if gain > MOST_GAIN:
         found[FAILED] = f"gains {gain:.0%} of energy"
     if index == 0:
-        found["frames"] = _pack(ours[shown_frames(scenes)])
+        found["frames"] = _pack(into_domain(scenes.scene, ours[shown_frames(scenes)]))
     return found
-
-
-def _require_finite(predicted: Tensor) -> None:
-    if not predicted.isfinite().all():
-        frame = int((~predicted.isfinite()).flatten(2).any(-1).nonzero()[0, 1])
-        raise DataError(f"Positions are not finite from predicted frame {frame + 1} on.")
 
 
 def _collect(candidate: Candidate, scenes: Scenes, store: Store, timing: Timing) -> Outcome:

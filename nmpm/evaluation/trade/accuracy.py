@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from nmpm._support.messages import one_line
-from nmpm.errors import DataError, NmpmError
-from nmpm.evaluation.trade.choice import Choice
-from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, measure_errors
+from nmpm.errors import NmpmError
+from nmpm.evaluation.machine import is_machine_failure
+from nmpm.evaluation.trade.choice import Choice, Prediction
+from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 
@@ -49,24 +50,25 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
     try:
         predicted = _predict(choice, scenes, index, frames, store)
     except NmpmError as error:
+        if is_machine_failure(error):
+            raise
         return {FAILED: one_line(error)}
-    found: dict[str, Any] = dict(measure_errors(scenes.scene, scenes.window([index]), predicted, measures))
-    if found.get(GAIN, 0.0) > MOST_GAIN:
+    found: dict[str, Any] = dict(measure_errors(scenes.scene, scenes.window([index]), predicted.position, measures))
+    if predicted.gain is not None:
+        found[GAIN] = predicted.gain
+    if found[GAIN] > MOST_GAIN:
         found[FAILED] = f"gains {found[GAIN]:.0%} of energy"
     if index == 0:
-        found[PICTURE] = thumbnail(scenes, predicted[0, shown_frame(scenes)])
+        found[PICTURE] = thumbnail(scenes, predicted.position[0, shown_frame(scenes)])
     return found
 
 
-def _predict(choice: Choice, scenes: Scenes, index: int, frames: int, store: Store) -> Tensor:
+def _predict(choice: Choice, scenes: Scenes, index: int, frames: int, store: Store) -> Prediction:
     key, scene = dict(choice.identity), scenes.digests[index]
     stored = store.read_prediction(key, scene, frames)
     if stored is not None:
         return stored
-    predicted = choice.prepare(scenes, [index])(frames).cpu().float()
-    if not predicted.isfinite().all():
-        frame = int((~predicted.isfinite()).flatten(2).any(-1).nonzero()[0, 1])
-        raise DataError(f"Positions are not finite from predicted frame {frame + 1} on.")
+    predicted = choice.predict(scenes, index, frames)
     store.write_prediction(key, scene, predicted)
     return predicted
 
@@ -79,6 +81,7 @@ def shown_frame(scenes: Scenes) -> int:
 def thumbnail(scenes: Scenes, position: Tensor) -> str:
     """Positions (N, D) along the first two axes in 256 steps of the domain, as base64; a part of many particles."""
     every = -(-position.shape[0] // _SHOWN)
+    inside = into_domain(scenes.scene, position[::every])
     low, high = position.new_tensor(scenes.scene.domain)[:2].T
-    steps = ((position[::every, :2] - low) / (high - low) * 255).round().clamp(0, 255).to(torch.uint8)
+    steps = ((inside[:, :2] - low) / (high - low) * 255).round().clamp(0, 255).to(torch.uint8)
     return base64.b64encode(steps.numpy().tobytes()).decode("ascii")

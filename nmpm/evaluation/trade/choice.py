@@ -6,12 +6,14 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from nmpm.errors import DataError
 from nmpm.evaluation.trade.scenes import Scenes
 
 Rollout = Callable[[int], Tensor]
@@ -31,6 +33,20 @@ class Kind(StrEnum):
     SIMULATOR = "simulator"
     TRIVIAL = "trivial"
     FLOOR = "floor"
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One predicted scene.
+
+    Args:
+        position: (1, T, N, D) of the recorded particles, in domain length.
+        gain: Energy gain of the choice's own particles, see `errors.energy_gain`; None where these are the recorded
+            ones, so that the positions tell it.
+    """
+
+    position: Tensor
+    gain: float | None = None
 
 
 class Choice(ABC):
@@ -64,6 +80,30 @@ class Choice(ABC):
         Returns:
             Predicts the frames after each scene's first two. It raises an NmpmError where it fails.
         """
+
+    def computed_frames(self, frames: int) -> int:
+        """Frames that a rollout of so many frames computes: the time of a frame is its time over these."""
+        return frames
+
+    def predict(self, scenes: Scenes, index: int, frames: int) -> Prediction:
+        """Predict one scene, which is not timed.
+
+        Raises:
+            NmpmError: if it fails; a DataError if positions are not finite.
+        """
+        return Prediction(require_finite(self.prepare(scenes, [index])(frames).cpu().float()))
+
+
+def require_finite(position: Tensor) -> Tensor:
+    """The positions (B, T, N, D).
+
+    Raises:
+        DataError: if any is not finite, naming the first such frame.
+    """
+    broken = (~position.isfinite()).flatten(2).any(-1).any(0)
+    if bool(broken.any()):
+        raise DataError(f"Positions are not finite from predicted frame {int(broken.nonzero()[0, 0]) + 1} on.")
+    return position
 
 
 def digest(plain: Any) -> str:

@@ -9,7 +9,9 @@
 | height | deviation of the mean height above the floor in the last frame, relative |
 | crowding | deviation of the particles per occupied cell in the last frame, relative |
 
-`gain` is the energy gained beyond the initial one, as a share of it: no error, but a mark of instability.
+`gain` is the energy gained beyond the initial one, as a share of it: no error, but a mark of instability. Where a
+choice simulates other particles than the recorded ones it is that of its own, see `choice.Prediction`: recorded ones
+that follow them weigh them unevenly, and seem to gain energy that no simulated particle has.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
 
-REVISION = 2
+REVISION = 3
 """Increased whenever the same prediction gets other errors."""
 
 GAIN = "gain"
@@ -87,19 +89,27 @@ def field_error(scene: Scene, ours: Tensor, theirs: Tensor, material: Tensor) ->
 
     Args:
         scene: Gives domain and particle spacing.
-        ours: (T, N, D) positions; those outside of the domain count at its border.
+        ours: (T, N, D) positions; those outside of the domain count as `into_domain` moves them.
         theirs: (T, N, D) likewise.
         material: (N,) index into the scene's materials.
     """
     chosen = _evenly_spaced(len(ours), _FIELD_FRAMES)
     grid, kinds = _counting_grid(scene), torch.nn.functional.one_hot(material, len(scene.materials)).to(ours.dtype)
-    low, high = ours.new_tensor(scene.domain).T
     values = kinds.expand(len(chosen), -1, -1)
     first, second = (
-        Linear().p2g(values, grid.to_cells(path[chosen].clamp(low, high), path.dtype), grid) for path in (ours, theirs)
+        Linear().p2g(values, grid.to_cells(into_domain(scene, path[chosen]), path.dtype), grid)
+        for path in (ours, theirs)
     )
     wrong = (first - second).abs().flatten(1).sum(1)
     return float((wrong / (first + second).flatten(1).sum(1)).mean())
+
+
+def into_domain(scene: Scene, position: Tensor) -> Tensor:
+    """Positions (..., D) moved into the domain: by whole periods, and to the border at walls."""
+    columns = []
+    for along, (low, high), periodic in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True):
+        columns.append(low + (along - low).remainder(high - low) if periodic else along.clamp(low, high))
+    return torch.stack(columns, dim=-1)
 
 
 def _earth_mover(ours: Tensor, theirs: Tensor, material: Tensor, count: int) -> float:
@@ -114,21 +124,35 @@ def _evenly_spaced(frames: int, count: int) -> NDArray[np.int64]:
 
 def _energies(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> dict[str, float]:
     moving = window.mask[0]
-    densities = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)
-    mass = densities[window.material[0, moving]]
-    share = mass / mass.sum()
+    material, gravity = window.material[0, moving], window.gravity[0].double()
     start = window.frames[0, :2, moving].double()
-    kinetic, total = _energy(scene, torch.cat([start, ours]), share, window.gravity[0].double())
-    truth, _ = _energy(scene, torch.cat([start, theirs]), share, window.gravity[0].double())
-    initial = float(total[0])
+    kinetic, total = _energy(scene, torch.cat([start, ours]), material, gravity)
+    truth, _ = _energy(scene, torch.cat([start, theirs]), material, gravity)
     found = {"kinetic": float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))}
-    if initial > 0:
-        found[GAIN] = float(total.max() / initial - 1)
-    return found
+    return found | {GAIN: _gain(total)}
 
 
-def _energy(scene: Scene, path: Tensor, share: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
+def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> float:
+    """Most energy in a path beyond that between its first two frames, as a share of that; 0 where that has none.
+
+    Args:
+        scene: Gives bounds and densities.
+        path: (T, N, D) positions of all moving particles, which have the same volume.
+        material: (N,) index into the scene's materials.
+        gravity: (D,) in length per frame squared.
+    """
+    return _gain(_energy(scene, path.double(), material, gravity.double())[1])
+
+
+def _gain(total: Tensor) -> float:
+    initial = float(total[0])
+    return float(total.max() / initial - 1) if initial > 0 else 0.0
+
+
+def _energy(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
     """Kinetic, and kinetic and potential energy per mass between frames, (T - 1,), of a path (T, N, D)."""
+    mass = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)[material]
+    share = mass / mass.sum()
     steps = path.diff(dim=0)
     kinetic = (steps.square().sum(-1) * share).sum(-1) / 2
     middle = (path[1:] + path[:-1]) / 2
@@ -139,8 +163,7 @@ def _energy(scene: Scene, path: Tensor, share: Tensor, gravity: Tensor) -> tuple
 
 def _shapes(scene: Scene, state: Particles, ours: Tensor, theirs: Tensor) -> dict[str, float]:
     grid = _counting_grid(scene)
-    low, high = ours.new_tensor(scene.domain).T
-    shapes = [measure_shape(scene, grid, state, position.clamp(low, high)) for position in (ours, theirs)]
+    shapes = [measure_shape(scene, grid, state, into_domain(scene, position)) for position in (ours, theirs)]
     relative = shapes[0].relative_to(shapes[1])
     return {name: abs(relative[name] - 1) for name in ("height", "crowding")}
 

@@ -57,6 +57,9 @@ class ModelChoice(Choice):
         state = scenes.window(indices, 0).to(self.device).initial
         return lambda frames: rollout(self.emulator, state, frames)
 
+    def computed_frames(self, frames: int) -> int:
+        return -(-frames // self.emulator.frames) * self.emulator.frames  # whole bundles
+
 
 def over_scenes(name: str, emulator: Emulator, scenes: Scenes) -> Emulator:
     """The emulator itself, or rebuilt for these scenes if it was trained on others, see `EmulatorRecipe.over`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +12,7 @@ from pathlib import Path
 import torch
 
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
@@ -56,15 +57,15 @@ class Scenes:
 
     def moving_frames(self, index: int) -> int:
         """Predicted frames until the scene comes to rest, see `MOVING`; at least 1."""
-        steps = self.recordings[index].frames[1:].diff(dim=0)
+        steps = displacements(self.recordings[index].frames[1:], self.scene)
         speed = steps.square().sum(-1).mean(-1).sqrt()
         moving = (speed >= MOVING * speed.max()).nonzero()
         return int(moving[-1]) + 1 if len(moving) else 1
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
-        """SHA-256 of each scene's positions, materials and gravity, in short."""
-        return tuple(_digest(recording) for recording in self.recordings)
+        """SHA-256 of what predictions and errors of each scene depend on, in short: its facts and its recording."""
+        return tuple(_digest(self.scene, recording) for recording in self.recordings)
 
 
 def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = None) -> Scenes:
@@ -117,9 +118,11 @@ def _check_start(scenes: Scenes) -> None:
         )
 
 
-def _digest(recording: Recording) -> str:
-    digest = hashlib.sha256()
-    for values in (recording.frames, recording.material, recording.obstacle, recording.gravity):
-        digest.update(f"{values.dtype} {tuple(values.shape)};".encode())
+def _digest(scene: Scene, recording: Recording) -> str:
+    digest = hashlib.sha256(json.dumps(scene.to_dict(), sort_keys=True).encode())
+    own = {name: getattr(recording, name) for name in ("frames", "material", "obstacle", "gravity")}
+    fields = {f"field {name}": values for name, values in sorted(recording.fields.items())}
+    for name, values in (own | fields).items():
+        digest.update(f";{name} {values.dtype} {tuple(values.shape)};".encode())
         digest.update(values.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

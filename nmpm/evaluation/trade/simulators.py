@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nmpm.evaluation.trade.choice import Choice, Kind, Rollout
+from nmpm.evaluation.trade.choice import Choice, Kind, Prediction, Rollout, require_finite
+from nmpm.evaluation.trade.errors import energy_gain
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.sim import Preset
+from nmpm.sim.initial_state import InitialState
 from nmpm.sim.nudge import nudge
 
 
@@ -22,7 +24,8 @@ class SimulatorChoice(Choice):
     """A simulator, from the initial state of each trajectory, of which frames 0 and 1 are left out.
 
     Where its particles are others than the recorded ones (larger particles of SPH), a recorded particle moves like
-    the simulated one that was nearest to it initially.
+    the simulated one that was nearest to it initially. Errors are those of the recorded particles, the energy gain is
+    that of the simulated ones.
 
     Args:
         name: Unique among the choices.
@@ -47,17 +50,35 @@ class SimulatorChoice(Choice):
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         (index,) = indices
-        recorded = scenes.recordings[index].frames[:2]
+        start = self._draw(scenes, index)
+        follow = follow_nearest(scenes.recordings[index].frames[0], start.position)
+        return lambda frames: follow(self._simulate(start, frames))[2:].unsqueeze(0)
+
+    def computed_frames(self, frames: int) -> int:
+        return frames + 1  # from the initial state on, of which a rollout leaves out two frames
+
+    def predict(self, scenes: Scenes, index: int, frames: int) -> Prediction:
+        start, recording = self._draw(scenes, index), scenes.recordings[index]
+        simulated = self._simulate(start, frames)
+        first = recording.frames[0]
+        position = require_finite(follow_nearest(first, start.position)(simulated)[2:].unsqueeze(0))
+        if first.shape == simulated[0].shape:
+            return Prediction(position)
+        return Prediction(position, self._gain(start, simulated, recording.gravity))
+
+    def _draw(self, scenes: Scenes, index: int) -> InitialState:
         start = self.preset.draw(scenes.seeds[index])
-        if self.nudge:
-            start = nudge(self.preset, start, self.nudge, scenes.seeds[index])
-        follow = follow_nearest(recorded[0], start.position)
+        return nudge(self.preset, start, self.nudge, scenes.seeds[index]) if self.nudge else start
 
-        def run(frames: int) -> Tensor:
-            simulated = self.preset.simulate_from(start, frames + 1).position[:, : len(start.position)]
-            return follow(torch.from_numpy(simulated))[2:].unsqueeze(0)
+    def _simulate(self, start: InitialState, frames: int) -> Tensor:
+        """(frames + 2, M, D): the initial state, the frame that every rollout starts from, and the predicted ones."""
+        return torch.from_numpy(self.preset.simulate_from(start, frames + 1).position[:, : len(start.position)])
 
-        return run
+    def _gain(self, start: InitialState, simulated: Tensor, gravity: Tensor) -> float:
+        """Energy gain of the simulated particles (T, M, D); `gravity` (D,) in length per frame squared."""
+        counts = torch.tensor(start.counts or (len(start.position),))
+        material = torch.arange(len(counts)).repeat_interleave(counts)
+        return energy_gain(self.preset.scene, require_finite(simulated.unsqueeze(0))[0], material, gravity)
 
 
 def follow_nearest(first: Tensor, start: NDArray[Any]) -> Callable[[Tensor], Tensor]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
-from nmpm.evaluation.trade.choice import digest
+from nmpm.evaluation.trade.choice import Prediction, digest
 
 
 class Store:
@@ -39,21 +39,25 @@ class Store:
         with atomic_write(self._path(kind, key)) as part:
             part.write_text(json.dumps({"key": key, "known": known}, indent=1) + "\n", encoding="utf-8")
 
-    def read_prediction(self, key: Any, scene: str, frames: int) -> Tensor | None:
-        """A stored prediction (1, frames, N, D), if there is one."""
+    def read_prediction(self, key: Any, scene: str, frames: int) -> Prediction | None:
+        """A stored prediction of so many frames, if there is one.
+
+        Those of former versions, which do not say what the choice's own particles gain, are none.
+        """
         try:
             with np.load(self._prediction(key, scene), allow_pickle=False) as arrays:
-                position = torch.from_numpy(arrays["position"])
+                position, gain = torch.from_numpy(arrays["position"]), float(arrays["gain"])
         except (OSError, ValueError, KeyError):
             return None
-        return position if position.shape[1] == frames else None
+        return Prediction(position, None if math.isnan(gain) else gain) if position.shape[1] == frames else None
 
-    def write_prediction(self, key: Any, scene: str, position: Tensor) -> None:
-        """Store a prediction (1, T, N, D), if predictions are kept."""
+    def write_prediction(self, key: Any, scene: str, predicted: Prediction) -> None:
+        """Store a prediction, if predictions are kept."""
         if self.keep_predictions:
             path = self._prediction(key, scene)
             with atomic_write(path) as part, part.open("wb") as file:
-                np.savez_compressed(file, position=position.cpu().numpy())
+                gain = math.nan if predicted.gain is None else predicted.gain
+                np.savez_compressed(file, position=predicted.position.numpy(), gain=np.float64(gain))
 
     def _path(self, kind: str, key: Any) -> Path:
         return self.folder / "points" / f"{kind}-{digest(key)}.json"

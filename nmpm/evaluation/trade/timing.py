@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from nmpm.errors import ConfigError, NmpmError
-from nmpm.evaluation.machine import clock_for, describe_device, peak_bytes
+from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, peak_bytes
 from nmpm.evaluation.trade.choice import Choice, digest
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
@@ -43,7 +43,7 @@ class Times:
     """What was timed of a choice.
 
     Args:
-        milliseconds: Per frame and scene, of each round.
+        milliseconds: Per computed frame and scene, of each round, see `Choice.computed_frames`.
         ratios: Of each round, over the reference's in the same round.
         memory: Peak in bytes, None where it is not known.
         clock: What the time is: "CPU time" or "wall time".
@@ -136,7 +136,10 @@ def _key(choice: Choice, scenes: Scenes, timing: Timing) -> dict[str, Any]:
 
 
 def _time_round(runner: _Runner, scenes: Scenes, turn: int, timing: Timing, warm_up: bool) -> float | None:
-    """Milliseconds per frame and scene; None where the choice fails, which is stored."""
+    """Milliseconds per computed frame and scene; None where the choice fails, which is stored.
+
+    Where the machine fails the error is raised, so that the round is repeated the next time.
+    """
     choice = runner.choice
     indices = [(turn + offset) % len(scenes) for offset in range(choice.batch)]
     frames = min(timing.frames, *(min(scenes.moving_frames(i), scenes.frames(i)) for i in indices))
@@ -152,8 +155,10 @@ def _time_round(runner: _Runner, scenes: Scenes, turn: int, timing: Timing, warm
         _, clock = clock_for(choice.device, choice.threads)
         start = clock()
         run(frames)
-        return 1e3 * (clock() - start) / (frames * choice.batch)
+        return 1e3 * (clock() - start) / (choice.computed_frames(frames) * choice.batch)
     except NmpmError as error:
+        if is_machine_failure(error):
+            raise
         runner.known["failed"] = str(error)
         return None
     finally:

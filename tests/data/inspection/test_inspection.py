@@ -67,6 +67,12 @@ def test_first_acceleration_in_free_fall_is_gravity(tmp_path):
     assert found.first_acceleration == pytest.approx((0.0, -9.81), abs=0.05)
 
 
+def test_a_float32_copy_of_the_stated_gravity_is_no_variation(tmp_path):
+    first, second = lattice(3), lattice(3)
+    first.attributes["gravity"] = np.array([0.0, -9.81], np.float32)
+    assert look(tmp_path, first, second, **(UNIT | {"gravity": (0.0, -9.81)})).varies == ()
+
+
 def test_what_varies(tmp_path):
     first, second = made_up_trajectory(12, 5), made_up_trajectory(14, 6, seed=1, statics=2)
     first.attributes["gravity"], second.attributes["gravity"] = [0.0, -1.0], [1.0, 0.0]

@@ -18,6 +18,7 @@ from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.window_plan import OPENING, WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Scene
 
 PLANS = st.builds(
     WindowPlan,
@@ -28,6 +29,11 @@ PLANS = st.builds(
     passes=st.sampled_from([0.3, 1, 4]),
     seed=st.integers(0, 2**40),
 )
+
+
+def square(**facts) -> Scene:
+    sides = ((0.0, 1.0),) * 2
+    return Scene(bounds=sides, domain=sides, dt=0.01, materials=("water",), particle_volume=1e-3, **facts)
 
 
 def recordings_of(folder) -> SplitRecordings:
@@ -205,13 +211,26 @@ def test_emphasis_draws_windows_in_proportion_to_their_motion():
     frames[:10] = torch.arange(10).view(-1, 1, 1) * 0.01  # moves for 10 frames, then rests
     frames[10:] = frames[9]
     recording = Recording(frames, torch.zeros(3, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
-    motion = MotionSampler({7: recording}, length=4)
+    motion = MotionSampler({7: recording}, square(), length=4)
     rng = np.random.default_rng(0)
     drawn = [motion.window_at(share) for share in rng.random(4000)]
     assert {trajectory for trajectory, _ in drawn} == {7}
     starts = np.bincount([start for _, start in drawn], minlength=37) / 4000
     expected = np.array([min(3, max(0, 9 - start)) for start in range(37)]) / 24
     np.testing.assert_allclose(starts, expected, atol=0.03)
+
+
+def test_emphasis_does_not_take_the_way_across_a_periodic_border_for_motion():
+    time = torch.arange(40).view(-1, 1, 1)
+
+    def recorded(start, speed):
+        frames = torch.cat([(start + speed * time).remainder(1.0), torch.full((40, 1, 1), 0.5)], -1)
+        return Recording(frames, torch.zeros(1, dtype=torch.long), torch.zeros(0, 2), torch.zeros(2))
+
+    slow, quick = recorded(0.99, 0.001), recorded(0.2, 0.01)  # the slow one crosses the border
+    motion = MotionSampler({0: slow, 1: quick}, square(boundary=("periodic", "wall")), length=10)
+    share = motion.cumulative[30] / motion.cumulative[-1]
+    np.testing.assert_allclose(share, 1 / 11, rtol=1e-4)
 
 
 def test_with_emphasis_a_batch_depends_on_its_index_only(make_dataset):

@@ -184,8 +184,10 @@ def test_damaged_files_are_named(simulator, tmp_path):
 def test_wrong_settings_are_named():
     with pytest.raises(ConfigError, match="width = 0"):
         GraphRecipe(SCENE, width=0)
-    with pytest.raises(ConfigError, match="periodic"):
-        GraphRecipe(dataclasses.replace(SCENE, boundary=("periodic", "wall")))
+    with pytest.raises(ConfigError, match="not for periodic axes"):
+        GraphRecipe(
+            dataclasses.replace(SCENE, boundary=("periodic", "wall"), domain=(SCENE.bounds[0], SCENE.domain[1]))
+        )
     with pytest.raises(ConfigError, match="read no fields, and the scene has heat"):
         GraphRecipe(dataclasses.replace(SCENE, evolving=("heat",)))
     with pytest.raises(ConfigError, match="seconds = 0"):

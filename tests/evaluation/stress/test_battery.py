@@ -185,7 +185,7 @@ def test_who_is_outside_or_nowhere_is_lost():
     position = torch.tensor([[0.5, 0.5], [0.95, 0.5], [0.5, 0.0], [float("nan"), 0.5], [0.08, 0.92]])
     assert is_lost(scene, position).tolist() == [False, True, True, True, False]
     assert beyond_walls(scene, position).tolist() == [False, True, True, False, False]
-    assert not is_lost(box(boundary=("periodic", "wall")), position[1])
+    assert not is_lost(box(boundary=("periodic", "wall"), bounds=((0.08, 0.92), (0.1, 0.9))), position[1])
 
 
 def test_energy_is_that_of_a_stone():

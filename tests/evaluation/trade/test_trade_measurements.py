@@ -1,7 +1,9 @@
 """Choices over a tiny simulated dataset: what they predict, and that stored measurements are taken up."""
 
+import base64
 import csv
 import dataclasses
+import itertools
 import json
 from importlib.util import find_spec
 
@@ -10,15 +12,22 @@ import pytest
 import torch
 
 from nmpm._support.digests import short_digest
+from nmpm.data.generate import generate
+from nmpm.data.loading.recording import Recording
 from nmpm.errors import ConfigError
 from nmpm.evaluation.baselines import free_fall
 from nmpm.evaluation.gns import GraphRecipe, TrainedGraph
-from nmpm.evaluation.trade import Choice, Kind, Store, count_steps, make_choices, measure
-from nmpm.evaluation.trade.accuracy import measure_accuracy
-from nmpm.evaluation.trade.errors import field_error, measure_errors
+from nmpm.evaluation.trade import Choice, Kind, Scenes, Store, count_steps, make_choices, measure, read_scenes
+from nmpm.evaluation.trade.accuracy import known_accuracy, measure_accuracy, thumbnail
+from nmpm.evaluation.trade.errors import field_error, into_domain, measure_errors
 from nmpm.evaluation.trade.simulators import SimulatorChoice, follow_nearest
 from nmpm.evaluation.trade.table import COLUMNS, csv_text
+from nmpm.evaluation.trade.timing import Timing, known_times, measure_times
 from nmpm.evaluation.trade.trivial import TrivialChoice
+from nmpm.scene import Scene
+from nmpm.sim import load_preset
+from nmpm.sim.sph.preset import SphPreset
+from nmpm.sim.trajectory import SimulatedTrajectory
 from tests.evaluation.trade.made_up import tiny_emulator, tiny_scenes, tiny_sweep
 
 
@@ -104,6 +113,84 @@ def test_stored_predictions_give_other_errors_without_predicting(scenes, tmp_pat
     monkeypatch.setattr(TrivialChoice, "prepare", lambda *_: pytest.fail("predicted again"))
     list(measure_accuracy(choice, scenes, dataclasses.replace(measures, horizons=(2,)), store))
     assert len(list(tmp_path.glob("predictions/*/*.npz"))) == 2
+
+
+@pytest.fixture(scope="module")
+def drops(tmp_path_factory):
+    """One test scene of a few drops of SPH water, of 16 frames, and the choice that simulates it coarser."""
+    preset = load_preset("wbcsph").coarsened(4).with_frames(16)
+    folder = tmp_path_factory.mktemp("drops")
+    generate(preset, folder, {"train": 0, "valid": 0, "test": 1}, workers=1)
+    return read_scenes("drops", folder, 1), SimulatorChoice("coarser", preset.coarsened(2), {})
+
+
+def simulate_as(path, monkeypatch):
+    """Let SPH presets simulate `path`, from the initial positions (M, D) and a number of frames."""
+
+    def simulate_from(self, start, frames, progress=None):
+        position = path(start.position, frames).astype(np.float32)
+        return SimulatedTrajectory(position, np.full(position.shape[1], 5), {})
+
+    monkeypatch.setattr(SphPreset, "simulate_from", simulate_from)
+
+
+def rise_and_fall(start, frames):
+    """The particle nearest to the floor rises like all others fall: the energy stays, unless it counts more often."""
+    rise = 5e-4 * np.arange(frames + 1) ** 2
+    path = np.repeat(start[None], frames + 1, axis=0)
+    path[..., 1] -= rise[:, None] / (len(start) - 1)
+    path[:, np.argmin(start[:, 1]), 1] = start[:, 1].min() + rise
+    return path
+
+
+def test_a_simulation_of_larger_particles_is_judged_by_their_own_energy(drops, tmp_path, monkeypatch):
+    scenes, coarser = drops
+    first = scenes.recordings[0].frames[0].clone()
+    start = coarser.preset.draw(scenes.seeds[0]).position
+    crowd = torch.from_numpy(start[np.argmin(start[:, 1])]).float()
+    first[: len(first) // 2] = crowd  # half of the recorded particles follow the one that rises
+    frames = first.expand_as(scenes.recordings[0].frames)
+    crowded = dataclasses.replace(scenes, recordings=(dataclasses.replace(scenes.recordings[0], frames=frames),))
+    simulate_as(rise_and_fall, monkeypatch)
+    predicted = coarser.predict(crowded, 0, crowded.frames(0))
+    followed = measure_errors(scenes.scene, crowded.window([0]), predicted.position, tiny_sweep().measures)["gain"]
+    assert followed > 0.05 > abs(predicted.gain)
+    (point,) = measure([coarser], crowded, tiny_sweep(), Store(tmp_path), lambda _: None)
+    assert point.stable
+
+
+def test_a_simulation_of_larger_particles_that_gains_energy_is_unstable(drops, tmp_path, monkeypatch):
+    scenes, coarser = drops
+    simulate_as(lambda start, frames: start + 0.002 * np.arange(frames + 1)[:, None, None] ** 2, monkeypatch)
+    store = Store(tmp_path, keep_predictions=True)
+    measures = tiny_sweep().measures
+    for judged in (measures, dataclasses.replace(measures, horizons=(2,))):  # anew, then of the stored prediction
+        list(measure_accuracy(coarser, scenes, judged, store))
+        assert "of energy" in known_accuracy(coarser, scenes, judged, store)[0]["failed"]
+        monkeypatch.setattr(SphPreset, "simulate_from", lambda *_: pytest.fail("simulated again"))
+
+
+def test_stored_predictions_keep_the_energy_gain_of_other_particles(drops, tmp_path, monkeypatch):
+    scenes, coarser = drops
+    store, measures = Store(tmp_path, keep_predictions=True), tiny_sweep().measures
+    list(measure_accuracy(coarser, scenes, measures, store))
+    (first,) = known_accuracy(coarser, scenes, measures, store)
+    other = dataclasses.replace(measures, horizons=(2,))
+    with monkeypatch.context() as patch:
+        patch.setattr(SphPreset, "simulate_from", lambda *_: pytest.fail("simulated again"))
+        list(measure_accuracy(coarser, scenes, other, store))
+    (again,) = known_accuracy(coarser, scenes, other, store)
+    assert again["gain"] == first["gain"]
+    assert "failed" not in again
+
+
+def test_a_stored_prediction_without_energy_gain_is_not_used(drops, tmp_path):
+    scenes, coarser = drops
+    store = Store(tmp_path, keep_predictions=True)
+    list(measure_accuracy(coarser, scenes, tiny_sweep().measures, store))
+    (path,) = tmp_path.glob("predictions/*/*.npz")
+    np.savez_compressed(path, position=np.load(path)["position"])  # as a former version wrote it
+    assert store.read_prediction(dict(coarser.identity), scenes.digests[0], scenes.frames(0)) is None
 
 
 class Made(Choice):
@@ -272,3 +359,109 @@ def test_the_field_error_asks_where_material_is_and_not_which_particle(scenes):
     half = torch.cat([left[:, ::2], right[:, 1::2]], dim=1)[:, : left.shape[1]]
     share = 1 - left[:, ::2].shape[1] / left.shape[1]
     np.testing.assert_allclose(field_error(scenes.scene, half, left, material), share, rtol=1e-6)
+
+
+def flow(start, steps):
+    """Scenes of 100 particles in a square of period 1 along x, that start at x = `start` and move by `steps` (T,)."""
+    scene = Scene(
+        bounds=((0.0, 1.0),) * 2, domain=((0.0, 1.0),) * 2, dt=0.01, materials=("water",), particle_volume=1e-3,
+        boundary=("periodic", "wall"), gravity=(0.0, -9.81),
+    )  # fmt: skip
+    places = np.stack(np.meshgrid(np.linspace(start, start + 0.2, 10), np.linspace(0.1, 0.4, 10)), -1).reshape(-1, 2)
+    shift = np.stack([np.concatenate([[0], np.cumsum(steps)]), np.zeros(len(steps) + 1)], -1)
+    frames = torch.from_numpy(places + shift[:, None]).float()
+    frames[..., 0] = frames[..., 0].remainder(1.0)
+    gravity = torch.tensor([0.0, -9.81e-4])
+    recording = Recording(frames, torch.zeros(100, dtype=torch.long), torch.zeros(0, 2), gravity)
+    return Scenes("flow", scene, (recording,))
+
+
+@pytest.mark.parametrize("turns", [-2, 1])
+def test_errors_of_fields_and_shapes_do_not_depend_on_whole_periods(turns):
+    scenes = flow(0.7, [0.02] * 30)  # across the border
+    window, measures = scenes.window([0]), tiny_sweep().measures
+    slower = flow(0.7, [0.02] + [0.015] * 29).window([0]).target
+    found = measure_errors(scenes.scene, window, slower, measures)
+    turned = measure_errors(scenes.scene, window, slower + torch.tensor([float(turns), 0.0]), measures)
+    assert 0.1 < found["field"] < 0.9
+    for name in ("field", "crowding", "height"):
+        np.testing.assert_allclose(turned[name], found[name], rtol=1e-3, atol=1e-6)
+
+
+def test_positions_beyond_a_wall_count_at_the_border_and_beyond_a_period_on_the_other_side():
+    scene = flow(0.0, [0.01]).scene
+    inside = into_domain(scene, torch.tensor([[1.25, 0.5], [-2.25, 1.5], [0.5, -0.5]]))
+    torch.testing.assert_close(inside, torch.tensor([[0.25, 0.5], [0.75, 1.0], [0.5, 0.0]]))
+
+
+def test_thumbnails_show_particles_within_the_period():
+    scenes = flow(0.7, [0.02] * 30)
+    position = scenes.recordings[0].frames[-1]
+    turned, shown = (
+        np.frombuffer(base64.b64decode(thumbnail(scenes, position + shift)), np.uint8).astype(int)
+        for shift in (torch.tensor([3.0, 0.0]), torch.zeros(2))
+    )
+    assert np.abs(turned - shown).max() <= 1  # of 256 steps, by rounding
+
+
+def test_rest_is_found_across_a_periodic_border():
+    slowing = 0.02 * 0.8 ** np.arange(40)
+    assert flow(0.9, slowing).moving_frames(0) == flow(0.1, slowing).moving_frames(0) < 30
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"bounds": ((0.0, 1.0), (0.05, 1.0))},
+        {"domain": ((0.0, 1.0), (-0.1, 1.1))},
+        {"boundary": ("wall", "wall")},
+        {"particle_volume": 2e-3},
+        {"dt": 0.02},
+    ],
+    ids=lambda facts: next(iter(facts)),
+)
+def test_errors_are_measured_anew_where_a_fact_of_the_scene_is_another(facts, tmp_path):
+    scenes, store, measures = flow(0.1, [0.01] * 8), Store(tmp_path), tiny_sweep().measures
+    choice = TrivialChoice("free fall")
+    list(measure_accuracy(choice, scenes, measures, store))
+    assert known_accuracy(choice, scenes, measures, store)[0]
+    other = dataclasses.replace(scenes, scene=dataclasses.replace(scenes.scene, **facts))
+    assert known_accuracy(choice, other, measures, store) == [{}]
+
+
+def test_digests_tell_fields_apart():
+    scenes = flow(0.1, [0.01] * 8)
+
+    def with_fields(**fields):
+        heated = dataclasses.replace(scenes.recordings[0], fields=fields)
+        return dataclasses.replace(scenes, recordings=(heated,)).digests
+
+    cold, warm = torch.zeros(9, 100), torch.ones(9, 100)
+    found = [with_fields(**fields) for fields in ({}, {"heat": cold}, {"heat": warm}, {"salt": warm})]
+    assert len(set(found)) == 4
+    assert with_fields(heat=warm, salt=cold) == with_fields(salt=cold, heat=warm)
+
+
+def test_times_are_per_frame_that_is_computed(scenes, choices, monkeypatch, tmp_path):
+    timed = [choices[0], named(choices, "carried"), named(choices, "carried, batch 2"), named(choices, "free fall")]
+    ticks = itertools.count()  # each rollout takes a second
+    monkeypatch.setattr("nmpm.evaluation.trade.timing.clock_for", lambda *_: ("a clock", lambda: next(ticks)))
+    timing, store = Timing(rounds=1, frames=3), Store(tmp_path)
+    list(measure_times(timed, timed[0], scenes, timing, store))
+    frames = [1e3 / known_times(choice, scenes, timing, store).milliseconds[0] for choice in timed]
+    assert frames == pytest.approx([4, 4, 8, 3])  # one more; a bundle of 2 more, of one and of two scenes; as asked
+
+
+def test_what_the_machine_cannot_do_is_raised_and_tried_again(scenes, tmp_path):
+    def exhaust(_):
+        raise ConfigError("the network cannot be compiled") from MemoryError()
+
+    sweep, store = tiny_sweep(), Store(tmp_path)
+    bad = Made("machine", exhaust)
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        list(measure_accuracy(bad, scenes, sweep.measures, store))
+    with pytest.raises(ConfigError, match="cannot be compiled"):
+        list(measure_times([bad], bad, scenes, sweep.timing, store))
+    bad.make = lambda target: target
+    (point,) = measure([bad], scenes, sweep, store, lambda _: None)
+    assert point.competes
