@@ -211,6 +211,15 @@ class TestBounds:
         with pytest.raises(ValueError, match=r"particle 0: predicted at .* more than one beyond"):
             rollout(emulator.eval(), fast, 4)
 
+    def test_padding_beyond_the_bounds_is_no_error(self):
+        emulator = EmulatorRecipe(
+            box(), 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds="error")
+        ).build()
+        particles = cloud(box())
+        particles.mask[:, 20:] = False
+        particles.position[:, 20:] = -3.0
+        assert rollout(emulator.eval(), particles, 4).shape[1] == 4
+
     def test_error_is_raised_once_per_bundle_for_real_particles_at_their_own_place(self, monkeypatch):
         """Chunks of particles do not change the index that is named."""
         monkeypatch.setattr(
