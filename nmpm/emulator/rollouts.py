@@ -99,6 +99,39 @@ def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
     return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
 
+class _Numbers(NamedTuple):
+    """Numbers of a state that must be finite.
+
+    Args:
+        place: What an error calls one of them, with the index into K.
+        values: (B, K, V).
+        counts: (B, K) bool, False for padding.
+    """
+
+    place: str
+    values: Tensor
+    counts: Tensor
+
+    @property
+    def wrong(self) -> Tensor:
+        """(B, K) bool."""
+        return ~self.values.isfinite().all(-1) & self.counts
+
+
+def _state_numbers(particles: Particles) -> list[_Numbers]:
+    real = particles.mask
+    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
+    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
+    return [
+        *(
+            _Numbers(f"particle {{}}: its {name}", values.expand(*real.shape, -1), real)
+            for name, values in (vectors | numbers).items()
+        ),
+        _Numbers("obstacle particle {}: its position", particles.obstacle, particles.obstacle_mask),
+        _Numbers("its gravity", particles.gravity.unsqueeze(1), torch.ones_like(real[:, :1])),
+    ]
+
+
 def check_inputs(emulator: Emulator, particles: Particles) -> None:
     """Reject emulators with non-finite weights, and states that are non-finite or outside of the domain.
 
@@ -111,27 +144,33 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
     Raises:
         DataError: naming the weight or statistic; or scene, particle and value.
     """
-    real = particles.mask
-    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
-    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
-    given = {name: values.expand(*real.shape, -1) for name, values in (vectors | numbers).items()}
-    states = {name: ~values.isfinite().all(-1) & real for name, values in given.items()}
+    real, materials = particles.mask, emulator.scene.materials
+    numbers = _state_numbers(particles)
+    wrong = [given.wrong for given in numbers]
     beyond = beyond_walls(emulator.scene, particles.position) & real
+    unknown = ((particles.material < 0) | (particles.material >= len(materials))) & real
     weights = emulator.state_dict()
     unsound = [~values.isfinite().all() for values in weights.values()]
-    checks = [torch.stack(unsound).any(), *(bad.any() for bad in states.values()), beyond.any()]
+    checks = [torch.stack(unsound).any(), *(bad.any() for bad in (*wrong, unknown, beyond))]
     if not bool(torch.stack(checks).any()):
         return
     for name, bad in zip(weights, unsound, strict=True):
         if bad:
             raise DataError(f"The emulator's {name} holds values that are not finite: load a sound checkpoint.")
-    for name, bad in states.items():
+    for given, bad in zip(numbers, wrong, strict=True):
         if bad.any():
-            scene, particle = map(int, bad.nonzero()[0])
+            scene, index = map(int, bad.nonzero()[0])
             raise DataError(
-                f"Scene {scene} of the batch, particle {particle}: its {name} is"
-                f" {given[name][scene, particle].tolist()}; it must be finite."
+                f"Scene {scene} of the batch, {given.place.format(index)} is {given.values[scene, index].tolist()}; it"
+                " must be finite."
             )
+    if unknown.any():
+        scene, particle = map(int, unknown.nonzero()[0])
+        kind = int(particles.material[scene, particle])
+        raise DataError(
+            f"Scene {scene} of the batch, particle {particle}: its material is {kind}; it must be an index, from 0,"
+            f" into the model's {len(materials)} ({', '.join(materials)})."
+        )
     scene, particle = map(int, beyond.nonzero()[0])
     raise DataError(
         f"Scene {scene} of the batch, particle {particle}: it is at {particles.position[scene, particle].tolist()},"
