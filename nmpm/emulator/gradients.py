@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.model import Emulator
-from nmpm.emulator.rollouts import check_inputs
+from nmpm.emulator.rollouts import check_inputs, warn_of_training_mode
 from nmpm.particles import Particles
 
 Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
@@ -67,9 +67,13 @@ def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int
     Raises:
         ValueError: if `frames` is below 1.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     if frames < 1:
         raise ValueError(f"A rollout with gradients has 1 or more frames, not {frames}.")
+    warn_of_training_mode(emulator)
     with torch.no_grad():
         check_inputs(emulator, particles)
     bundles = unroll_with_gradients(emulator, particles, -(-frames // emulator.frames), recomputed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -178,6 +179,18 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
     )
 
 
+def warn_of_training_mode(emulator: Emulator) -> None:
+    """Warn of an emulator in training mode, such as a module's own, whose rollouts would be other than intended."""
+    held = emulator.constraints
+    constrained = held.energy or held.rest_speed or held.density_cap or (held.solids and emulator.scene.obstacles)
+    if emulator.training and (constrained or emulator.recipe.grid_noise):
+        warnings.warn(
+            "The emulator is in training mode, in which rollouts obey none of its constraints but the bounds, and the"
+            " network's input gets the noise of trainings: call emulator.eval() first.",
+            stacklevel=4,
+        )
+
+
 def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
     """Whether positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
     sides = [
@@ -235,9 +248,13 @@ def stream_rollout(
         ValueError: if `frames` is negative.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     if frames < 0:
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
+    warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
     bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor)
     made = 0
@@ -270,6 +287,9 @@ def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monit
         ValueError: if `frames` is negative.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     parts = list(stream_rollout(emulator, particles, frames, monitor))
     if parts:

@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
+from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.metrics import MSE
@@ -147,6 +148,17 @@ def test_a_checkpoint_stands_alone(make_dataset, tmp_path):
     assert loaded.emulator.calibrated
     for name, value in model.emulator.state_dict().items():
         assert torch.equal(value, loaded.emulator.state_dict()[name]), name
+
+
+@pytest.mark.filterwarnings("error:The emulator is in training mode")
+def test_validations_and_tests_are_rollouts_in_evaluation_mode(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    module = module_of(data, constraints=Constraints(energy=True))
+    trainer = trainer_of(tmp_path, 2)
+    trainer.fit(module, data)
+    trainer.test(module, data)
+    with pytest.warns(UserWarning, match="training mode"):
+        rollout(EmulatorModule.of(module.emulator).emulator, next(iter(data.test_dataloader())).initial, 2)
 
 
 def test_a_pretrained_emulator_keeps_its_statistics(make_dataset, tmp_path):
