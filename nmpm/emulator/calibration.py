@@ -168,7 +168,7 @@ def _warn_of_absent(names: Sequence[str]) -> None:
     warnings.warn(
         f"The windows that the model is calibrated on have no particles of {', '.join(names)}, which get the other"
         " materials' scales: if they move very differently, shuffle the training trajectories, or calibrate on more.",
-        stacklevel=3,
+        stacklevel=4,
     )
 
 

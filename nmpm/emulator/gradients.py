@@ -10,6 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.model import Emulator
+from nmpm.emulator.periods import Periods
 from nmpm.emulator.rollouts import check_inputs, warn_of_training_mode
 from nmpm.particles import Particles
 
@@ -76,5 +77,12 @@ def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int
     warn_of_training_mode(emulator)
     with torch.no_grad():
         check_inputs(emulator, particles)
-    bundles = unroll_with_gradients(emulator, particles, -(-frames // emulator.frames), recomputed)
-    return torch.cat([bundle.position for bundle in bundles], dim=1)[:, :frames]
+    periods = Periods(emulator)
+    bundles = unroll_with_gradients(
+        emulator,
+        periods.wrap(particles),
+        -(-frames // emulator.frames),
+        recomputed,
+        lambda bundle, start: periods.wrap(bundle.state_after(start)),
+    )
+    return torch.cat([periods.unwrapped(bundle).position for bundle in bundles], dim=1)[:, :frames]

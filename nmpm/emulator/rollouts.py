@@ -13,6 +13,7 @@ from torch import Tensor
 from nmpm.emulator.bundle import Bundle
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.periods import Periods
 from nmpm.emulator.windows import Memory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
@@ -34,15 +35,18 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     """
     if monitor is not None:
         monitor.start(emulator, particles)
+    periods = Periods(emulator)
+    particles = periods.wrap(particles)
     calls = _Calls(emulator, particles)
     for remaining in reversed(range(bundles)):
         bundle = calls.predict(particles)
+        travelled = periods.unwrapped(bundle)
         if monitor is not None:
-            monitor.see(emulator, particles, bundle)
+            monitor.see(emulator, periods.unwrapped_state(particles), travelled)
             if not remaining:
                 monitor.read()
-        yield bundle
-        after = bundle.state_after(particles)
+        yield travelled
+        after = periods.wrap(bundle.state_after(particles))
         calls.let_sleep(particles, after)
         particles = after
 
