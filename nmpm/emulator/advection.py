@@ -91,7 +91,7 @@ class Advection:
         Raises:
             DataError: as `constrained_path`.
         """
-        return self._check_bounds(self._free(self._take_off(start)))
+        return self._check_bounds(start, self._free(self._take_off(start)))
 
     def constrained_path(self, start: Departure, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
@@ -109,10 +109,10 @@ class Advection:
         path = self._free(flight) if budget is None else self._within_energy(flight, budget)
         if start.readable is not None:
             check_reads(start.cells, path, start.mask, start.readable, self.grid)
-        path = self._clear_of_obstacles(flight, path, solid)
+        path = self._clear_of_obstacles(start, path, solid)
         if self.constraints.rest_speed:
             path = self._bring_to_rest(start, path, solid)
-        return self._check_bounds(path)
+        return self._check_bounds(start, path)
 
     def uncrowded_path(self, start: Departure, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """A constrained path (B, m, N, D) whose overfull cells at the end have been spread, evenly over its frames.
@@ -226,11 +226,12 @@ class Advection:
             path.append(arrived)
         return torch.stack(path[1:], dim=1)
 
-    def _clear_of_obstacles(self, flight: Flight, path: Tensor, solid: Tensor) -> Tensor:
+    def _clear_of_obstacles(self, start: Departure, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), clear of obstacles."""
         if not (self.constraints.solids and self.scene.obstacles):
             return path
-        return self._confine(Contact(obstacle_share(solid, self.walls), self.grid).hold(flight.cells, path))
+        contact = Contact(obstacle_share(solid, self.walls), self.grid)
+        return self._confine(contact.hold(start.cells, path, start.mask))
 
     def _bring_to_rest(self, start: Departure, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
@@ -276,7 +277,7 @@ class Advection:
         ]
         return torch.stack(columns, dim=-1)
 
-    def _check_bounds(self, path: Tensor) -> Tensor:
+    def _check_bounds(self, start: Departure, path: Tensor) -> Tensor:
         if self.constraints.bounds == "error":
-            check_within_bounds(path, self.bounds, self.scene.periodic)
+            check_within_bounds(path, start.mask, self.bounds, self.scene.periodic)
         return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from nmpm.emulator.fields import calibrate_fields, true_rates
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.rasterise import grid_state, volume_fraction
 from nmpm.particles import Window
+from nmpm.scene import Scene
 from nmpm.transfer import Linear
 
 _MARGIN = 0.5
@@ -47,27 +49,33 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
 
     Inputs get mean and standard deviation per channel over all cells, and the limits to which they are clipped; outputs
     the root mean square of what is left of the true velocities once the decoder's known part is taken out, per frame of
-    the bundle and component, and of the evolving fields' changes. Fields get mean and standard deviation. Where several
-    processes train together, all of them call this, each with windows of its own, and get the statistics of all. The
-    windows may be on any device.
+    the bundle and component, and of the evolving fields' changes. Fields get mean and standard deviation. A material
+    without particles in the windows gets the other materials' scales. Where several processes train together, all of
+    them call this, each with windows of its own, and get the statistics of all. The windows may be on any device.
 
     Raises:
         ValueError: if there is no window or one is too short.
+
+    Warns:
+        UserWarning: naming the materials without particles in the windows.
     """
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
     windows = [window.to(emulator.device) for window in windows]
     calibrate_fields(emulator.field_scales, windows)
     inputs = _combine(all_gather(_inputs(emulator, windows)))
-    emulator.input_mean.copy_(inputs.mean.reshape_as(emulator.input_mean))
-    emulator.input_std.copy_(_nonzero(inputs.std).reshape_as(emulator.input_std))
+    materials = list(zip(*all_gather(_unknowns(emulator, windows)), strict=True))
+    absent = _absent_materials(materials[: len(emulator.scene.materials)])
+    if absent:
+        _warn_of_absent([emulator.scene.materials[index] for index in absent])
+    emulator.input_mean.copy_(_borrowed(inputs.mean, emulator.scene, absent).reshape_as(emulator.input_mean))
+    emulator.input_std.copy_(_nonzero(_borrowed(inputs.std, emulator.scene, absent)).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
     spread = inputs.high - inputs.low
     margin = torch.where(spread > 1e-12, _MARGIN * spread, UNLIMITED)
     emulator.input_low.copy_((inputs.low - margin).reshape_as(emulator.input_low))
     emulator.input_high.copy_((inputs.high + margin).reshape_as(emulator.input_high))
-    materials = zip(*all_gather(_unknowns(emulator, windows)), strict=True)
-    scale = torch.cat([_root_mean_square(parts) for parts in materials], dim=-1)
+    scale = torch.cat([_root_mean_square(parts) for parts in _substituted(materials, emulator.scene)], dim=-1)
     emulator.output_scale.copy_(_nonzero(scale).reshape_as(emulator.output_scale))
     emulator.calibrated.fill_(True)
 
@@ -148,6 +156,45 @@ def _mean_square(parts: Sequence[Tensor], index: int, windows: Sequence[Window])
     chosen = [window.mask & (window.material == index) for window in windows]
     values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(parts, chosen, strict=True)])
     return _Unknowns(len(values), _shareable(values.square().mean(0)))
+
+
+def _absent_materials(materials: Sequence[Sequence[_Unknowns]]) -> list[int]:
+    """Indices of the materials without particles; none where no material has any."""
+    absent = [index for index, parts in enumerate(materials) if not any(part.particles for part in parts)]
+    return absent if len(absent) < len(materials) else []
+
+
+def _warn_of_absent(names: Sequence[str]) -> None:
+    warnings.warn(
+        f"The windows that the model is calibrated on have no particles of {', '.join(names)}, which get the other"
+        " materials' scales: if they move very differently, shuffle the training trajectories, or calibrate on more.",
+        stacklevel=4,
+    )
+
+
+def _borrowed(values: Tensor, scene: Scene, absent: Sequence[int]) -> Tensor:
+    """Figures (C,) of the input channels, those of absent materials replaced by the mean of the others'."""
+    if not absent:
+        return values
+    values, count = values.clone(), len(scene.materials)
+    present = [index for index in range(count) if index not in absent]
+    fields = len(scene.particle_fields)
+    first_field = len(values) - len(scene.parameters) - count * fields
+    for first, size in ((0, scene.dim), (count * scene.dim, 1), (first_field, fields)):
+        rows = values[first : first + count * size].view(count, size)
+        rows[absent] = rows[present].mean(0)
+    return values
+
+
+def _substituted(materials: Sequence[Sequence[_Unknowns]], scene: Scene) -> list[Sequence[_Unknowns]]:
+    """Each material's parts, of velocities and then of fields; those of all materials for one without particles."""
+    count = len(scene.materials)
+    groups = [materials[first : first + count] for first in range(0, len(materials), count)]
+    return [
+        parts if any(part.particles for part in parts) else [part for others in group for part in others]
+        for group in groups
+        for parts in group
+    ]
 
 
 def _root_mean_square(parts: Sequence[_Unknowns]) -> Tensor:

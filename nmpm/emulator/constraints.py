@@ -52,11 +52,12 @@ BOUNDS: Mapping[str, BoundsRule] = MappingProxyType({"stop": stop, "reflect": re
 """Rules for positions beyond the bounds, by name. With "error", `check_within_bounds` is called once per bundle."""
 
 
-def check_within_bounds(path: Tensor, bounds: Tensor, periodic: Sequence[bool]) -> None:
+def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, periodic: Sequence[bool]) -> None:
     """Raise an error if a bundle leads more than a cell beyond the bounds. Reads one value back from the device.
 
     Args:
         path: (B, m, N, D) in cells.
+        mask: (B, N) bool, False for padding, which may be anywhere.
         bounds: (2, D) lowest and highest positions.
         periodic: Whether each axis wraps, and so has no bounds.
 
@@ -66,7 +67,7 @@ def check_within_bounds(path: Tensor, bounds: Tensor, periodic: Sequence[bool]) 
     low, high = bounds.unbind(0)
     walls = [axis for axis, wraps in enumerate(periodic) if not wraps]
     sides = [(path[..., axis] < low[axis] - 1) | (path[..., axis] > high[axis] + 1) for axis in walls]
-    beyond = torch.stack(sides).any(0) if sides else None
+    beyond = torch.stack(sides).any(0) & mask.unsqueeze(1) if sides else None
     if beyond is None or not bool(beyond.any()):
         return
     frame, scene, particle = map(int, beyond.transpose(0, 1).nonzero()[0])

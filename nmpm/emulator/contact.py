@@ -12,6 +12,7 @@ largest number of pieces, with masks. In both, a scene's result does not depend 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -59,32 +60,34 @@ class Contact:
     solid: Tensor
     grid: Grid
 
-    def hold(self, start: Tensor, path: Tensor) -> Tensor:
+    def hold(self, start: Tensor, path: Tensor, mask: Tensor | None = None) -> Tensor:
         """A path that does not lead into an obstacle; one that starts in an obstacle leads out.
 
         Args:
             start: (B, N, D) in cells.
             path: (B, m, N, D) as predicted.
+            mask: (B, N) bool, False for padding, whose path is returned as it is and changes no other; None for none.
 
         Returns:
             (B, m, N, D): the path itself for particles that keep clear of obstacles.
         """
-        return self.hold_touching(start, path) if can_branch(start) else self.hold_all(start, path)
+        return self.hold_touching(start, path, mask) if can_branch(start) else self.hold_all(start, path, mask)
 
     def inside(self, places: Tensor) -> Tensor:
         """(B, K) bool: whether places (B, K, D) in cells are deeper in an obstacle than its surface."""
         return self._scene_depth(places) > SURFACE
 
-    def hold_touching(self, start: Tensor, path: Tensor) -> Tensor:
+    def hold_touching(self, start: Tensor, path: Tensor, mask: Tensor | None = None) -> Tensor:
         """`hold` for a CPU: treats the particles that touch, and returns the same tensor if there are none."""
         steps = path.diff(dim=1, prepend=start.unsqueeze(1))
-        pieces = _pieces(_length(steps).amax(1))
+        pieces = _pieces(_longest_steps(steps, mask))
         inside = self.inside(start)
         touching = inside.clone()
         for piece in range(_largest(pieces)):
             share = (piece / pieces).clamp(max=1).view(-1, 1, 1, 1)
             places = (path - steps * share).flatten(1, 2)
             touching |= (self._scene_depth(places).unflatten(1, path.shape[1:3]) > SURFACE).any(1)
+        touching = touching if mask is None else touching & mask
         if not bool(touching.any()):
             return path
         scene, particle = touching.nonzero().unbind(1)
@@ -100,12 +103,12 @@ class Contact:
         path[scene, :, particle] = held
         return path
 
-    def hold_all(self, start: Tensor, path: Tensor) -> Tensor:
+    def hold_all(self, start: Tensor, path: Tensor, mask: Tensor | None = None) -> Tensor:
         """`hold` without reading values back: treats all particles, in chunks that bound the memory."""
         batch, frames, count, _ = path.shape
         if not count:
             return path
-        pieces = _pieces(_length(path.diff(dim=1, prepend=start.unsqueeze(1))).amax(1))
+        pieces = _pieces(_longest_steps(path.diff(dim=1, prepend=start.unsqueeze(1)), mask))
         parts = chunks(count, path.device, values=batch * frames * _MAX_PIECES)
         touches, rows = [], []
         for part in parts:
@@ -113,6 +116,9 @@ class Contact:
             own = _spread(pieces, len(begin))
             touch = _touch(self._depth_of_all, begin, mine, own, _MAX_PIECES)
             inside = (self._depth_of_all(begin.unsqueeze(1)) > SURFACE).squeeze(1)
+            if mask is not None:
+                real = mask[:, part].flatten()
+                inside, touch = inside & real, dataclasses.replace(touch, hits=touch.hits & real)
             rows.append((begin, mine, own, inside))
             touches.append(touch)
         lengths = [
@@ -223,6 +229,12 @@ def _length(steps: Tensor) -> Tensor:
     """(...) lengths of steps (..., D), without gradient; 0 for those that are not finite, as they have no pieces."""
     lengths: Tensor = steps.detach().norm(dim=-1)
     return lengths.nan_to_num(0.0, 0.0, 0.0)
+
+
+def _longest_steps(steps: Tensor, mask: Tensor | None) -> Tensor:
+    """(B, N): length of each particle's longest step (B, m, N, D); 0 for padding."""
+    lengths = _length(steps).amax(1)
+    return lengths if mask is None else lengths.masked_fill(~mask, 0.0)
 
 
 def _pieces(lengths: Tensor) -> Tensor:

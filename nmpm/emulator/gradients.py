@@ -10,7 +10,8 @@ from torch.utils.checkpoint import checkpoint
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.model import Emulator
-from nmpm.emulator.rollouts import check_inputs
+from nmpm.emulator.periods import Periods
+from nmpm.emulator.rollouts import check_inputs, warn_of_training_mode
 from nmpm.particles import Particles
 
 Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
@@ -67,10 +68,21 @@ def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int
     Raises:
         ValueError: if `frames` is below 1.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     if frames < 1:
         raise ValueError(f"A rollout with gradients has 1 or more frames, not {frames}.")
+    warn_of_training_mode(emulator)
     with torch.no_grad():
         check_inputs(emulator, particles)
-    bundles = unroll_with_gradients(emulator, particles, -(-frames // emulator.frames), recomputed)
-    return torch.cat([bundle.position for bundle in bundles], dim=1)[:, :frames]
+    periods = Periods(emulator)
+    bundles = unroll_with_gradients(
+        emulator,
+        periods.wrap(particles),
+        -(-frames // emulator.frames),
+        recomputed,
+        lambda bundle, start: periods.wrap(bundle.state_after(start)),
+    )
+    return torch.cat([periods.unwrapped(bundle).position for bundle in bundles], dim=1)[:, :frames]

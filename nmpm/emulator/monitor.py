@@ -84,7 +84,7 @@ class Monitor:
     Attributes:
         incidents: The first of each kind in this rollout.
         peaks: The largest value of each measure in this rollout, by the names that incidents have.
-        at_walls: Particles at the scene's bounds or beyond, when crowding was last measured.
+        at_walls: Particles at the scene's bounds or beyond, when crowding was last measured; periodic axes have none.
         rest_share: Mean share of the particles that a bundle leaves where they were, as `rest_speed` does.
     """
 
@@ -172,7 +172,10 @@ class Monitor:
         """(B,) measures of positions (B, N, D) by name."""
         grid, scene = emulator.grid, emulator.scene
         fraction = volume_fraction(scene, grid, emulator.transfer, particles.mask, grid.to_cells(last.nan_to_num()))
-        sides = [(x <= low) | (x >= high) for x, (low, high) in zip(last.unbind(-1), scene.bounds, strict=True)]
+        sides = [
+            torch.zeros_like(particles.mask) if wraps else (column <= low) | (column >= high)
+            for column, (low, high), wraps in zip(last.unbind(-1), scene.bounds, scene.periodic, strict=True)
+        ]
         at_walls = torch.stack(sides).any(0) & particles.mask
         found = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}
         if self.crowding is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from nmpm.emulator.bundle import Bundle
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.periods import Periods
 from nmpm.emulator.windows import Memory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
@@ -33,15 +35,18 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
     """
     if monitor is not None:
         monitor.start(emulator, particles)
+    periods = Periods(emulator)
+    particles = periods.wrap(particles)
     calls = _Calls(emulator, particles)
     for remaining in reversed(range(bundles)):
         bundle = calls.predict(particles)
+        travelled = periods.unwrapped(bundle)
         if monitor is not None:
-            monitor.see(emulator, particles, bundle)
+            monitor.see(emulator, periods.unwrapped_state(particles), travelled)
             if not remaining:
                 monitor.read()
-        yield bundle
-        after = bundle.state_after(particles)
+        yield travelled
+        after = periods.wrap(bundle.state_after(particles))
         calls.let_sleep(particles, after)
         particles = after
 
@@ -99,6 +104,39 @@ def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
     return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
 
+class _Numbers(NamedTuple):
+    """Numbers of a state that must be finite.
+
+    Args:
+        place: What an error calls one of them, with the index into K.
+        values: (B, K, V).
+        counts: (B, K) bool, False for padding.
+    """
+
+    place: str
+    values: Tensor
+    counts: Tensor
+
+    @property
+    def wrong(self) -> Tensor:
+        """(B, K) bool."""
+        return ~self.values.isfinite().all(-1) & self.counts
+
+
+def _state_numbers(particles: Particles) -> list[_Numbers]:
+    real = particles.mask
+    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
+    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
+    return [
+        *(
+            _Numbers(f"particle {{}}: its {name}", values.expand(*real.shape, -1), real)
+            for name, values in (vectors | numbers).items()
+        ),
+        _Numbers("obstacle particle {}: its position", particles.obstacle, particles.obstacle_mask),
+        _Numbers("its gravity", particles.gravity.unsqueeze(1), torch.ones_like(real[:, :1])),
+    ]
+
+
 def check_inputs(emulator: Emulator, particles: Particles) -> None:
     """Reject emulators with non-finite weights, and states that are non-finite or outside of the domain.
 
@@ -111,32 +149,50 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
     Raises:
         DataError: naming the weight or statistic; or scene, particle and value.
     """
-    real = particles.mask
-    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
-    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
-    given = {name: values.expand(*real.shape, -1) for name, values in (vectors | numbers).items()}
-    states = {name: ~values.isfinite().all(-1) & real for name, values in given.items()}
+    real, materials = particles.mask, emulator.scene.materials
+    numbers = _state_numbers(particles)
+    wrong = [given.wrong for given in numbers]
     beyond = beyond_walls(emulator.scene, particles.position) & real
+    unknown = ((particles.material < 0) | (particles.material >= len(materials))) & real
     weights = emulator.state_dict()
     unsound = [~values.isfinite().all() for values in weights.values()]
-    checks = [torch.stack(unsound).any(), *(bad.any() for bad in states.values()), beyond.any()]
+    checks = [torch.stack(unsound).any(), *(bad.any() for bad in (*wrong, unknown, beyond))]
     if not bool(torch.stack(checks).any()):
         return
     for name, bad in zip(weights, unsound, strict=True):
         if bad:
             raise DataError(f"The emulator's {name} holds values that are not finite: load a sound checkpoint.")
-    for name, bad in states.items():
+    for given, bad in zip(numbers, wrong, strict=True):
         if bad.any():
-            scene, particle = map(int, bad.nonzero()[0])
+            scene, index = map(int, bad.nonzero()[0])
             raise DataError(
-                f"Scene {scene} of the batch, particle {particle}: its {name} is"
-                f" {given[name][scene, particle].tolist()}; it must be finite."
+                f"Scene {scene} of the batch, {given.place.format(index)} is {given.values[scene, index].tolist()}; it"
+                " must be finite."
             )
+    if unknown.any():
+        scene, particle = map(int, unknown.nonzero()[0])
+        kind = int(particles.material[scene, particle])
+        raise DataError(
+            f"Scene {scene} of the batch, particle {particle}: its material is {kind}; it must be an index, from 0,"
+            f" into the model's {len(materials)} ({', '.join(materials)})."
+        )
     scene, particle = map(int, beyond.nonzero()[0])
     raise DataError(
         f"Scene {scene} of the batch, particle {particle}: it is at {particles.position[scene, particle].tolist()},"
         f" outside of the domain {list(emulator.scene.domain)} ({int(beyond.sum())} particles are)."
     )
+
+
+def warn_of_training_mode(emulator: Emulator) -> None:
+    """Warn of an emulator in training mode, such as a module's own, whose rollouts would be other than intended."""
+    held = emulator.constraints
+    constrained = held.energy or held.rest_speed or held.density_cap or (held.solids and emulator.scene.obstacles)
+    if emulator.training and (constrained or emulator.recipe.grid_noise):
+        warnings.warn(
+            "The emulator is in training mode, in which rollouts obey none of its constraints but the bounds, and the"
+            " network's input gets the noise of trainings: call emulator.eval() first.",
+            stacklevel=4,
+        )
 
 
 def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
@@ -196,9 +252,13 @@ def stream_rollout(
         ValueError: if `frames` is negative.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     if frames < 0:
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
+    warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
     bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor)
     made = 0
@@ -231,6 +291,9 @@ def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monit
         ValueError: if `frames` is negative.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     parts = list(stream_rollout(emulator, particles, frames, monitor))
     if parts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -26,7 +27,8 @@ class EarthMover(RolloutMetric):
     papers often quote.
 
     Args:
-        every: Compute it at frames every, 2 every, …
+        every: Compute it at frames every, 2 every, …; at the last frame of shorter rollouts. It is NaN for trajectories
+            with a position that is not finite at one of these.
     """
 
     cheap: ClassVar[bool] = False
@@ -40,7 +42,7 @@ class EarthMover(RolloutMetric):
         self.add_state("distances", default=[], dist_reduce_fx="cat")
 
     def update(self, window: Window, predicted: Tensor) -> None:
-        frames = slice(self.every - 1, None, self.every)
+        frames = slice(min(self.every, predicted.shape[1]) - 1, None, self.every)
         on_cpu = (v.cpu() for v in (predicted[:, frames], window.target[:, frames], window.mask, window.material))
         means = [
             earth_mover_of_materials(ours[:, real], theirs[:, real], kinds[real])
@@ -59,8 +61,10 @@ class EarthMover(RolloutMetric):
 def earth_mover(ours: Tensor, theirs: Tensor) -> float:
     """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size, in their length.
 
-    Memory grows with N²: 3 GB for 9,000 particles.
+    NaN where a position is not finite, as no match is the best then. Memory grows with N²: 3 GB for 9,000 particles.
     """
+    if not bool((ours.isfinite() & theirs.isfinite()).all()):
+        return math.nan
     frames = zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), strict=True)
     return float(np.mean([_match(cdist(left, right)) for left, right in frames]))
 

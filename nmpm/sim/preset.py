@@ -86,7 +86,8 @@ class Preset(abc.ABC):
             progress: Called after each frame.
 
         Raises:
-            DataError: if the arrays do not fit together, or a particle is outside of the box or inside an obstacle.
+            DataError: if the arrays do not fit together, there is no particle, or one is outside of the box or inside
+                an obstacle.
             UnstableError: if the simulation becomes unstable; the message names the frame.
         """
 

@@ -16,6 +16,9 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 
+_SAME_PLACE = 0.25
+"""Cells by which a mirror image's walls may be off: bounds of recorded data are widened by single stray particles."""
+
 
 @dataclass(frozen=True)
 class Augmentation:
@@ -37,7 +40,7 @@ class Augmentation:
         Raises:
             ConfigError: as `check_mirrors` and `check_jitter`.
         """
-        check_mirrors(scene, self.mirror)
+        check_mirrors(scene, grid, self.mirror)
         check_jitter(scene, grid, self.jitter)
 
     def mirrored(self, window: Window, scene: Scene) -> Window:
@@ -57,11 +60,12 @@ class Augmentation:
         return with_jitter(emulator, self.jitter)
 
 
-def check_mirrors(scene: Scene, axes: Sequence[int]) -> None:
+def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
     """Make sure that a mirror image along each axis is a scene of the same family.
 
     Raises:
-        ConfigError: if an axis does not exist, or gravity acts along it and is not an input of the model.
+        ConfigError: if an axis does not exist, gravity acts along it and is not an input of the model, or the image's
+            walls are elsewhere.
     """
     for axis in axes:
         if not 0 <= axis < scene.dim:
@@ -70,6 +74,15 @@ def check_mirrors(scene: Scene, axes: Sequence[int]) -> None:
             raise ConfigError(
                 f"mirror: along axis {axis} the scene has gravity {scene.gravity[axis]}, so that its mirror image is "
                 "another scene; leave the axis out."
+            )
+        (low, high), (outer_low, outer_high) = scene.bounds[axis], scene.domain[axis]
+        moved = abs(low + high - outer_low - outer_high) / grid.spacing[axis]
+        if moved > _SAME_PLACE and not scene.periodic[axis]:
+            raise ConfigError(
+                f"mirror: along axis {axis} the bounds {(low, high)} do not lie in the middle of the domain"
+                f" {(outer_low, outer_high)}, about which windows are mirrored: walls of the images would be"
+                f" {moved:.2g} cells off. Leave the axis out, or give the data a domain with equal layers around the"
+                " bounds."
             )
 
 

@@ -24,6 +24,20 @@ NEW = "not an option yet"
 """What an argument was that the version which wrote a checkpoint did not have."""
 
 
+def check_horizon(frames: int, unroll: int, horizon: int) -> None:
+    """Make sure that training windows hold every frame that a training step predicts; longer ones are cut.
+
+    Raises:
+        ConfigError: naming both numbers of frames.
+    """
+    if horizon < frames * unroll:
+        raise ConfigError(
+            f"data.horizon = {horizon} is shorter than the {frames * unroll} frames that a training step predicts"
+            f" (model.frames = {frames} times model.unroll = {unroll}): give TrajectoryDataModule"
+            f" horizon={frames * unroll}, or unroll less."
+        )
+
+
 def check_same_scene(mine: Scene, theirs: Scene, data: str = "the data's") -> None:
     """Make sure that a model's scene is that of its data.
 

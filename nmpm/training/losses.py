@@ -45,8 +45,13 @@ class TrainingError:
             raise ConfigError(f"model.error_power = {self.power} must be above 0 and at most 1.")
 
     def __call__(self, predicted: Tensor, window: Window, scene: Scene, grid: Grid, frames: int) -> Tensor:
-        """The error () of predicted positions (B, K m, N, D), m frames to a bundle, as a mean over particles."""
+        """The error () of predicted positions (B, K m, N, D), m frames to a bundle, as a mean over particles.
+
+        Raises:
+            ValueError: if the window has fewer frames than were predicted, or other particles.
+        """
         target = window.target[:, : predicted.shape[1]]
+        check_comparable(predicted, target, frames)
         last = slice(frames - 1, None, frames)
         if self.power == 1:
             error = position_error(predicted, target, window.mask, grid)
@@ -114,8 +119,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
     Raises:
         ValueError: if the shapes differ.
     """
-    if predicted.shape != target.shape:
-        raise ValueError(f"Predicted {tuple(predicted.shape)} and target {tuple(target.shape)} positions do not match.")
+    check_comparable(predicted, target, frames=1)
     squared = grid.to_cell_displacement(predicted - target).square() * mask[:, None, :, None]
     return squared.sum() / (mask.sum() * predicted.shape[1] * predicted.shape[3])
 
@@ -129,7 +133,11 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
         mask: (B, N) bool, False for padding.
         grid: Gives the cells' size.
         frames: m; T is a multiple of it.
+
+    Raises:
+        ValueError: if the shapes differ, or T is no multiple of `frames`.
     """
+    check_comparable(predicted, target, frames)  # (kernels check no bounds)
     if _kernels_support(predicted, target, grid):
         from nmpm.training.kernels import PositionErrors
 
@@ -138,6 +146,18 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
     squared = grid.to_cell_displacement(predicted - target).square().mean(-1) * mask.unsqueeze(1)
     bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
     return bundles.mean(-1) / mask.sum(1, keepdim=True)
+
+
+def check_comparable(predicted: Tensor, target: Tensor, frames: int) -> None:
+    """Reject predicted positions (B, T, N, D) that differ in shape from their target, or whose last bundle is cut.
+
+    Raises:
+        ValueError: naming both shapes, or the frames.
+    """
+    if predicted.shape != target.shape:
+        raise ValueError(f"Predicted {tuple(predicted.shape)} and target {tuple(target.shape)} positions do not match.")
+    if predicted.shape[1] % frames:
+        raise ValueError(f"{predicted.shape[1]} predicted frames are no whole number of bundles of {frames} frames.")
 
 
 def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:

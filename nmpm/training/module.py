@@ -34,6 +34,7 @@ from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.compatibility import (
     adopt_optimizer_arguments,
     changed_arguments,
+    check_horizon,
     check_same_optimizer,
     check_same_recipe,
     check_same_scene,
@@ -155,19 +156,22 @@ class EmulatorModule(LightningModule):
         module.emulator.load_state_dict(emulator.state_dict())
         return module
 
-    def setup(self, stage: str) -> None:  # noqa: ARG002
-        """Make sure that the data are of the model's scene.
+    def setup(self, stage: str) -> None:
+        """Make sure that the data are of the model's scene, and training windows as long as its horizon.
 
         Raises:
-            ConfigError: naming the facts in which they differ.
+            ConfigError: naming the facts in which they differ, or both horizons.
 
         Warns:
             UserWarning: naming the fields that the model was trained without.
         """
-        scene = getattr(getattr(self.trainer, "datamodule", None), "scene", None)
+        data = getattr(self.trainer, "datamodule", None)
+        scene, horizon = getattr(data, "scene", None), getattr(data, "horizon", None)
         if isinstance(scene, Scene):
             check_same_scene(self.emulator.scene, scene)
             warn_of_ignored(self.emulator.scene, scene.fields)
+        if stage == TrainerFn.FITTING and isinstance(horizon, int):
+            check_horizon(self.emulator.frames, self.unroll, horizon)
 
     def on_fit_start(self) -> None:
         """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
@@ -225,9 +229,11 @@ class EmulatorModule(LightningModule):
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Seed the batch's random numbers by its index, so that a resumed run repeats them.
 
-        All ranks use the same seed: each takes its own rows of the numbers drawn for all.
+        All ranks use the same seed: each takes its own rows of the numbers drawn for all. The index is the number of
+        finished batches: Lightning's `total_batch_idx` also counts one that was interrupted, which is repeated.
         """
-        entropy = (self.seed, 0, self.trainer.fit_loop.total_batch_idx)
+        finished = self.trainer.fit_loop.epoch_loop.batch_progress.total.processed  # type: ignore[attr-defined]  # (of batches)
+        entropy = (self.seed, 0, finished)
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002

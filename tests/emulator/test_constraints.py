@@ -1,4 +1,5 @@
 import dataclasses
+import warnings
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from scenes import box, cloud
 from nmpm.decoders import Absolute, Acceleration, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, lowest_potential, mass_shares
+from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import Pointwise, UNet
@@ -284,6 +286,18 @@ def test_nothing_is_held_in_training():
     results = [next(unroll(e.train(), particles, 1)).position for e in (free, held)]
     assert torch.equal(*results)
     assert held.budget(particles) is None
+
+
+@pytest.mark.parametrize("roll", [rollout, differentiable_rollout])
+def test_a_rollout_in_training_mode_says_that_constraints_do_not_act(roll):
+    scene = box()
+    particles, held = cloud(scene), emulator_of(scene, rest_speed=1.0).train()
+    with pytest.warns(UserWarning, match=r"in training mode.*call emulator\.eval\(\) first"):
+        roll(held, particles, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        roll(held.eval(), particles, 4)
+        roll(emulator_of(scene).train(), particles, 4)  # has nothing that could act
 
 
 def test_energy_needs_known_gravity():

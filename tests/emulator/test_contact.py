@@ -131,6 +131,20 @@ def test_a_scene_does_not_feel_how_fast_another_is():
         torch.testing.assert_close(together[:1], floor().hold(begin, slow), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
+def test_padding_is_left_as_it_is_and_changes_no_other_path(hold):
+    generator = torch.Generator().manual_seed(0)
+    start = 20 * torch.rand(2, 50, 2, generator=generator)
+    path = start.unsqueeze(1) + (0.4 * torch.randn(2, 4, 50, 2, generator=generator)).cumsum(1)
+    path[:, :, 40:] = start[:, None, 40:] + 9 * torch.randn(2, 4, 10, 2, generator=generator)  # fast, some inside
+    mask = torch.arange(50).expand(2, -1) < 40
+    contact = Contact(block().solid.repeat(2, 1, 1, 1), GRID)
+    held = getattr(contact, hold)(start, path, mask)
+    assert torch.equal(held[:, :, :40], getattr(contact, hold)(start[:, :40], path[:, :, :40]))
+    assert torch.equal(held[:, :, 40:], path[:, :, 40:])
+    assert not torch.equal(held, path)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
 def test_a_step_that_is_not_finite_stays_so_and_disturbs_nobody(value, hold):

@@ -219,6 +219,23 @@ def test_calibration_measures_what_the_network_has_to_give():
         calibrate(emulator, [dataclasses.replace(window, frames=frames[:, :4])])
 
 
+def test_a_material_that_the_calibration_does_not_see_gets_the_scales_of_the_others():
+    scene = box(gravity=None, materials=("water", "sand", "goop"))
+    particles = cloud(scene, count=60, batch=4)
+    particles = dataclasses.replace(particles, material=torch.arange(60).expand(4, -1) % 2 * 2)  # no sand
+    frames = particles.position[:, None] + 0.002 * torch.randn(4, 6, 60, 2).cumsum(1)
+    rest = (particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
+    emulator = small(scene)
+    with pytest.warns(UserWarning, match="no particles of sand"):
+        calibrate(emulator, [Window(frames, *rest)])
+    scale = emulator.output_scale.squeeze().unflatten(-1, (3, 2))
+    torch.testing.assert_close(scale[:, 1].square(), (scale[:, 0].square() + scale[:, 2].square()) / 2)
+    for figures in (emulator.input_mean.flatten(), emulator.input_std.flatten()):
+        velocity, volume = figures[:6].view(3, 2), figures[6:9]
+        torch.testing.assert_close(velocity[1], velocity[[0, 2]].mean(0))
+        torch.testing.assert_close(volume[1], volume[[0, 2]].mean())
+
+
 def test_rollouts_are_cut_to_the_frames_asked_for():
     scene = box()
     particles, emulator = cloud(scene), small(scene, frames=3)

@@ -1,5 +1,6 @@
 """The kernels give what tensor operations give, to rounding, whatever the scene."""
 
+import contextlib
 import dataclasses
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box, cloud
 
+from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
@@ -178,6 +180,24 @@ def test_padding_changes_nothing_to_the_bit_not_even_if_it_is_not_a_number():
     padded.velocity[:, 50:] = 1e3
     with torch.no_grad():
         assert torch.equal(emulator(padded).position[:, :, :40], emulator(particles).position)
+
+
+@pytest.mark.parametrize("backend", [None, "native"])
+@pytest.mark.parametrize("seed", range(3))
+def test_padding_changes_nothing_beside_obstacles_however_fast_and_wherever_it_is(backend, seed):
+    scene = box(obstacles=True)
+    slab = lattice(((0.3, 0.7), (0.35, 0.5)), 0.02)[None]
+    obstacle = {"obstacle": slab, "obstacle_mask": torch.ones(slab.shape[:2], dtype=torch.bool)}
+    emulator = emulator_of(scene, cells=16, seed=seed, decoder=Flip())
+    particles = dataclasses.replace(cloud(scene, 200, speed=0.02, seed=seed), **obstacle)
+    padded = dataclasses.replace(cloud(scene, 260, seed=seed), **obstacle)
+    for name in ("position", "velocity", "material"):
+        getattr(padded, name)[:, :200] = getattr(particles, name)
+    padded.mask[:, 200:] = False
+    padded.position[:, 200:230] = slab[:, :30]
+    padded.velocity[:, 230:] = 0.4
+    with torch.no_grad(), using(backend) if backend else contextlib.nullcontext():
+        assert torch.equal(emulator(padded).position[:, :, :200], emulator(particles).position)
 
 
 def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):

@@ -11,6 +11,7 @@ from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
 from nmpm.emulator.rollouts import check_inputs, rollout, stream
+from nmpm.errors import DataError
 from nmpm.processors import Pointwise
 
 
@@ -168,6 +169,17 @@ class TestReadLate:
         assert monitor.peaks["speed"] < 1
 
 
+def test_periodic_axes_have_no_walls_to_be_at():
+    scene = box(boundary=("periodic", "wall"), domain=((0.1, 0.9), (0.08, 0.92)))
+    particles = cloud(scene, speed=0.0)
+    position = particles.position.clone()
+    position[0, :3, 0] = torch.tensor([0.1, -5.0, 7.0])
+    position[0, 3:5, 1] = 0.1
+    monitor = Monitor(Policy.RECORD)
+    rollout(emulator_of(scene, 1e-6), particles.with_motion(position, torch.zeros_like(position)), 4, monitor)
+    assert monitor.at_walls == 2
+
+
 def test_inputs_are_checked_in_one_reading(monkeypatch):
     scene = box()
     emulator, particles = emulator_of(scene, 1e-6), cloud(scene)
@@ -175,6 +187,29 @@ def test_inputs_are_checked_in_one_reading(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "__bool__", lambda values: read.append(values) or to_bool(values))
     check_inputs(emulator, particles)
     assert len(read) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "message"),
+    [
+        ("gravity", (1, 1), float("nan"), r"Scene 1 of the batch, its gravity is \[.*nan\]; it must be finite"),
+        ("gravity", (0, 0), -float("inf"), "Scene 0 of the batch, its gravity"),
+        ("obstacle", (1, 4), float("nan"), r"Scene 1 of the batch, obstacle particle 4: its position is \[nan"),
+        ("material", (0, 7), 2, r"particle 7: its material is 2; .* the model's 2 \(water, sand\)"),
+        ("material", (1, 7), -1, "Scene 1 of the batch, particle 7: its material is -1"),
+    ],
+)
+def test_a_state_that_cannot_be_is_named_unless_it_is_padding(name, place, value, message):
+    scene = box(materials=("water", "sand"), obstacles=True)
+    particles = cloud(scene, batch=2, statics=6)
+    particles = dataclasses.replace(particles, gravity=particles.gravity.clone())
+    emulator = emulator_of(scene, 1e-6)
+    getattr(particles, name)[place] = value
+    with pytest.raises(DataError, match=message):
+        check_inputs(emulator, particles)
+    if name != "gravity":
+        (particles.mask if name == "material" else particles.obstacle_mask)[place] = False
+        check_inputs(emulator, particles)
 
 
 class TestBounds:
@@ -210,6 +245,15 @@ class TestBounds:
         fast = particles.with_motion(particles.position, torch.full_like(particles.position, 0.5))
         with pytest.raises(ValueError, match=r"particle 0: predicted at .* more than one beyond"):
             rollout(emulator.eval(), fast, 4)
+
+    def test_padding_beyond_the_bounds_is_no_error(self):
+        emulator = EmulatorRecipe(
+            box(), 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(bounds="error")
+        ).build()
+        particles = cloud(box())
+        particles.mask[:, 20:] = False
+        particles.position[:, 20:] = -3.0
+        assert rollout(emulator.eval(), particles, 4).shape[1] == 4
 
     def test_error_is_raised_once_per_bundle_for_real_particles_at_their_own_place(self, monkeypatch):
         """Chunks of particles do not change the index that is named."""

@@ -103,6 +103,26 @@ def test_earth_mover_keeps_materials_apart():
     assert metric.compute()["emd"] == 1
 
 
+def test_earth_mover_of_a_short_rollout_is_that_of_its_last_frame():
+    target = torch.rand(2, 7, 5, 2)
+    moved = target.clone()
+    moved[:, -1, :, 0] += 3.0
+    metric = EarthMover(every=10)
+    metric.update(recorded(target), moved)
+    assert metric.compute()["emd"].item() == pytest.approx(3.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_earth_mover_of_a_rollout_that_is_not_finite_is_no_number_and_no_error(value):
+    target = torch.rand(2, 20, 5, 2)
+    broken = target.clone()
+    broken[1, 9:, 3] = value
+    metric = EarthMover(every=10)
+    metric.update(recorded(target), broken)
+    assert metric.distances[0].isnan().tolist() == [False, True]
+    assert metric.compute()["emd"].isnan()
+
+
 def test_loss_is_in_cells_whatever_the_unit_of_length():
     for factor in (1.0, 1e3):
         grid = Grid((10, 20), (0.0, 0.0), (0.1 * factor, 0.2 * factor), (False, False))

@@ -110,6 +110,14 @@ def test_a_wide_dam_break_has_as_many_times_as_many_particles():
     assert preset.widened(2).draw(0).counts[0] == 2 * preset.draw(0).counts[0]
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_state_without_particles_is_refused(name):
+    preset = small(name)
+    none = np.empty((0, len(preset.box)))
+    with pytest.raises(DataError, match="no particle to simulate"):
+        preset.simulate_from(InitialState(none, none), 1)
+
+
 @pytest.mark.parametrize("name", ["waterramps", "wbcsph"])
 def test_a_state_of_another_solver_is_refused(name):
     preset = load_preset(name)

@@ -2,11 +2,13 @@ import pytest
 import torch
 from scenes import box, cloud
 
+from nmpm.data import catalog
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
 from nmpm.processors import UNet
+from nmpm.training import EmulatorModule
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_windows, with_jitter
 
 
@@ -32,12 +34,31 @@ def test_a_mirror_image_reflects_one_axis_of_the_chosen_windows_about_the_middle
 
 
 def test_only_symmetries_are_allowed():
-    check_mirrors(box(), [0])
-    check_mirrors(box(gravity_varies=True), [0, 1])
+    grid = Grid.of(box(), 42)
+    check_mirrors(box(), grid, [0])
+    check_mirrors(box(gravity_varies=True), grid, [0, 1])
     with pytest.raises(ConfigError, match=r"axis 1.*-9\.81"):
-        check_mirrors(box(), [1])
+        check_mirrors(box(), grid, [1])
     with pytest.raises(ConfigError, match="no axis 2"):
-        check_mirrors(box(), [2])
+        check_mirrors(box(), grid, [2])
+
+
+def test_walls_must_lie_about_the_domains_middle_where_windows_are_mirrored():
+    wide = {"domain": ((0.08, 1.4), (0.08, 0.92))}
+    with pytest.raises(ConfigError, match=r"axis 0 the bounds \(0.1, 0.9\) .* domain \(0.08, 1.4\)"):
+        EmulatorModule(box(**wide), cells=16, frames=2, mirror=(0,))
+    EmulatorModule(box(**wide), cells=16, frames=2)
+    EmulatorModule(box(domain=((0.0, 1.0), (0.08, 0.92))), cells=16, frames=2, mirror=(0,))
+    stray = box(bounds=((0.1, 0.903), (0.1, 0.9)))  # by a particle that was recorded a little beyond the wall
+    EmulatorModule(stray, cells=16, frames=2, mirror=(0,))
+
+
+@pytest.mark.parametrize("name", catalog.catalog())
+def test_embedded_datasets_can_be_mirrored(name):
+    scene = catalog.scene(name)
+    fall = scene.gravity or (0.0,) * scene.dim
+    level = [axis for axis in range(scene.dim) if scene.gravity_varies or not fall[axis]]
+    check_mirrors(scene, Grid.of(scene, 64), level)
 
 
 def test_jitter_moves_the_grid_by_less_than_asked_and_keeps_the_weights():

@@ -139,6 +139,27 @@ def test_padding_changes_no_tempered_error():
     torch.testing.assert_close(error(more + shift, padded, scene, grid, 1), expected)
 
 
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+@pytest.mark.parametrize("power", [0.5, 1.0])
+def test_more_predicted_frames_than_the_window_has_are_refused(power, weight):
+    scene, grid, window, predicted = calm_and_violent(frames=4)
+    error = TrainingError(weight, power)
+    with pytest.raises(ValueError, match=r"Predicted \(2, 8, 1, 2\) and target \(2, 4, 1, 2\) positions do not match"):
+        error(torch.cat([predicted, predicted], 1), window, scene, grid, 4)
+    with pytest.raises(ValueError, match="4 predicted frames are no whole number of bundles of 3"):
+        error(predicted, window, scene, grid, 3)
+    one = dataclasses.replace(window, frames=window.frames[:, :3])  # whose single frame would broadcast
+    with pytest.raises(ValueError, match="do not match"):
+        error(predicted, one, scene, grid, 2)
+
+
+def test_a_longer_window_is_compared_up_to_the_prediction():
+    scene, grid, window, predicted = calm_and_violent(frames=4)
+    error = TrainingError(1.0, 0.5)
+    short = dataclasses.replace(window, frames=window.frames[:, :4])
+    assert torch.equal(error(predicted[:, :2], window, scene, grid, 2), error(predicted[:, :2], short, scene, grid, 2))
+
+
 @pytest.mark.parametrize("power", [0.0, -1.0, 1.5])
 def test_powers_out_of_range_are_named(power):
     with pytest.raises(ConfigError, match=r"error_power = .* above 0 and at most 1"):

@@ -11,11 +11,12 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, OnExceptionCheckpoint
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.decoders import Absolute
+from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.metrics import MSE
@@ -72,6 +73,20 @@ class Losses(lightning.Callback):
         self.seen.append(outputs["loss"].item())
 
 
+class Seeds(lightning.Callback):
+    """Keeps the seed of every finished step, and fails before one of them."""
+
+    def __init__(self, fail_at: int | None = None):
+        self.seen, self.fail_at = [], fail_at
+
+    def on_before_zero_grad(self, trainer, pl_module, optimizer):
+        if len(self.seen) == self.fail_at:
+            raise RuntimeError("interrupted")
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.seen.append(torch.initial_seed())
+
+
 def test_training_lowers_the_loss_and_reports_rollouts_beside_the_trivial_predictors(make_dataset, tmp_path):
     data = data_of(make_dataset())
     fast = functools.partial(torch.optim.Adam, lr=1e-2)
@@ -105,6 +120,20 @@ def test_a_resumed_training_ends_with_the_same_weights(make_dataset, tmp_path, o
         assert torch.equal(value, resumed[0].state_dict()[name]), name
 
 
+def test_a_training_interrupted_within_a_batch_resumes_with_its_random_numbers(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    whole, broken, resumed = Seeds(), Seeds(fail_at=4), Seeds()
+    trainer_of(tmp_path / "whole", 7, callbacks=[whole]).fit(module_of(data), data)
+    saving = OnExceptionCheckpoint(tmp_path, "broken")
+    with pytest.raises(RuntimeError, match="interrupted"):
+        trainer_of(tmp_path / "parts", 7, callbacks=[broken, saving]).fit(module_of(data), data)
+    trainer_of(tmp_path / "rest", 7, callbacks=[resumed]).fit(
+        module_of(data), data_of(tmp_path / "dataset"), ckpt_path=tmp_path / "broken.ckpt", weights_only=True
+    )
+    assert len(set(whole.seen)) == 7
+    assert broken.seen + resumed.seen == whole.seen
+
+
 def test_a_checkpoint_stands_alone(make_dataset, tmp_path):
     data = data_of(make_dataset())
     model = module_of(data, transfer=Nearest(), decoder=Absolute())
@@ -119,6 +148,17 @@ def test_a_checkpoint_stands_alone(make_dataset, tmp_path):
     assert loaded.emulator.calibrated
     for name, value in model.emulator.state_dict().items():
         assert torch.equal(value, loaded.emulator.state_dict()[name]), name
+
+
+@pytest.mark.filterwarnings("error:The emulator is in training mode")
+def test_validations_and_tests_are_rollouts_in_evaluation_mode(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    module = module_of(data, constraints=Constraints(energy=True))
+    trainer = trainer_of(tmp_path, 2)
+    trainer.fit(module, data)
+    trainer.test(module, data)
+    with pytest.warns(UserWarning, match="training mode"):
+        rollout(EmulatorModule.of(module.emulator).emulator, next(iter(data.test_dataloader())).initial, 2)
 
 
 def test_a_pretrained_emulator_keeps_its_statistics(make_dataset, tmp_path):
@@ -153,6 +193,14 @@ def test_data_of_another_scene_are_refused(make_dataset, tmp_path):
     renamed = replace(data.scene, materials=tuple(f"my {name}" for name in data.scene.materials))
     assert data.scene.differences(renamed) == ()
     assert renamed.differences(replace(renamed, dt=1.0, particle_volume=1.0)) == ("dt", "particle_volume")
+
+
+def test_windows_shorter_than_a_training_step_are_refused_and_longer_ones_cut(make_dataset, tmp_path):
+    data = data_of(make_dataset())
+    with pytest.raises(ConfigError, match=r"data\.horizon = 4 .* 6 frames .*frames = 2 .*unroll = 3"):
+        trainer_of(tmp_path, 1).fit(module_of(data, unroll=3), data)
+    trainer_of(tmp_path, 1, limit_test_batches=1).test(module_of(data, unroll=3), data)  # of whole trajectories
+    trainer_of(tmp_path, 1).fit(module_of(data, unroll=1), data)
 
 
 def test_bundles_grow_over_the_share_of_the_training_asked_for(make_dataset, tmp_path):

@@ -148,8 +148,9 @@ def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
             (recording.fields[name], len(recording.material)) for recording in recordings if name in recording.fields
         ]
         parts = [part for part, _ in own]
-        kinds = {(part.shape[0] == 1, part.shape[1] == 1 < count) for part, count in own}
-        if len(parts) < len(recordings) or len(kinds) > 1:
+        constant = {part.shape[0] == 1 for part in parts}
+        single = {part.shape[1] == 1 for part, count in own if count > 1}  # (of one particle, both kinds look the same)
+        if len(parts) < len(recordings) or len(constant) > 1 or len(single) > 1:
             raise DataError(
                 f"The field {name} has another shape in some trajectories than in others, or is missing in some: store"
                 " it in all as (T, N), as (N,), or as one number."

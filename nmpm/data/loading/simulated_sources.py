@@ -73,9 +73,13 @@ class SimulatedSource(EmbeddedSource):
         counts = dict(options.get("counts") or catalog.describe(self.name).counts)
         return catalog.ensure(self.name, **(options | {"counts": counts | {"train": 0}}))
 
-    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+    @cached_property
+    def training_recordings(self) -> SimulatedRecordings:
+        """The trajectories to train on: one provider, whose buffers calibration and training share."""
         options = {key: value for key, value in self._check_options().items() if key not in ("counts", "workers")}
         request = catalog.simulation_request(self.name, **options)
-        recordings = SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
-        frames = (request.preset.frames + 1,) * plan["buffer_size"]
-        return recordings, EndlessWindowPlan(frames=frames, length=length, **plan)
+        return SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
+
+    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        frames = (self.training_recordings.preset.frames + 1,) * plan["buffer_size"]
+        return self.training_recordings, EndlessWindowPlan(frames=frames, length=length, **plan)

@@ -53,9 +53,12 @@ def depths(share: Any, places: Any, grid: Any, out: Any) -> Any:
 
 
 @jit
-def longest_step(cells: Any, path: Any, low: Any, high: Any) -> Any:
-    """Length of the longest step of particles `low` to `high` in a frame; steps that are not finite do not count."""
-    longest = ZERO
+def longest_step(cells: Any, path: Any, mask: Any, low: Any, high: Any) -> Any:
+    """Length of the longest step of particles `low` to `high` in a frame.
+
+    Steps of padding, and those that are not finite, do not count.
+    """
+    longest, real = ZERO, mask[low:high]
     for frame in range(len(path)):
         here = path[frame, low:high]
         before = path[frame - 1, low:high] if frame > 0 else cells[low:high]
@@ -64,7 +67,7 @@ def longest_step(cells: Any, path: Any, low: Any, high: Any) -> Any:
             for d in range(here.shape[1]):
                 step = here[p, d] - before[p, d]
                 square += step * step
-            longest = square if square > longest and square < _INFINITE else longest
+            longest = square if real[p] and square > longest and square < _INFINITE else longest
     return np.sqrt(longest)
 
 
@@ -103,13 +106,20 @@ def fill_clearance(share: Any, grid: Any, clearance: Any) -> Any:
 
 
 @jit
-def _find_near(cells: Any, path: Any, clearance: Any, grid: Any, begin: Any, end: Any, near: Any) -> Any:
-    """Fill in which particles may touch an obstacle, in order, and return how many: all, without clearances."""
+def _find_near(cells: Any, path: Any, mask: Any, clearance: Any, grid: Any, begin: Any, end: Any, near: Any) -> Any:
+    """Fill in which particles may touch an obstacle, in order, and return how many.
+
+    Never padding; all others, without clearances.
+    """
     shape, wraps = grid
+    found = 0
     if len(clearance) == 0:
-        near[: end - begin] = np.arange(begin, end)
-        return end - begin
-    found, furthest, start = 0, np.zeros(end - begin, np.float32), cells[begin:end]
+        for p in range(begin, end):
+            if mask[p]:
+                near[found] = p
+                found += 1
+        return found
+    furthest, start = np.zeros(end - begin, np.float32), cells[begin:end]
     for frame in range(len(path)):
         here = path[frame, begin:end]
         for d in range(len(shape)):
@@ -121,7 +131,7 @@ def _find_near(cells: Any, path: Any, clearance: Any, grid: Any, begin: Any, end
         for d in range(len(shape)):
             row = np.int64(np.floor(cells[p, d])) if np.isfinite(cells[p, d]) else 0
             node = node * shape[d] + (row % shape[d] if wraps[d] else min(max(row, 0), shape[d] - 1))
-        if not furthest[p - begin] <= clearance[node] - ONE:
+        if mask[p] and not furthest[p - begin] <= clearance[node] - ONE:
             near[found] = p
             found += 1
     return found
@@ -129,15 +139,16 @@ def _find_near(cells: Any, path: Any, clearance: Any, grid: Any, begin: Any, end
 
 @jit
 def mark(
-    cells: Any, path: Any, share: Any, clearance: Any, grid: Any, pieces: Any, marks: Any, low: Any, high: Any
-) -> Any:
+    cells: Any, path: Any, mask: Any, share: Any, clearance: Any, grid: Any, pieces: Any, marks: Any, low: Any,
+    high: Any,
+) -> Any:  # fmt: skip
     """Fill in which particles touch an obstacle (`TOUCHES`) or start in one (`STUCK`), and return how many do."""
     dim, found = cells.shape[1], 0
     places, values = np.empty((_BLOCK, dim), np.float32), np.empty(_BLOCK, np.float32)
     near = np.empty(_BLOCK, np.int64)
     marks[low:high] = CLEAR
     for begin in range(low, high, _BLOCK):
-        count = _find_near(cells, path, clearance, grid, begin, min(begin + _BLOCK, high), near)
+        count = _find_near(cells, path, mask, clearance, grid, begin, min(begin + _BLOCK, high), near)
         for k in range(count):
             for d in range(dim):
                 places[k, d] = cells[near[k], d]

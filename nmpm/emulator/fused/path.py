@@ -151,16 +151,17 @@ def clear_of_obstacles(start: SceneArrays, plan: Plan, around: Surroundings, pat
         threads: How many work.
     """
     ranges, grid, share = split(len(start.cells), _CHUNK), (plan.shape, plan.wraps), around.share
-    pieces = _count_pieces(map_ranges(partial(contact.longest_step, start.cells, path), ranges, threads))
+    longest = map_ranges(partial(contact.longest_step, start.cells, path, start.mask), ranges, threads)
+    pieces = _count_pieces(longest)
     marks = np.empty(len(start.cells), np.int8)
-    find = partial(contact.mark, start.cells, path, share, around.clearance, grid, pieces, marks)
+    find = partial(contact.mark, start.cells, path, start.mask, share, around.clearance, grid, pieces, marks)
     if not sum(map_ranges(find, ranges, threads)):
         return
     rows = np.flatnonzero(marks)
     free = np.empty(len(rows), np.int64)
     place, along = np.empty((2, len(rows), plan.dim), np.float32)
-    longest = contact.follow(start.cells, path, share, grid, pieces, rows, free, place, along)
-    contact.slide(path, share, grid, plan.limits, pieces, _count_pieces([longest]), rows, free, place, along)
+    rest = contact.follow(start.cells, path, share, grid, pieces, rows, free, place, along)
+    contact.slide(path, share, grid, plan.limits, pieces, _count_pieces([rest]), rows, free, place, along)
     stuck = np.flatnonzero(marks == contact.STUCK)
     if len(stuck):
         contact.push_out(start.cells, path, share, grid, plan.limits, stuck)

@@ -53,7 +53,7 @@ def _advance_frame(stepper: MpmStepper, particles: MpmParticles, substeps: int, 
 
 
 def check_particles(position: NDArray[Any], velocity: NDArray[Any], reach: tuple[Interval, ...]) -> None:
-    """Check the shapes of positions and velocities, and that particles are finite and within `reach`.
+    """Check the shapes of positions and velocities, and that there are particles, finite and within `reach`.
 
     Raises:
         DataError: if they are not.
@@ -62,6 +62,8 @@ def check_particles(position: NDArray[Any], velocity: NDArray[Any], reach: tuple
         raise DataError(
             f"Positions {position.shape} and velocities {velocity.shape} must both have shape (N, {len(reach)})."
         )
+    if not len(position):
+        raise DataError("There is no particle to simulate: give the position of one at least.")
     low, high = np.array(reach).T
     inside = np.all((low <= position) & (position <= high) & np.isfinite(velocity), axis=1)
     if not inside.all():

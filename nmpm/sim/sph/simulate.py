@@ -72,13 +72,15 @@ def check_particles(
     box: tuple[Interval, Interval],
     obstacles: tuple[PolygonObstacle, ...],
 ) -> None:
-    """Check the shapes of positions and velocities, and that particles are finite, in the box and in no obstacle.
+    """Check the shapes of positions and velocities, and that there are particles, finite, in the box, in no obstacle.
 
     Raises:
         DataError: if they are not.
     """
     if position.ndim != 2 or position.shape[1] != 2 or velocity.shape != position.shape:
         raise DataError(f"Positions {position.shape} and velocities {velocity.shape} must both have shape (N, 2).")
+    if not len(position):
+        raise DataError("There is no particle to simulate: give the position of one at least.")
     low, high = np.array(box).T
     valid = np.all((low <= position) & (position <= high) & np.isfinite(velocity), axis=1)
     for obstacle in obstacles:

@@ -107,6 +107,16 @@ class TestDataModule:
             name="goop", source="simulate", horizon=3, batch_size=2, buffer_size=2, generate=options
         )
 
+    def test_calibration_and_training_share_their_trajectories(self, module, monkeypatch):
+        seeds, simulate = [], MpmPreset.simulate
+        monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: seeds.append(seed) or simulate(preset, seed))
+        calibration = list(islice(module.train_dataloader(), 2))
+        training = list(islice(module.train_dataloader(), 2))
+        module.teardown("fit")
+        assert [torch.equal(a.frames, b.frames) for a, b in zip(calibration, training, strict=True)] == [True, True]
+        assert len(seeds) == len(set(seeds))
+        assert not [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+
     def test_training_trajectories_are_not_written(self, module):
         window = next(iter(module.train_dataloader()))
         assert window.frames.shape[:2] == (2, 5)

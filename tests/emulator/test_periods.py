@@ -1,0 +1,102 @@
+"""Particles that travel through many periods of a scene."""
+
+import dataclasses
+
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.decoders import Flip, Residual
+from nmpm.emulator import EmulatorRecipe
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.gradients import differentiable_rollout
+from nmpm.emulator.monitor import Monitor, Policy
+from nmpm.emulator.rollouts import rollout
+from nmpm.processors import Identity, Pointwise
+
+PERIOD = 0.8
+CHANNEL = {"boundary": ("periodic", "wall"), "domain": ((0.1, 0.9), (0.08, 0.92))}
+STILL = box(gravity=(0.0, 0.0), **CHANNEL)
+
+
+def emulator_of(scene=STILL, scale=1e-9, decoder=None, **constraints):
+    torch.manual_seed(0)
+    network = Identity() if scale < 1e-6 else Pointwise(hidden=(4,))
+    recipe = EmulatorRecipe(
+        scene, 16, 4, processor=network, decoder=decoder or Flip(), constraints=Constraints(**constraints)
+    )
+    emulator = recipe.build().eval().requires_grad_(False)
+    emulator.output_scale.fill_(scale)
+    return emulator
+
+
+def drifting(speed: float, periods: float = 0.0):
+    """Particles that move along the periodic axis, so many periods away from the domain."""
+    particles = cloud(STILL, speed=0.0)
+    position, velocity = particles.position.clone(), particles.velocity.clone()
+    position[..., 0] += periods * PERIOD
+    velocity[..., 0] = speed * torch.linspace(0.5, 1, velocity.shape[1])
+    return particles.with_motion(position, velocity)
+
+
+@pytest.mark.parametrize("decoder", [Flip(), Residual()])
+def test_a_slow_particle_moves_as_far_whatever_its_distance_from_the_domain(decoder):
+    emulator = emulator_of(decoder=decoder)
+    near, far = drifting(2e-4), drifting(2e-4, periods=100)
+    moved, other = (rollout(emulator, start, 200)[:, -1] - start.position for start in (near, far))
+    torch.testing.assert_close(other[..., 0], moved[..., 0], rtol=2e-3, atol=0)
+
+
+def test_trajectories_are_unwrapped():
+    start = drifting(0.05)
+    predicted = rollout(emulator_of(), start, 400)
+    expected = start.position[:, None] + start.velocity[:, None] * torch.arange(1, 401)[:, None, None]
+    assert expected[:, -1].max() > 20 * PERIOD
+    torch.testing.assert_close(predicted, expected, rtol=1e-4, atol=1e-4)
+    assert (predicted[..., 0].diff(dim=1) > 0).all()
+
+
+def test_within_the_domain_a_rollout_is_that_of_calls_to_the_bit():
+    emulator, state = emulator_of(scale=0.1), cloud(STILL)
+    predicted = rollout(emulator, state, 8)
+    first = emulator(state)
+    second = emulator(first.state_after(state))
+    assert torch.equal(predicted, torch.cat([first.position, second.position], dim=1))
+
+
+def test_gradients_are_those_of_the_same_rollout():
+    emulator, start = emulator_of(scale=0.1), drifting(0.2)
+    position = start.position.clone().requires_grad_()
+    predicted = differentiable_rollout(emulator, start.with_motion(position, start.velocity), 16)
+    torch.testing.assert_close(predicted, rollout(emulator, start, 16), rtol=1e-4, atol=1e-4)
+    predicted[:, -1, :, 0].sum().backward()
+    assert position.grad is not None
+    assert position.grad[..., 0].mean().item() == pytest.approx(1.0, abs=0.5)
+
+
+def test_what_rests_stays_where_it_is():
+    emulator = emulator_of(rest_speed=0.01)
+    start = drifting(0.0, periods=7.0)
+    predicted = rollout(emulator, start, 12)
+    assert torch.equal(predicted, predicted[:, :1].expand_as(predicted))
+    torch.testing.assert_close(predicted[:, 0], start.position, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_energy_is_that_of_the_whole_way_fallen(varies):
+    scene = box(gravity=(9.81, 0.0), gravity_varies=varies, **CHANNEL)
+    emulator = emulator_of(scene, energy=True)
+    start = dataclasses.replace(drifting(0.02), gravity=torch.tensor([[9.81, 0.0]]) * scene.dt**2)
+    monitor = Monitor(Policy.RECORD, speed=100.0)
+    predicted = rollout(emulator, start, 200, monitor)
+    fallen = start.position[:, None] + start.velocity[:, None] * torch.arange(1, 201)[:, None, None]
+    assert (predicted[:, -1, :, 0] >= fallen[:, -1, :, 0] - 1e-3).all()  # no energy is lost to crossings
+    assert monitor.peaks["energy"] < 0.02
+
+
+def test_a_monitor_sees_where_particles_are():
+    monitor = Monitor(Policy.STOP)
+    rollout(emulator_of(), drifting(0.05), 100, monitor)
+    assert monitor.peaks["speed"] < 1.1
+    assert abs(monitor.peaks["energy"]) < 1e-3
+    assert monitor.rest_share == 0
