@@ -69,7 +69,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
             os.replace(path, place / FORMER)
         try:
             os.replace(place / NEW, path)
-        except OSError:
+        except BaseException:  # an interrupt too, after which the temporary folder is deleted
             if (place / FORMER).exists():
                 os.replace(place / FORMER, path)
             raise
