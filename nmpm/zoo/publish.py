@@ -64,12 +64,22 @@ def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
     return target
 
 
+def weights_of(checkpoint: Path) -> str:
+    """The SHA-256 of the weights that an entry of a checkpoint has."""
+    return hashlib.sha256(serialise(_rounded(checkpoint))).hexdigest()
+
+
+def _rounded(checkpoint: Path) -> Emulator:
+    """The emulator of a checkpoint as its entry stores it."""
+    return round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
+
+
 def _publish(run: Path, name: str, target: Path, about: str) -> None:
     checkpoint, report = run / BEST, run / "report.json"
     for needed in (checkpoint, report):
         if not needed.is_file():
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
-    emulator = round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
+    emulator = _rounded(checkpoint)
     weights = serialise(emulator)
     files = [path for path in (run / file for file in COPIED) if path.is_file()]
     try:

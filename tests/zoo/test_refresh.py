@@ -1,4 +1,4 @@
-"""Refreshed entries: what stands on their cards stays, others' changes too, and incomplete ones are left as they are."""
+"""Refreshed entries keep what their cards state and what others write meanwhile; incomplete cards are refused."""
 
 import pytest
 import yaml
@@ -52,7 +52,10 @@ def test_an_entry_that_is_replaced_meanwhile_keeps_its_own_card(entry, replaced,
 
 
 def test_weights_that_are_replaced_while_they_are_rounded_stay(entry, replaced, monkeypatch):
-    monkeypatch.setattr("nmpm.zoo.storage.round_network", lambda emulator: replaced() and emulator.rebuilt(emulator.recipe))
+    def round_network(emulator):
+        return replaced() and emulator.rebuilt(emulator.recipe)
+
+    monkeypatch.setattr("nmpm.zoo.storage.round_network", round_network)
     with pytest.raises(ZooError, match="were replaced"):
         halve(entry)
     assert (Zoo.load("small", entry.parent).emulator.input_std == 3.0).all()
