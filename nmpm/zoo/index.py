@@ -83,7 +83,7 @@ def refresh(
     model = load_entry(folder)
     weights = str(model.card["sha256"])
     golden = {} if "golden" in model.card else {"golden": golden_rollout(model.emulator)}
-    card = read_card_of(folder, weights)
+    card = read_card_of(folder, weights, "the golden rollout")
     card = {"format": CARD_FORMAT} | card | {"lifecycle": lifecycle(card)} | golden
     if failures is not None:
         card.pop("failures", None)
@@ -105,18 +105,18 @@ def add_facts(folder: Path, weights: str, facts: Mapping[str, Any]) -> None:
     Raises:
         ZooError: if the entry has other weights by now.
     """
-    write_card(folder, {**read_card_of(folder, weights), **facts})
+    write_card(folder, {**read_card_of(folder, weights, ", ".join(facts)), **facts})
 
 
-def read_card_of(folder: Path, weights: str) -> dict[str, Any]:
-    """The card of an entry, if it still has the weights of this SHA-256.
+def read_card_of(folder: Path, weights: str, measured: str) -> dict[str, Any]:
+    """The card of an entry, if it still has the weights of this SHA-256, of which something was measured.
 
     Raises:
         ZooError: if it has others.
     """
     card = read_card(folder)
     if card.get("sha256") != weights:
-        raise ZooError(f"{folder}: its weights were replaced while they were measured; measure it again.")
+        raise ZooError(f"{folder}: its weights were replaced while {measured} was measured; measure it again.")
     return card
 
 

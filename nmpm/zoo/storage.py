@@ -79,7 +79,7 @@ def halve(folder: Path) -> bool:
             "golden": golden_rollout(half),
             "sha256": sha256(weights).hexdigest(),
         }
-        write_card(new, read_card_of(new, str(model.card["sha256"])) | facts)
+        write_card(new, read_card_of(new, str(model.card["sha256"]), "its rounding") | facts)
     return True
 
 
