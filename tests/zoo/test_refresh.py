@@ -44,9 +44,7 @@ def test_an_existing_golden_rollout_is_not_computed_again(entry, monkeypatch):
 
 def test_an_entry_that_is_replaced_meanwhile_keeps_its_own_card(entry, replaced, monkeypatch):
     monkeypatch.setattr(module, "golden_rollout", replaced)
-    with pytest.raises(
-        ZooError, match="were replaced while the golden rollout was measured; measure it again"
-    ):
+    with pytest.raises(ZooError, match="were replaced while the golden rollout was measured; measure it again"):
         refresh(entry)
     assert "golden" not in Zoo.load("small", entry.parent).card  # it can be loaded
     with pytest.raises(ZooError, match="were replaced"):
