@@ -50,7 +50,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
         ZooError: if the run is not finished, a report cannot be read, the name is taken, or the folder cannot be
             written or is part of the installed package.
     """
-    target = _target(check_name(name), root)
+    target = new_entry_folder(name, root)
     _publish(run, name, target, about)
     write_index(user_zoo() if root is None else Path(root))
     return target
@@ -96,12 +96,14 @@ def _publish(run: Path, name: str, target: Path, about: str) -> None:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
 
 
-def _target(name: str, root: str | Path | None) -> Path:
-    """The folder of a new entry.
+def new_entry_folder(name: str, root: str | Path | None) -> Path:
+    """The folder of a new entry, of the user's own zoo where `root` is None.
 
     Raises:
-        ZooError: if the name is taken, or the folder is part of the installed package.
+        ZooError: if the name is malformed or taken, also by a shipped model, which the new one would hide; or if the
+            folder is part of the installed package.
     """
+    check_name(name)
     zoo = _writable_zoo(user_zoo() if root is None else Path(root))
     taken = [zoo / name, *([shipped_folder("zoo") / name] if root is None else [])]
     for folder in taken:
