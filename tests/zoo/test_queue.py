@@ -205,10 +205,48 @@ def test_mistakes_in_a_queue_are_named(queue, tmp_path):
         ({"dataset": []}, "dataset: unknown key"),
         ({"datasets": [{"name": "small"}]}, "config"),
         ({"datasets": [content["datasets"][0] | {"hours": 0}]}, "hours = 0 must be positive"),
+        ({"datasets": [content["datasets"][0] | {"start": "lava"}]}, "small: start = lava is no other dataset"),
+        ({"datasets": [content["datasets"][0] | {"start": "small"}]}, "small: start = small is no other dataset"),
     ):
         path.write_text(json.dumps(content | change))
         with pytest.raises(ConfigError, match=complaint):
             Plan.read(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--data", "small"], "--data small: write NAME=FOLDER"),
+        (["--data", "small="], "--data small=: write NAME=FOLDER"),
+        (["--hours", "0"], "--hours 0.0 must be a positive number"),
+        (["--hours", "nan"], "--hours nan must be a positive number"),
+        (["--hours", "inf"], "--hours inf must be a positive number"),
+        (["--device", "abacus"], "--device abacus"),
+        (["--device", "cuda:99"], "This machine has no device 'cuda:99'"),
+    ],
+    ids=str,
+)
+def test_mistakes_in_options_are_named_before_anything_is_done(queue, capsys, options, message):
+    assert train(queue(1.0), *options) == 1
+    assert f"error: {message}" in capsys.readouterr().out
+    assert not Path("runs").exists()
+
+
+def test_what_left_out_datasets_wait_for_is_said(queue, tmp_path, capsys):
+    path = queue(1.0)
+    entries = [
+        {"name": "recorded", "config": "waterdrop.yaml", "hours": 1},
+        {"name": "later", "config": "goop.yaml", "hours": 1, "start": "recorded"},
+        {"name": "done", "config": "goop.yaml", "hours": 0.5},
+    ]
+    path.write_text(yaml.safe_dump({"extension": {"hours": 0.5, "limit": 0.5}, "datasets": entries}))
+    finished(Path("runs/done"), 0.5)
+    assert train(path) == 0
+    said = capsys.readouterr().out
+    assert "nothing is left to take" in said
+    assert "recorded waits for --data recorded=FOLDER." in said
+    assert "later waits for the training of recorded." in said
+    assert "done waits" not in said
 
 
 def test_trainings_and_an_extension_become_an_entry_with_their_curve(queue, capsys):
