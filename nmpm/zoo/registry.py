@@ -219,7 +219,9 @@ def _check_variants(model: str | Path, root: Root) -> None:
     Raises:
         ConfigError: if it is a path or an id.
     """
-    if root is None and not _is_in_zoo(model) and (_exists(Path(model)) or HubId.parse(str(model)) is not None):
+    if root is not None or (isinstance(model, str) and any(f"{name}/".startswith(f"{model}/") for name in Zoo.list())):
+        return
+    if _exists(Path(model)) or HubId.parse(str(model)) is not None:
         raise ConfigError(
             f"{one_line(model)} is one model: variant, max_mse and max_ms_per_frame choose among those of a name in the"
             " zoo. Leave them out; or, for a folder of several models, give root=FOLDER and a name within it."

@@ -78,6 +78,16 @@ def test_paths_and_ids_have_no_variants(root, monkeypatch, choice):
             Zoo.load(model, **choice)
 
 
+def test_a_folder_with_the_name_of_a_dataset_does_not_hide_its_variants(
+    home, small, write_entry, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for folder in (home / "zoo" / "pond" / "fast", tmp_path / "pond"):
+        write_entry(folder, small)
+    assert Zoo.load("pond", variant="fast").name == "fast"
+    assert Zoo.load("pond", max_mse=1.0).name == "fast"
+
+
 def test_the_variants_of_a_dataset_are_named_where_one_is_not_known(pond):
     with pytest.raises(ZooError, match=r"no model 'pond/slow'; .* Of pond it has pond/accurate, pond/balanced, .*fast"):
         Zoo.load("pond", pond, variant="slow")
