@@ -74,7 +74,8 @@ def main(words: list[str] | None = None) -> int:
     from nmpm.zoo.queue.plan import Plan
 
     try:
-        data = dict(entry.split("=", 1) if "=" in entry else (entry, "") for entry in chosen.data)
+        check_options(chosen)
+        data = dict(entry.split("=", 1) for entry in chosen.data)
         plan = Plan.read(chosen.queue).with_data(data).select(chosen.names)
         if chosen.status:
             return print_status(plan, chosen)
@@ -94,6 +95,24 @@ def main(words: list[str] | None = None) -> int:
         return 130
 
 
+def check_options(chosen: argparse.Namespace) -> None:
+    """Make sure that the options can be followed, before anything is done.
+
+    Raises:
+        ConfigError: naming the first that cannot.
+    """
+    from nmpm.cli.options import check_device
+    from nmpm.errors import ConfigError
+
+    for entry in chosen.data:
+        name, _, folder = entry.partition("=")
+        if not name or not folder:
+            raise ConfigError(f"--data {entry}: write NAME=FOLDER, a dataset of the queue and the folder of its data.")
+    if chosen.hours is not None and not 0 < chosen.hours < float("inf"):
+        raise ConfigError(f"--hours {chosen.hours} must be a positive number.")
+    check_device(chosen.device)
+
+
 def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
     """Train until no dataset is left that this process could take."""
     failed: set[str] = set()
@@ -110,7 +129,8 @@ def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
             break
         if not done:
             names = ", ".join(sorted(failed)) or "none"
-            say(f"nothing is left to take. {remaining(plan, chosen)} Failed: {names}.")
+            left_out = "".join(f" {text}." for text in waits(plan, chosen))
+            say(f"nothing is left to take.{left_out} {remaining(plan, chosen)} Failed: {names}.")
             return 1 if failed else 0
 
 
@@ -195,6 +215,15 @@ def histories(plan: Plan, chosen: argparse.Namespace) -> list[History]:
 
     entries = {d.name: None if chosen.fresh or not d.publish else chosen.zoo / d.name for d in plan.datasets}
     return [History(d, chosen.runs / d.name, plan.extension, entries[d.name]) for d in plan.datasets]
+
+
+def waits(plan: Plan, chosen: argparse.Namespace) -> Iterator[str]:
+    """What each dataset waits for that cannot be trained yet, in words."""
+    for history in histories(plan, chosen):
+        needed = history.waits_for()
+        if needed:
+            what = needed if needed.startswith("--") else f"the training of {needed}"
+            yield f"{history.dataset.name} waits for {what}"
 
 
 def remaining(plan: Plan, chosen: argparse.Namespace) -> str:

@@ -65,12 +65,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """
     with _workplace(path) as place:
         yield place / NEW
-        if path.exists():
-            os.replace(path, place / FORMER)
         try:
+            if path.exists():
+                os.replace(path, place / FORMER)
             os.replace(place / NEW, path)
-        except OSError:
-            if (place / FORMER).exists():
+        except BaseException:  # an interrupt too, after which the temporary folder is deleted
+            if (place / FORMER).exists() and not path.exists():
                 os.replace(place / FORMER, path)
             raise
 

@@ -66,13 +66,20 @@ def from_spec(spec: object, base: type[T]) -> T:
         base: The base class that the recipe must have.
 
     Raises:
-        ConfigError: if the class is unknown or does not take the arguments.
+        ConfigError: if the class is unknown or does not take the arguments, or the spec has other keys.
     """
     if isinstance(spec, base):
         return spec
     if not isinstance(spec, Mapping) or "class_path" not in spec:
         raise ConfigError(
             f"Expected a {base.__name__} or its class_path and init_args; got {one_line(repr(spec), 100)}."
+        )
+    unknown = sorted(str(key) for key in set(spec) - {"class_path", "init_args"})
+    if unknown:
+        keys = one_line(", ".join(unknown), 100)
+        raise ConfigError(
+            f"{base.__name__} {one_line(spec['class_path'], 100)} has the unknown keys {keys} beside class_path and"
+            " init_args: move arguments into init_args."
         )
     kind = _find_class(str(spec["class_path"]), base)
     given = spec.get("init_args") or {}

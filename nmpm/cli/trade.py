@@ -112,14 +112,29 @@ def _sweep(chosen: argparse.Namespace) -> Sweep:
 
 def _models(names: list[str] | None, scenes: Scenes) -> dict[str, Emulator]:
     """Models by name; those of the zoo that were trained on the dataset if none are named."""
-    from nmpm.zoo import Zoo, load_model
+    from nmpm.zoo import load_model
 
     if names is None:
-        found = {name: load_model(name) for name in Zoo.list()}
-        return {name: model.emulator for name, model in found.items() if model.preset == scenes.name}
+        return _models_of(scenes.name)
     short = {name: Path(name).name if Path(name).is_dir() else name for name in names}
     unique = len(set(short.values())) == len(short)
     return {short[name] if unique else name: load_model(name).emulator for name in names}
+
+
+def _models_of(dataset: str) -> dict[str, Emulator]:
+    """The zoo's models of a simulated dataset by name; damaged ones are left out, and named on stderr."""
+    from nmpm.errors import ZooError
+    from nmpm.zoo import Zoo, load_model
+    from nmpm.zoo.pretrained import preset_of
+
+    found = {}
+    for name in Zoo.list():
+        try:
+            if preset_of(Zoo.card(name)) == dataset:
+                found[name] = load_model(name).emulator
+        except ZooError as error:
+            sys.stderr.write(f"left out: {error}\n")
+    return found
 
 
 def _graph_folders(names: list[str]) -> dict[str, TrainedGraph]:

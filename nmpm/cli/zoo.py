@@ -12,6 +12,7 @@ from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import add_device_option, check_device
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
+_MODEL = "name, an entry's folder, or owner/repository@revision of the hub"
 
 _EXAMPLES = """\
 examples:
@@ -54,19 +55,19 @@ def _parser() -> argparse.ArgumentParser:
 
     listing = add_command("list", "names, data and full-rollout errors of the models")
     card = add_command("card", "errors, times, training and known failures of one model")
-    card.add_argument("name")
+    card.add_argument("name", help=_MODEL)
     card.add_argument("--yaml", action="store_true", help="everything known of it, for programs")
     add = add_command("add", "make an entry of your own zoo, or of --root, from a finished run")
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="name of the new model, e.g. goop/mine")
     add.add_argument("--about", default="", help="description of the data and their origin, for the card")
     verify = add_command("verify", "measure the figures of cards again; 1 if one is not confirmed")
-    verify.add_argument("name", nargs="?", help="(default: every model)")
+    verify.add_argument("name", nargs="?", help=f"{_MODEL} (default: every model)")
     verify.add_argument("--full", action="store_true", help="all test scenes to their end (default: a few, 100 frames)")
     verify.add_argument("--data", type=Path, metavar="FOLDER", help="test data, of models of recorded data")
     add_device_option(verify)
     refresh = add_command("refresh", "write READMEs, charts and the table of --root's models again")
-    refresh.add_argument("name", nargs="?", help="(default: every model)")
+    refresh.add_argument("name", nargs="?", help="name of your own, or an entry's folder (default: every model)")
     refresh.add_argument(
         "--measure",
         nargs="+",
@@ -85,9 +86,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_device_option(refresh, "where the speed is measured: ")
     push = add_command("push", "upload a model to the Hugging Face hub")
-    push.add_argument("name")
+    push.add_argument("name", help=_MODEL)
     push.add_argument("repository", help="owner/repository, created if missing")
-    push.add_argument("--private", action="store_true", help="of a new repository")
+    push.add_argument("--private", action="store_true", help="refuse a public repository; make a new one private")
     pull = add_command("pull", "download a model of the Hugging Face hub")
     pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
     pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
@@ -122,9 +123,10 @@ def _summary(card: Mapping[str, Any]) -> str:
 def _card(chosen: argparse.Namespace) -> None:
     from nmpm.errors import ZooError
     from nmpm.zoo.cards import readme
-    from nmpm.zoo.registry import Zoo
+    from nmpm.zoo.entries import read_card
+    from nmpm.zoo.registry import find_entry
 
-    card = Zoo.card(chosen.name, chosen.root)
+    card = read_card(find_entry(chosen.name, chosen.root))
     if chosen.yaml:
         import yaml
 
@@ -132,7 +134,7 @@ def _card(chosen: argparse.Namespace) -> None:
         return
     try:
         text = readme(card)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ZooError(
             f"The card of {chosen.name} is not complete ({error}): `nmpm zoo card {chosen.name} --yaml` shows what it"
             " has."
@@ -159,11 +161,15 @@ def _add(chosen: argparse.Namespace) -> None:
 
 
 def _verify(chosen: argparse.Namespace) -> int:
-    """Verify a model, which must be possible; or all, of which those of recorded data may be left out."""
-    from nmpm.errors import ConfigError
+    """Verify a model, which must be possible; or all, of which those of recorded data may be left out.
+
+    Of all, a damaged one counts as a figure that is not confirmed.
+    """
+    from nmpm.errors import ConfigError, NmpmError
     from nmpm.zoo.registry import Zoo
     from nmpm.zoo.verification import verify
 
+    _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
     check_device(chosen.device)
     failed = 0
     for name in Zoo.list(chosen.root) if chosen.name is None else [chosen.name]:
@@ -176,44 +182,80 @@ def _verify(chosen: argparse.Namespace) -> int:
             if chosen.name is not None:
                 raise
             sys.stdout.write(f"  not verified: {error}\n")
+        except NmpmError as error:
+            if chosen.name is not None:
+                raise
+            sys.stdout.write(f"  FAIL  {error}\n")
+            failed += 1
     sys.stdout.write(f"{failed} figures are not confirmed.\n" if failed else "All that was measured is confirmed.\n")
     return 1 if failed else 0
 
 
 def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
-    from nmpm.errors import ConfigError
     from nmpm.zoo.index import refresh, write_index
     from nmpm.zoo.registry import Zoo
     from nmpm.zoo.storage import halve
 
-    if chosen.data is not None and chosen.name is None:
-        raise ConfigError("--data is the folder of one model's data: give the model's NAME too.")
-    if chosen.failures is not None and chosen.name is None:
-        raise ConfigError("--failures is about one model: give the model's NAME too.")
+    _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
+    _check_one("--failures is about one model", chosen.failures, chosen.name)
     check_device(chosen.device)
     root = user_zoo() if chosen.root is None else chosen.root
-    for name in Zoo.list(root) if chosen.name is None else [chosen.name]:
+    names = Zoo.list(root) if chosen.name is None else [chosen.name]
+    folders = [_find_writable(name, chosen.root) for name in names]
+    for folder in folders:
         if chosen.half:
-            halve(Zoo.folder(name, root))
-        refresh(Zoo.folder(name, root), chosen.measure, chosen.data, chosen.failures, chosen.device)
-    sys.stdout.write(f"wrote {write_index(root)}\n")
+            halve(folder)
+        refresh(folder, chosen.measure, chosen.data, chosen.failures, chosen.device)
+        sys.stdout.write(f"wrote {folder}\n")
+    if all(folder.resolve().is_relative_to(root.resolve()) for folder in folders):
+        sys.stdout.write(f"wrote {write_index(root)}\n")
+
+
+def _check_one(option: str, value: object, name: str | None) -> None:
+    """Make sure that an option about one model comes with its name."""
+    from nmpm.errors import ConfigError
+
+    if value is not None and name is None:
+        raise ConfigError(f"{option}: give the model's NAME too.")
+
+
+def _find_writable(model: str, root: Path | None) -> Path:
+    """The folder of an entry to refresh: of that name in the user's own zoo or in `root`, or at that path.
+
+    Raises:
+        ConfigError: if it is on the hub.
+        ZooError: if there is none.
+    """
+    from nmpm._support.shipped import user_zoo
+    from nmpm.errors import ConfigError
+    from nmpm.zoo.hub import HubId
+    from nmpm.zoo.registry import Zoo, find_entry
+
+    if root is not None:
+        return Zoo.folder(model, root)
+    if model in (Zoo.list(user_zoo()) if user_zoo().is_dir() else []):
+        return Zoo.folder(model, user_zoo())
+    if Path(model).is_dir():
+        return find_entry(Path(model))
+    if HubId.parse(model) is not None:
+        raise ConfigError(f"{model} is on the hub: `nmpm zoo pull {model} NAME` makes an entry of it; refresh that.")
+    return Zoo.folder(model, user_zoo())
 
 
 def _push(chosen: argparse.Namespace) -> None:
     from nmpm.zoo.hub import push
-    from nmpm.zoo.registry import Zoo
+    from nmpm.zoo.registry import find_entry
 
-    found = push(Zoo.folder(chosen.name, chosen.root), chosen.repository, chosen.private)
+    found = push(find_entry(chosen.name, chosen.root), chosen.repository, chosen.private)
     sys.stdout.write(f"pushed {found}; load it by that id.\n")
 
 
 def _pull(chosen: argparse.Namespace) -> None:
-    from nmpm._support.shipped import user_zoo
     from nmpm.errors import ConfigError
     from nmpm.zoo.entries import load_entry
     from nmpm.zoo.hub import HubId, download, pull
-    from nmpm.zoo.registry import check_name
+    from nmpm.zoo.publish import new_entry_folder
 
     identifier = HubId.parse(chosen.id)
     if identifier is None:
@@ -222,6 +264,5 @@ def _pull(chosen: argparse.Namespace) -> None:
         folder = download(identifier)
         load_entry(folder)
     else:
-        root = user_zoo() if chosen.root is None else chosen.root
-        folder = pull(identifier, root / check_name(chosen.name))
+        folder = pull(identifier, new_entry_folder(chosen.name, chosen.root), chosen.name)
     sys.stdout.write(f"{identifier} is in {folder}\n")

@@ -49,12 +49,13 @@ def stress_line(card: Mapping[str, Any]) -> str:
     return "; ".join(f"{kind}: {_stress_outcome(digest)}" for kind, digest in kinds.items())
 
 
-def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
+def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | None = None) -> str:
     """The README of an entry, as Markdown.
 
     Args:
         card: The content of `card.yaml`.
         files: Names of the files of the entry; pictures among them are shown.
+        load: What `Zoo.load` takes; the model's name when left out.
     """
     training, test = card["training"], card["test"]
     names = figure_names(test)
@@ -87,7 +88,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = ()) -> str:
         "```python",
         "from nmpm import Zoo",
         "",
-        f'model = Zoo.load("{card["name"]}")',
+        f'model = Zoo.load("{load or card["name"]}")',
         "positions = model.rollout(model.example(), frames=400)  # (1, 400, N, D)",
         "```",
     ]

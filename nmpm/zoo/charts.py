@@ -19,11 +19,17 @@ CHART = "chart.png"
 
 
 def write_chart(folder: Path) -> None:
-    """Draw `chart.png` of an entry's `errors.csv` and of the `curve` of its card; nothing where both are missing."""
-    card, errors = read_yaml(folder / "card.yaml"), _read_errors(folder / "errors.csv")
-    curve = card.get("curve") or []
+    """Write `chart.png` of an entry's `errors.csv` and of the `curve` of its card; nothing where both are missing."""
+    figure = draw_chart(folder, read_yaml(folder / "card.yaml"))
+    if figure is not None:
+        save_chart(folder, figure)
+
+
+def draw_chart(folder: Path, card: Mapping[str, Any]) -> Figure | None:
+    """The chart of an entry with this card; None where it has neither `errors.csv` nor a curve."""
+    errors, curve = _read_errors(folder / "errors.csv"), card.get("curve") or []
     if not errors and not curve:
-        return
+        return None
     figure = Figure(figsize=(4.6 * (bool(errors) + bool(curve)), 3.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = iter(figure.subplots(1, bool(errors) + bool(curve), squeeze=False)[0])
@@ -31,6 +37,11 @@ def write_chart(folder: Path) -> None:
         _draw_errors(next(axes), errors, card)
     if curve:
         _draw_training(next(axes), curve)
+    return figure
+
+
+def save_chart(folder: Path, figure: Figure) -> None:
+    """Write a chart to an entry's folder."""
     with atomic_write(folder / CHART) as part:
         figure.savefig(part, format="png")
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 from nmpm._support.devices import same_hardware
-from nmpm.errors import ZooError
+from nmpm.errors import ConfigError, ZooError
 
 
 @dataclass(frozen=True)
@@ -18,11 +20,20 @@ class Limits:
         max_mse: Largest full-rollout MSE on the test scenes, in length².
         max_ms_per_frame: Largest time per frame of one scene.
         hardware: Whose times count, as cards name it; those of this machine when left out.
+
+    Raises:
+        ConfigError: if a limit is not a positive number.
     """
 
     max_mse: float | None = None
     max_ms_per_frame: float | None = None
     hardware: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("max_mse", "max_ms_per_frame"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, Real) and float(value) > 0):
+                raise ConfigError(f"{name} = {value!r} must be a positive number, or be left out.")
 
     def __bool__(self) -> bool:
         return self.max_mse is not None or self.max_ms_per_frame is not None
@@ -31,42 +42,61 @@ class Limits:
 def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds: Callable[[str], float | None]) -> str:
     """The model within the limits: the most accurate if time is limited, else the fastest, else the most accurate.
 
+    Models whose cards state no error are left out; so are those of unknown times where the others' are known.
+
     Args:
         cards: Of the variants, by name.
         limits: What it must keep to.
         milliseconds: The time per frame of a model of that name; None where it is not known.
 
     Raises:
-        ZooError: if none is within the limits, or times are needed that are not known.
+        ZooError: if none is within the limits, or times are needed of which none is known.
     """
-    errors = {name: float(card["test"]["mse"]) for name, card in cards.items() if "mse" in (card.get("test") or {})}
-    times = {name: milliseconds(name) for name in errors}
-    unknown = sorted(name for name, time in times.items() if time is None)
-    if limits.max_ms_per_frame is not None and unknown:
+    errors = {name: mse for name, card in cards.items() if (mse := _stated_mse(card)) is not None}
+    times = {name: time for name in errors if (time := milliseconds(name)) is not None}
+    if limits.max_ms_per_frame is not None and errors and not times:
         where = limits.hardware or "this machine"
         raise ZooError(
-            f"The cards of {', '.join(unknown)} state no time on {where}{_measured(cards, unknown)}. Give"
+            f"The cards of {', '.join(sorted(errors))} state no time on {where}{_measured(cards, list(errors))}. Give"
             " calibrate=True to time them here."
         )
-    most, slowest = (limits.max_mse or float("inf")), (limits.max_ms_per_frame or float("inf"))
-    within = [n for n, mse in errors.items() if mse <= most and (times[n] is None or times[n] <= slowest)]  # type: ignore[operator]
+    accurate = [name for name, mse in errors.items() if limits.max_mse is None or mse <= limits.max_mse]
+    timed = [name for name in accurate if name in times]
+    if limits.max_ms_per_frame is not None:
+        within = [name for name in timed if times[name] <= limits.max_ms_per_frame]
+    else:
+        within = timed or accurate
     if not within:
         found = "; ".join(
-            f"{name}: MSE {mse:.3g}" + ("" if times[name] is None else f", {times[name]:.3g} ms")
+            f"{name}: MSE {mse:.3g}" + (f", {times[name]:.3g} ms" if name in times else "")
             for name, mse in errors.items()
         )
         raise ZooError(f"No model is within the limits. {found or 'None states an error.'}")
-    by_time = limits.max_ms_per_frame is None and not unknown
-    return min(within, key=lambda name: times[name] if by_time else errors[name])  # type: ignore[arg-type,return-value]
+    by_time = limits.max_ms_per_frame is None and bool(timed)
+    return min(within, key=lambda name: times[name] if by_time else errors[name])
 
 
 def stated_milliseconds(card: Mapping[str, Any], hardware: str) -> float | None:
     """The time per frame that a card states for a hardware; None where it states none."""
-    entries: Sequence[Mapping[str, Any]] = card.get("speed") or ()
-    own = [entry for entry in entries if same_hardware(str(entry.get("hardware")), hardware)]
-    return float(own[0]["ms_per_frame"]) if own else None
+    own = [time for name, time in _stated_times(card) if same_hardware(name, hardware)]
+    return own[0] if own else None
+
+
+def _stated_times(card: Mapping[str, Any]) -> list[tuple[str, float]]:
+    """Hardware and milliseconds per frame of each measurement that a card states; malformed ones are left out."""
+    entries = card.get("speed")
+    found = [entry for entry in entries if isinstance(entry, Mapping)] if isinstance(entries, list) else []
+    times = [(str(entry.get("hardware")), entry.get("ms_per_frame")) for entry in found]
+    return [(name, float(time)) for name, time in times if isinstance(time, int | float)]
+
+
+def _stated_mse(card: Mapping[str, Any]) -> float | None:
+    """The full-rollout error that a card states; None where it states none that is finite."""
+    test = card.get("test")
+    mse = test.get("mse") if isinstance(test, Mapping) else None
+    return float(mse) if isinstance(mse, int | float) and math.isfinite(mse) else None
 
 
 def _measured(cards: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
-    known = sorted({str(entry["hardware"]) for name in names for entry in cards[name].get("speed") or ()})
+    known = sorted({hardware for name in names for hardware, _ in _stated_times(cards[name])})
     return f", but on {'; '.join(known)} (hardware=…)" if known else ""

@@ -17,6 +17,7 @@ from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, NmpmError, ZooError
 from nmpm.zoo.building import build, read_recipe
+from nmpm.zoo.lifecycle import CARD_FORMAT
 from nmpm.zoo.pretrained import Pretrained
 
 CARD = "card.yaml"
@@ -28,12 +29,19 @@ def read_card(folder: Path) -> dict[str, Any]:
     """The content of an entry's card.
 
     Raises:
-        ZooError: if it is missing or damaged.
+        ZooError: if it is missing or damaged, or a newer nmpm wrote it.
     """
     try:
-        return read_yaml(folder / CARD)
+        card = read_yaml(folder / CARD)
     except DataError as error:
         raise ZooError(str(error)) from error
+    found = card.get("format", 0)  # cards of version 0.1 state none
+    if not isinstance(found, int) or found > CARD_FORMAT:
+        raise ZooError(
+            f"{folder / CARD} has format {one_line(found, 60)}; this nmpm reads up to {CARD_FORMAT}: pip install"
+            " --upgrade nmpm."
+        )
+    return card
 
 
 def load_entry(folder: Path) -> Pretrained:

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, rollout
+from nmpm.errors import ZooError
 from nmpm.zoo.pretrained import Pretrained
 
 FRAMES = 32
@@ -34,10 +36,24 @@ def golden_rollout(emulator: Emulator) -> dict[str, Any]:
 
 
 def golden_distance(model: Pretrained, golden: Mapping[str, Any]) -> float:
-    """Largest distance of a model's rollout from a stated one, in cells."""
-    found = _positions(model.emulator, golden["seed"], golden["count"], golden["frames"])
+    """Largest distance of a model's rollout from a stated one, in cells.
+
+    Raises:
+        ZooError: if what is stated is not such a rollout.
+    """
+    try:
+        seed, count, frames = (int(golden[key]) for key in ("seed", "count", "frames"))
+        stated = torch.tensor(golden["position"], dtype=torch.float64)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = one_line(repr(error))
+        raise ZooError(f"{model.name}: the golden rollout of its card cannot be read: {reason}.") from error
+    if stated.shape != (PROBES, model.scene.dim) or seed < 0 or count < 1 or not 1 <= frames <= FRAMES:
+        raise ZooError(
+            f"{model.name}: the golden rollout of its card should have a seed, a count, up to {FRAMES} frames and"
+            f" {PROBES} positions in {model.scene.dim} dimensions."
+        )
     spacing = torch.tensor(model.emulator.grid.spacing, dtype=torch.float64)
-    return float(((found - torch.tensor(golden["position"], dtype=torch.float64)) / spacing).norm(dim=-1).max())
+    return float(((_positions(model.emulator, seed, count, frames) - stated) / spacing).norm(dim=-1).max())
 
 
 def _positions(emulator: Emulator, seed: int, count: int, frames: int) -> Tensor:

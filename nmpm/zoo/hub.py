@@ -7,22 +7,28 @@ repositories take the hub's own login (`hf auth login`, `HF_TOKEN`).
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import yaml
 
 from nmpm._support.atomic import atomic_folder
+from nmpm._support.bounded_files import read_bounded, read_yaml
+from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
-from nmpm.errors import ZooError
-from nmpm.zoo.cards import PICTURES
+from nmpm.errors import DataError, ZooError
+from nmpm.zoo.cards import PICTURES, readme
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.pretrained import SIMULATED
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
 
 FILES = (CARD, "config.yaml", "model.safetensors", "README.md", *PICTURES, "errors.csv")
 """Files of an entry that are uploaded and downloaded."""
@@ -53,7 +59,39 @@ class HubId:
 
 
 def download(identifier: HubId) -> Path:
-    """The folder of a model's entry in the hub's cache, downloaded now if it is not there.
+    """The folder of a model's entry in the hub's cache, downloaded now if it is not there, or damaged.
+
+    Raises:
+        ZooError: if there is no such model or revision, it cannot be reached, or its weights are not those of its card.
+    """
+    from huggingface_hub import constants
+
+    folder = _snapshot(identifier)
+    if not (folder / CARD).is_file():
+        raise ZooError(f"{identifier} is not a model of nmpm: it has no {CARD}.")
+    if _is_whole(folder):
+        return folder
+    if not constants.HF_HUB_OFFLINE:
+        folder = _snapshot(identifier, again=True)  # else the hub's client would keep what it has
+        if _is_whole(folder):
+            return folder
+    raise ZooError(
+        f"{identifier}: its weights are not those that {CARD} was written for (the SHA-256 differs), or one of the two"
+        f" cannot be read. If the copy on this machine is damaged, delete {folder.parents[1]} and load it again online."
+    )
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether the weights in a folder are those of its card."""
+    try:
+        weights = read_bounded(folder / "model.safetensors", WEIGHT_BYTES)
+        return bool(hashlib.sha256(weights).hexdigest() == read_yaml(folder / CARD).get("sha256"))
+    except DataError:
+        return False
+
+
+def _snapshot(identifier: HubId, again: bool = False) -> Path:
+    """The folder of a model's files in the hub's cache, fetched where they are not there, or `again`.
 
     Raises:
         ZooError: if there is no such model or revision, or it cannot be reached.
@@ -66,8 +104,10 @@ def download(identifier: HubId) -> Path:
     )
 
     try:
-        folder = Path(
-            snapshot_download(identifier.repository, revision=identifier.revision, allow_patterns=list(FILES))
+        return Path(
+            snapshot_download(
+                identifier.repository, revision=identifier.revision, allow_patterns=list(FILES), force_download=again
+            )
         )
     except RepositoryNotFoundError as error:
         raise ZooError(f"The hub has no model {identifier.repository}, or it is private: hf auth login.") from error
@@ -77,13 +117,15 @@ def download(identifier: HubId) -> Path:
         raise ZooError(f"{identifier} is not in the cache, and the hub cannot be reached.") from error
     except Exception as error:  # the client's transport raises errors of its own
         raise ZooError(f"{identifier} cannot be downloaded ({type(error).__name__}): {one_line(error)}") from error
-    if not (folder / CARD).is_file():
-        raise ZooError(f"{identifier} is not a model of nmpm: it has no {CARD}.")
-    return folder
 
 
-def pull(identifier: HubId, target: Path) -> Path:
+def pull(identifier: HubId, target: Path, name: str) -> Path:
     """Copy a model of the hub to a new entry, after its weights have been compared with its card.
+
+    Args:
+        identifier: Of the model.
+        target: Folder of the new entry.
+        name: Of the new entry; its card and README have it, and the card the commit as `source`.
 
     Raises:
         ZooError: as `download`; if the entry exists, or the model cannot be loaded.
@@ -92,12 +134,15 @@ def pull(identifier: HubId, target: Path) -> Path:
         raise ZooError(f"{target} exists: choose another name, or remove it first.")
     folder = download(identifier)
     load_entry(folder)
+    card = read_card(folder) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
     with atomic_folder(target) as new:
         if target.is_dir():  # variants lie within it
             shutil.copytree(target, new, dirs_exist_ok=True)
-        for name in FILES:
-            if (folder / name).is_file():
-                shutil.copyfile(folder / name, new / name)
+        for file in FILES:
+            if (folder / file).is_file():
+                shutil.copyfile(folder / file, new / file)
+        (new / CARD).write_text(_yaml(card), encoding="utf-8")
+        (new / "README.md").write_text(_page(card, new, name), encoding="utf-8")
     return target
 
 
@@ -107,13 +152,14 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
     Args:
         entry: Its folder.
         repository: "owner/repository"; created if missing.
-        private: Whether a new repository is private.
+        private: Whether the repository has to be private: a new one is made so.
 
     Returns:
         The id of the commit, under which the model can be loaded for good.
 
     Raises:
-        ZooError: if the entry is damaged, the name is malformed, or the hub refuses.
+        ZooError: if the entry is damaged, the name is malformed, the repository is public though a private one is asked
+            for, or the hub refuses.
     """
     from huggingface_hub import HfApi
 
@@ -124,17 +170,50 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
         for name in FILES:
             if (entry / name).is_file():
                 shutil.copyfile(entry / name, Path(folder) / name)
-        readme = Path(folder) / "README.md"
-        text = readme.read_text(encoding="utf-8") if readme.is_file() else ""
-        metadata = yaml.safe_dump(hub_metadata(read_card(entry)), sort_keys=False, allow_unicode=True)
-        readme.write_text(f"---\n{metadata}---\n\n{text}", encoding="utf-8")
+        card = read_card(entry)
+        page = _page(card, entry, f"{repository}@main")
+        (Path(folder) / "README.md").write_text(f"---\n{_yaml(hub_metadata(card))}---\n\n{page}", encoding="utf-8")
         api = HfApi()
         try:
+            if private and _is_public(api, repository):
+                raise ZooError(
+                    f"{repository} exists and is public: push to another repository, make it private in its settings,"
+                    " or leave --private out."
+                )
             api.create_repo(repository, private=private, exist_ok=True)
-            commit = api.upload_folder(repo_id=repository, folder_path=folder, commit_message=f"nmpm: {entry.name}")
+            commit = api.upload_folder(
+                repo_id=repository,
+                folder_path=folder,
+                commit_message=f"nmpm: {card.get('name', entry.name)}",
+                delete_patterns=list(FILES),  # of a former entry that had more of them
+            )
+        except ZooError:
+            raise
         except Exception as error:  # the client's transport raises errors of its own
             raise ZooError(f"{repository} cannot be uploaded ({type(error).__name__}): {one_line(error)}") from error
     return HubId(repository, str(commit.oid))
+
+
+def _is_public(api: HfApi, repository: str) -> bool:
+    """Whether a repository exists that anyone can see."""
+    from huggingface_hub.errors import RepositoryNotFoundError
+
+    try:
+        return not api.model_info(repository).private
+    except RepositoryNotFoundError:
+        return False
+
+
+def _page(card: Mapping[str, Any], entry: Path, load: str) -> str:
+    """The README of an entry, by which `Zoo.load(load)` loads it; empty for a card without what it shows."""
+    try:
+        return readme(card, [path.name for path in entry.iterdir()], load)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError):
+        return ""
+
+
+def _yaml(content: Mapping[str, Any]) -> str:
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)
 
 
 def hub_metadata(card: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import torch
 import yaml
 
 from nmpm._support.atomic import atomic_write
-from nmpm.errors import DataError, ZooError
+from nmpm._support.messages import one_line
+from nmpm.errors import ZooError
 from nmpm.zoo.cards import intervals, readme, twin_ratio
-from nmpm.zoo.charts import write_chart
+from nmpm.zoo.charts import CHART, draw_chart, save_chart
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.golden import golden_rollout
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
@@ -34,6 +35,8 @@ steps (mostly half as many): at 1, a model is as accurate as the data themselves
 scene. `docs/concepts.md` explains the terms.
 """
 COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "trivial", "trained", "ms per frame")
+MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
+"""What text and charts raise where a card or a table lacks something, or has other kinds of values."""
 
 
 def write_index(root: Path) -> Path:
@@ -43,7 +46,7 @@ def write_index(root: Path) -> Path:
         try:
             card = Zoo.card(name, root)
             row, scene = _row(name, card), scene_row(name, root / name, card)
-        except (ZooError, DataError):
+        except (ZooError, *MALFORMED):  # a DataError is a ValueError
             continue
         rows.append(row)
         scenes.append(scene)
@@ -83,28 +86,66 @@ def refresh(
     if unknown:
         raise ZooError(f"--measure {' '.join(unknown)}: what can be measured is {', '.join(MEASURES)}.")
     model = load_entry(folder)
-    card = {"format": CARD_FORMAT} | read_card(folder)
-    card |= {"lifecycle": lifecycle(card)}
-    card.setdefault("golden", golden_rollout(model.emulator))
+    weights = str(model.card["sha256"])
+    golden = {} if "golden" in model.card else {"golden": golden_rollout(model.emulator)}
+    card = read_card_of(folder, weights, "the golden rollout")
+    card = {"format": CARD_FORMAT} | card | {"lifecycle": lifecycle(card)} | golden
     if failures is not None:
         card.pop("failures", None)
         card |= {"failures": " ".join(failures.split())} if failures.strip() else {}
     write_card(folder, card)
     for name in measures:
         measured = model.to(device) if name == "speed" else model
-        facts, now = MEASURES[name](measured, folder, data), read_card(folder)
-        if now.get("sha256") != card.get("sha256"):
-            raise ZooError(f"{folder}: its weights were replaced while {name} was measured; measure it again.")
-        write_card(folder, now | facts)
+        add_facts(folder, weights, MEASURES[name](measured, folder, data))
+
+
+def add_facts(folder: Path, weights: str, facts: Mapping[str, Any]) -> None:
+    """Write facts about an entry's weights to its card, beside what others wrote to it meanwhile.
+
+    Args:
+        folder: Of the entry.
+        weights: SHA-256 of the weights that the facts are about.
+        facts: Keys of the card, with their values.
+
+    Raises:
+        ZooError: if the entry has other weights by now.
+    """
+    write_card(folder, {**read_card_of(folder, weights, ", ".join(facts)), **facts})
+
+
+def read_card_of(folder: Path, weights: str, measured: str) -> dict[str, Any]:
+    """The card of an entry, if it still has the weights of this SHA-256, of which something was measured.
+
+    Raises:
+        ZooError: if it has others.
+    """
+    card = read_card(folder)
+    if card.get("sha256") != weights:
+        raise ZooError(f"{folder}: its weights were replaced while {measured} was measured; measure it again.")
+    return card
 
 
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:
-    """Write an entry's card, and the chart and README that follow from it."""
+    """Write an entry's card, and the chart and README that follow from it.
+
+    Raises:
+        ZooError: if they cannot be made, as something is missing; nothing is written.
+    """
+    try:
+        chart = draw_chart(folder, card)
+        pictures = {path.name for path in folder.iterdir()} | ({CHART} if chart else set())
+        text = readme(card, pictures)
+    except MALFORMED as error:
+        raise ZooError(
+            f"{folder / CARD} or errors.csv beside it is not complete ({type(error).__name__}: {one_line(error)})."
+            " `nmpm zoo card NAME --yaml` shows what the card has; `nmpm zoo add` writes a new one from the run."
+        ) from error
     with atomic_write(folder / CARD) as part:
         part.write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
-    write_chart(folder)
+    if chart is not None:
+        save_chart(folder, chart)
     with atomic_write(folder / "README.md") as part:
-        part.write_text(readme(card, [path.name for path in folder.iterdir()]), encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
 
 
 def _row(name: str, card: Mapping[str, Any]) -> str:

@@ -30,6 +30,12 @@ SIMULATED = ", simulated by nmpm"
 """What follows a preset's name in the description of its dataset."""
 
 
+def preset_of(card: Mapping[str, Any]) -> str | None:
+    """Name of the simulator preset that made the data of a card; None for recorded or unknown data."""
+    name, simulated, _ = str(card.get("dataset", "")).partition(SIMULATED)
+    return name if simulated else None
+
+
 @dataclass(frozen=True)
 class Pretrained:
     """A trained model, ready to roll out or to fine-tune.
@@ -68,8 +74,7 @@ class Pretrained:
     @property
     def preset(self) -> str | None:
         """Name of the simulator preset that made the training data; None for recorded or unknown data."""
-        name, simulated, _ = str(self.card.get("dataset", "")).partition(SIMULATED)
-        return name if simulated else None
+        return preset_of(self.card)
 
     def state(
         self,

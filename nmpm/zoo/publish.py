@@ -50,7 +50,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
         ZooError: if the run is not finished, a report cannot be read, the name is taken, or the folder cannot be
             written or is part of the installed package.
     """
-    target = _target(check_name(name), root)
+    target = new_entry_folder(name, root)
     _publish(run, name, target, about)
     write_index(user_zoo() if root is None else Path(root))
     return target
@@ -64,12 +64,22 @@ def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
     return target
 
 
+def weights_of(checkpoint: Path) -> str:
+    """The SHA-256 of the weights that an entry of a checkpoint has."""
+    return hashlib.sha256(serialise(_rounded(checkpoint))).hexdigest()
+
+
+def _rounded(checkpoint: Path) -> Emulator:
+    """The emulator of a checkpoint as its entry stores it."""
+    return round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
+
+
 def _publish(run: Path, name: str, target: Path, about: str) -> None:
     checkpoint, report = run / BEST, run / "report.json"
     for needed in (checkpoint, report):
         if not needed.is_file():
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
-    emulator = round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
+    emulator = _rounded(checkpoint)
     weights = serialise(emulator)
     files = [path for path in (run / file for file in COPIED) if path.is_file()]
     try:
@@ -86,12 +96,14 @@ def _publish(run: Path, name: str, target: Path, about: str) -> None:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
 
 
-def _target(name: str, root: str | Path | None) -> Path:
-    """The folder of a new entry.
+def new_entry_folder(name: str, root: str | Path | None) -> Path:
+    """The folder of a new entry, of the user's own zoo where `root` is None.
 
     Raises:
-        ZooError: if the name is taken, or the folder is part of the installed package.
+        ZooError: if the name is malformed or taken, also by a shipped model, which the new one would hide; or if the
+            folder is part of the installed package.
     """
+    check_name(name)
     zoo = _writable_zoo(user_zoo() if root is None else Path(root))
     taken = [zoo / name, *([shipped_folder("zoo") / name] if root is None else [])]
     for folder in taken:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import builtins
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from nmpm._support.devices import device_name, find_device
 from nmpm._support.limits import NAME_LENGTH
 from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import shipped_folder, user_zoo
-from nmpm.errors import ZooError
+from nmpm.errors import ConfigError, ZooError
 from nmpm.zoo.choice import Limits, choose, stated_milliseconds
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.hub import HubId, download
@@ -112,13 +113,21 @@ class Zoo:
 
         Raises:
             ZooError: as `load_model`; or if no variant is within the limits, or their times are not known.
+            ConfigError: if a limit is not a positive number; if `hardware` or `calibrate` is given without a limit, or
+                `variant` or a limit for a path or an id.
         """
-        if variant is not None:
-            name = f"{name}/{variant}"
         limits = Limits(max_mse, max_ms_per_frame, hardware)
-        if limits:
-            return _load_within(str(name), limits, root, find_device(device), calibrate)
-        return load_model(name, device, root)
+        if not limits and (calibrate or hardware is not None):
+            raise ConfigError("calibrate and hardware are of use with a limit: give max_mse or max_ms_per_frame too.")
+        if variant is None and not limits:
+            return load_model(name, device, root)
+        _check_variants(name, root)
+        chosen = str(name) if variant is None else f"{name}/{variant}"
+        return (
+            _load_within(chosen, limits, root, find_device(device), calibrate)
+            if limits
+            else load_model(chosen, device, root)
+        )
 
 
 def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root = None) -> Pretrained:
@@ -138,30 +147,85 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
         ConfigError: if this machine does not have the device, or a newer nmpm wrote the model.
     """
     target = find_device(device)
+    return _load_path(find_model(model, root)).to(target)
+
+
+def find_model(model: str | Path, root: Root = None) -> Path:
+    """The folder or checkpoint that a name, a path or an id means, as for `load_model`; an id is downloaded.
+
+    Raises:
+        ZooError: if there is no such model.
+    """
     name, path = str(model), Path(model)
-    if root is not None:
-        found = load_entry(Zoo.folder(name, root))
-    elif isinstance(model, str) and _is_name(name) and any(_exists(zoo / name / CARD) for zoo in _roots(None)):
-        found = load_entry(Zoo.folder(name))
-    elif path.suffix == ".ckpt" or _exists(path):
-        found = _load_path(path)
-    elif (identifier := HubId.parse(name)) is not None:
-        found = load_entry(download(identifier))
-    else:
+    if root is not None or _is_in_zoo(model):
+        return Zoo.folder(name, root)
+    if path.suffix == ".ckpt" or _exists(path):
+        return path
+    identifier = HubId.parse(name)
+    if identifier is None:
         raise _unknown_model(name)
-    return found.to(target)
+    return download(identifier)
+
+
+def find_entry(model: str | Path, root: Root = None) -> Path:
+    """As `find_model`, for what needs a card: the folder of an entry.
+
+    Raises:
+        ZooError: if there is no such model, or it is a run or a checkpoint.
+    """
+    folder = find_model(model, root)
+    if not _exists(folder / CARD):
+        raise ZooError(
+            f"{one_line(folder)} has no {CARD}: `nmpm zoo add RUN NAME` makes an entry of a run, with a card."
+        )
+    return folder
 
 
 def _load_within(name: str, limits: Limits, root: Root, device: torch.device, calibrate: bool) -> Pretrained:
-    cards = {variant: Zoo.card(variant, root) for variant in Zoo.variants(name, root)}
+    cards = _readable_cards(Zoo.variants(name, root), root)
     machine = limits.hardware or device_name(device)
 
     def milliseconds(variant: str) -> float | None:
-        if calibrate:
+        if not calibrate:
+            return stated_milliseconds(cards[variant], machine)
+        try:
             return float(measure_speed(load_model(variant, device, root))["ms_per_frame"])
-        return stated_milliseconds(cards[variant], machine)
+        except ZooError:  # damaged: the others can still be chosen
+            return None
 
     return load_model(choose(cards, limits, milliseconds), device, root)
+
+
+def _readable_cards(names: Sequence[str], root: Root) -> dict[str, dict[str, Any]]:
+    """The cards of models by name, without damaged ones.
+
+    Raises:
+        ZooError: if all are damaged.
+    """
+    cards, damaged = {}, []
+    for name in names:
+        try:
+            cards[name] = Zoo.card(name, root)
+        except ZooError as error:
+            damaged.append(error)
+    if damaged and not cards:
+        raise damaged[0]
+    return cards
+
+
+def _check_variants(model: str | Path, root: Root) -> None:
+    """Make sure that a model is given by a name, of which there may be variants.
+
+    Raises:
+        ConfigError: if it is a path or an id.
+    """
+    if root is not None or (isinstance(model, str) and any(f"{name}/".startswith(f"{model}/") for name in Zoo.list())):
+        return
+    if _exists(Path(model)) or HubId.parse(str(model)) is not None:
+        raise ConfigError(
+            f"{one_line(model)} is one model: variant, max_mse and max_ms_per_frame choose among those of a name in the"
+            " zoo. Leave them out; or, for a folder of several models, give root=FOLDER and a name within it."
+        )
 
 
 def check_name(name: str) -> str:
@@ -190,10 +254,20 @@ def _load_path(path: Path) -> Pretrained:
 
 def _unknown_model(name: str, root: Root = None) -> ZooError:
     known = Zoo.list(root)
-    near = suggestion(name[:NAME_LENGTH], sorted({*known, *(other.partition("/")[0] for other in known)}))
-    path = " No such path exists either." if root is None else ""
+    datasets = {other.partition("/")[0] for other in known}
+    dataset = name.partition("/")[0]
+    if dataset in datasets and dataset != name:
+        near = f" Of {dataset} it has {', '.join(other for other in known if other.partition('/')[0] == dataset)}."
+    else:
+        near = suggestion(name[:NAME_LENGTH], sorted({*known, *datasets}))
+    path = " No such path exists either." if root is None and not _exists(Path(name)) else ""
     shown = one_line(repr(name), NAME_LENGTH)
     return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(known) or 'none'}.{near}{path}")
+
+
+def _is_in_zoo(model: str | Path) -> bool:
+    """Whether it is the name of a model of the user's or the shipped zoo; `Path("goop")` is always a path."""
+    return isinstance(model, str) and _is_name(model) and any(_exists(zoo / model / CARD) for zoo in _roots(None))
 
 
 def _is_name(name: str) -> bool:

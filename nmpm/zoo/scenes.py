@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from nmpm._support.messages import one_line
 from nmpm.data.format import Split, Trajectory, read_metadata, split_paths
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
@@ -14,7 +15,7 @@ from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader, SplitRecordings
 from nmpm.data.progress import progress_bar
 from nmpm.data.simulation_request import SimulationRequest
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
 from nmpm.zoo.pretrained import Pretrained
@@ -53,18 +54,31 @@ def track_test_scenes(what: str, model: Pretrained, data: Path | None) -> Iterat
 
 
 def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
-    """The simulator of a model's data, and what was simulated; cards of version 0.1 state the preset's name only."""
+    """The simulator of a model's data, and what was simulated; cards of version 0.1 state the preset's name only.
+
+    Raises:
+        ConfigError: if another revision of the simulator made the data, or none did.
+        ZooError: if the card's `simulation` is malformed.
+    """
     stated: Any = model.card.get("simulation")
-    if isinstance(stated, Mapping):
-        preset = preset_from_dict(dict(stated["preset"]))
+    if stated is not None:
+        preset, request = _stated_simulation(model, stated)
         if stated.get("revision") != preset.revision:
             raise ConfigError(
                 f"{model.name}: its data are of revision {stated.get('revision')} of the simulator, which is now"
                 f" {preset.revision} and gives other trajectories."
             )
-        return preset, SimulationRequest(preset, stated["counts"], stated["seed"], stated.get("redrawn", {}))
+        return preset, request
     if model.preset not in preset_names():
         raise ConfigError(f"{model.name} was tested on recorded data ({model.card.get('dataset')}): give their folder.")
     preset = load_preset(str(model.preset))
     count = len(model.card["per_trajectory"])
     return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": count})
+
+
+def _stated_simulation(model: Pretrained, stated: Any) -> tuple[Preset, SimulationRequest]:
+    try:
+        preset = preset_from_dict(stated["preset"])
+        return preset, SimulationRequest(preset, stated["counts"], stated["seed"], stated.get("redrawn", {}))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ZooError(f"{model.name}: simulation of its card cannot be read: {one_line(repr(error))}.") from error

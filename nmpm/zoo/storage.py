@@ -12,9 +12,9 @@ from torch import Tensor
 
 from nmpm._support.atomic import atomic_folder
 from nmpm.emulator import Emulator
-from nmpm.zoo.entries import load_entry, read_card
+from nmpm.zoo.entries import load_entry
 from nmpm.zoo.golden import golden_distance, golden_rollout
-from nmpm.zoo.index import write_card
+from nmpm.zoo.index import read_card_of, write_card
 from nmpm.zoo.pretrained import Pretrained
 
 WEIGHTS = "model.safetensors"
@@ -65,7 +65,8 @@ def halve(folder: Path) -> bool:
     Raises:
         ZooError: if it is damaged.
     """
-    emulator = load_entry(folder).emulator
+    model = load_entry(folder)
+    emulator = model.emulator
     half = round_network(emulator)
     weights = serialise(half)
     if half is emulator or weights == (folder / WEIGHTS).read_bytes():
@@ -78,7 +79,7 @@ def halve(folder: Path) -> bool:
             "golden": golden_rollout(half),
             "sha256": sha256(weights).hexdigest(),
         }
-        write_card(new, read_card(new) | facts)
+        write_card(new, read_card_of(new, str(model.card["sha256"]), "its rounding") | facts)
     return True
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
 from nmpm.particles import Window
@@ -18,7 +18,11 @@ from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import iterate_test_scenes
 
+Rows = Sequence[Mapping[str, float]]
+"""Figures by their names, of each test scene."""
 SHORT_SCENES, SHORT_FRAMES = 2, 100
+ROUNDING = 1e-5
+"""Relative difference of a mean from the stated one that is tolerated: cards state means in float32."""
 RELATIVE = 0.1
 """Relative difference of a scene's MSE at 100 frames and before that is tolerated, as rounding differs."""
 
@@ -65,23 +69,59 @@ def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> I
     Raises:
         ConfigError: if the test scenes cannot be had: recorded data without `data`, or a card that states no errors.
         DataError: if the data cannot be read.
+        ZooError: if the card is malformed, or states nothing of the test scenes that can be measured.
     """
     golden = model.card.get("golden")
-    if isinstance(golden, Mapping):
-        distance = golden_distance(model, golden)
-        yield Check("golden rollout, largest distance in cells", 0.0, distance, 0.0, TOLERANCE)
-    rows = model.card.get("per_trajectory")
-    if not isinstance(rows, Sequence) or not rows:
-        raise ConfigError(f"{model.name}: its card states no errors of single test scenes.")
+    if golden is not None:
+        yield Check("golden rollout, largest distance in cells", 0.0, golden_distance(model, golden), 0.0, TOLERANCE)
+    rows = _stated_rows(model)
+    yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
     errors = [_errors(model, window) for window in islice(iterate_test_scenes(model, frames, data), count)]
-    if full:
-        yield from _means(rows, errors)
-    else:
-        yield from _scenes(rows, errors)
+    checks = list(_means(rows, errors) if full else _scenes(rows, errors))
+    if not checks:
+        more = "" if full else "; --full measures the whole scenes"
+        raise ZooError(f"{model.name}: its card states no error of a test scene that was measured{more}.")
+    yield from checks
 
 
-def _scenes(rows: Sequence[Mapping[str, float]], errors: Sequence[Mapping[str, float]]) -> Iterator[Check]:
+def _stated_rows(model: Pretrained) -> Rows:
+    """The errors of single test scenes that a model's card states.
+
+    Raises:
+        ConfigError: if it states none.
+        ZooError: if they are not figures by their names.
+    """
+    rows = model.card.get("per_trajectory")
+    if not rows:
+        raise ConfigError(f"{model.name}: its card states no errors of single test scenes.")
+    if not isinstance(rows, list) or not all(row and _is_figures(row) for row in rows):
+        raise ZooError(f"{model.name}: per_trajectory of its card should list the figures of each test scene by name.")
+    return rows
+
+
+def _headline(model: Pretrained, rows: Rows) -> Iterator[Check]:
+    """The figures that cards, tables and choices show beside the means of those of single test scenes.
+
+    Raises:
+        ZooError: if the card states none.
+    """
+    test = model.card.get("test")
+    own = {name: value for name, value in test.items() if "/" not in name} if isinstance(test, Mapping) else {}
+    if "mse" not in own or not _is_figures(own):
+        raise ZooError(f"{model.name}: test of its card should state figures by name, such as mse.")
+    for name, stated in own.items():
+        found = [row[name] for row in rows if name in row]
+        mean = float(np.mean(found)) if found else math.nan
+        bounds = sorted((1 + sign * ROUNDING) * stated for sign in (-1, 1))
+        yield Check(f"test {name}, as the mean over the card's {len(rows)} test scenes", stated, mean, *bounds)
+
+
+def _is_figures(values: object) -> bool:
+    return isinstance(values, Mapping) and all(isinstance(value, int | float) for value in values.values())
+
+
+def _scenes(rows: Rows, errors: Rows) -> Iterator[Check]:
     for index, (row, found) in enumerate(zip(rows, errors, strict=False)):
         for name in (name for name in row if "@" in name and name != "mse@1" and name in found):
             stated = row[name]
@@ -89,7 +129,7 @@ def _scenes(rows: Sequence[Mapping[str, float]], errors: Sequence[Mapping[str, f
             yield Check(f"test scene {index}, {name}", stated, found[name], *bounds)
 
 
-def _means(rows: Sequence[Mapping[str, float]], errors: Sequence[Mapping[str, float]]) -> Iterator[Check]:
+def _means(rows: Rows, errors: Rows) -> Iterator[Check]:
     for name in (name for name in rows[0] if name != "mse@1"):
         stated = [row[name] for row in rows if name in row]
         found = [row[name] for row in errors if name in row]

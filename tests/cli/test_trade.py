@@ -1,7 +1,11 @@
+from types import SimpleNamespace
+
 import pytest
 
 from nmpm.cli import main
+from nmpm.cli.trade import _models
 from nmpm.evaluation.trade import default_sweep_text
+from nmpm.zoo import load_model
 from tests.evaluation.trade.made_up import SWEEP, tiny_scenes
 
 
@@ -31,6 +35,23 @@ def test_help_teaches(capsys):
 def test_mistakes_are_named(words, message, capsys):
     assert main(words) == 1
     assert message in capsys.readouterr().err
+
+
+def test_models_are_those_of_the_dataset_and_damaged_ones_are_left_out(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path))
+    for name in ("bad", "other", "broken"):
+        (tmp_path / "zoo" / name).mkdir(parents=True)
+    (tmp_path / "zoo" / "bad" / "card.yaml").write_text("dataset: goop, simulated by nmpm")
+    (tmp_path / "zoo" / "other" / "card.yaml").write_text("dataset: recorded")
+    (tmp_path / "zoo" / "broken" / "card.yaml").write_text("{")
+    loaded = []
+    monkeypatch.setattr("nmpm.zoo.load_model", lambda name: loaded.append(name) or load_model(name))
+    assert sorted(_models(None, SimpleNamespace(name="goop"))) == ["goop", "goop/fast"]
+    assert sorted(loaded) == ["bad", "goop", "goop/fast"]
+    left_out = capsys.readouterr().err.splitlines()
+    assert [line.partition(": ")[0] for line in left_out] == ["left out", "left out"]
+    assert "bad/model.safetensors" in left_out[0]
+    assert "broken/card.yaml" in left_out[1]
 
 
 def test_a_folder_is_measured_and_the_report_written(tmp_path, capsys):

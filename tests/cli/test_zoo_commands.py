@@ -63,13 +63,29 @@ def test_a_damaged_card_does_not_hide_the_others(home, capsys):
     assert "goop, simulated by nmpm" in said
 
 
+def test_all_are_verified_though_one_is_damaged(tmp_path, capsys):
+    copy("goop", tmp_path / "other" / "a")
+    (tmp_path / "other" / "a" / "model.safetensors").write_bytes(b"")
+    copy("goop", tmp_path / "other" / "b")
+    (tmp_path / "other" / "b" / "card.yaml").write_text("{")
+    copy("goop", tmp_path / "other" / "goop")
+    assert main(["zoo", "verify", "--root", "other"]) == 1
+    said = capsys.readouterr().out
+    assert said.count("FAIL  other/") == 2
+    assert "pass  test scene 0" in said
+    assert "2 figures are not confirmed" in said
+    assert main(["zoo", "verify", "a", "--root", "other"]) == 1
+    assert "SHA-256 differs" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["card", "gop"], "Did you mean goop?"),
-        (["card", "../goop"], "cannot name a model"),
+        (["card", "../goop"], "holds no model '../goop'"),
         (["list", "--root", "nowhere"], "There is no zoo in nowhere"),
         (["add", "nowhere", "mine"], "not a finished run"),
+        (["verify", "--data", "."], "--data is the folder of one model's data: give the model's NAME too"),
     ],
 )
 def test_wrong_calls_get_one_line(words, message, capsys):

@@ -37,17 +37,18 @@ def test_a_former_folder_stays_if_its_successor_fails(tmp_path):
     assert files_of(tmp_path) == {"one/inner/file": "first"}
 
 
-def test_a_former_folder_comes_back_if_the_new_one_cannot_be_renamed(tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_a_former_folder_comes_back_if_the_new_one_cannot_be_renamed(tmp_path, monkeypatch, error):
     write(tmp_path / "one", "first")
     rename = os.replace
 
     def refuse(source, target):
         if str(source).endswith("new"):
-            raise OSError("no space left on device")
+            raise error("no space left on device")
         rename(source, target)
 
     monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(error, match="no space"):
         write(tmp_path / "one", "second")
     assert files_of(tmp_path) == {"one/inner/file": "first"}
 

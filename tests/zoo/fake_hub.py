@@ -5,7 +5,7 @@ import contextlib
 import hashlib
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
@@ -36,9 +36,10 @@ class FakeHub(ThreadingHTTPServer):
             return commits[-1]
         return next((commit for commit in commits if commit[0] == revision), None)
 
-    def commit(self, repository: str, changed: dict[str, bytes]) -> str:
+    def commit(self, repository: str, changed: dict[str, bytes], deleted: Iterable[str] = ()) -> str:
         commits = self.commits[repository]
         files = (commits[-1][1] if commits else {}) | changed
+        files = {path: content for path, content in files.items() if path not in deleted}
         oid = hashlib.sha1(f"{len(commits)}{sorted(files)}".encode(), usedforsecurity=False).hexdigest()
         commits.append((oid, files))
         return oid
@@ -66,6 +67,7 @@ class Handler(BaseHTTPRequestHandler):
             if name in self.server.commits:
                 return self._answer({"error": "exists", "url": f"{self.server.url}/{name}"}, 409)
             self.server.commits[name] = []
+            self.server.commit(name, {".gitattributes": b""})  # as the hub does
             if asked.get("private") or asked.get("visibility") == "private":
                 self.server.private.add(name)
             return self._answer({"url": f"{self.server.url}/{name}"})
@@ -81,7 +83,8 @@ class Handler(BaseHTTPRequestHandler):
         changed = {
             line["value"]["path"]: base64.b64decode(line["value"]["content"]) for line in lines if line["key"] == "file"
         }
-        oid = self.server.commit(repository, changed)
+        deleted = [line["value"]["path"] for line in lines if line["key"] == "deletedFile"]
+        oid = self.server.commit(repository, changed, deleted)
         url = f"{self.server.url}/{repository}/commit/{oid}"
         return self._answer({"success": True, "commitOid": oid, "commitUrl": url})
 
@@ -95,19 +98,21 @@ class Handler(BaseHTTPRequestHandler):
             repository in self.server.private and not self.headers.get("Authorization")
         ):
             return self._answer({"error": "Repository not found"}, 404, {"X-Error-Code": "RepoNotFound"})
-        found = self.server.files(repository, parts[5] if listing else parts[3])
+        revision = (parts[5] if len(parts) > 4 else "main") if listing else parts[3]
+        found = self.server.files(repository, revision)
         if found is None:
             return self._answer({"error": "Invalid rev id"}, 404, {"X-Error-Code": "RevisionNotFound"})
         oid, files = found
-        if listing and parts[4] == "tree":
+        if listing and parts[4:5] == ["tree"]:
             entries = [
                 {"type": "file", "path": name, "size": len(content), "oid": hashlib.sha256(content).hexdigest()}
                 for name, content in files.items()
             ]
             return self._answer(entries)
         if listing:
+            private = repository in self.server.private
             siblings = [{"rfilename": name} for name in files]
-            return self._answer({"id": repository, "sha": oid, "siblings": siblings, "tags": []})
+            return self._answer({"id": repository, "sha": oid, "siblings": siblings, "tags": [], "private": private})
         name = "/".join(parts[4:])
         if name not in files:
             return self._answer({"error": "no such file"}, 404, {"X-Error-Code": "EntryNotFound"})

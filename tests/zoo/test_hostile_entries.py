@@ -62,6 +62,8 @@ POINTWISE = {"class_path": "nmpm.processors.Pointwise", "init_args": {"hidden": 
         ({"processor__init_args__kernel": 10**7 + 1}, "config.yaml does not describe a model"),
         ({"processor__class_path": "a" * 100_000}, "is not known"),
         ({"processor__init_args": ["width"]}, "must be a mapping"),
+        ({"processor__width": 8, "decoder__x": 1}, "has the unknown keys width beside class_path and init_args"),
+        ({"decoder__" + "x" * 100_000: 1}, "has the unknown keys xxx"),
         ({"processor": "x" * 100_000}, "Expected a Processor"),
         ({"scene__dt": float("inf")}, "dt: inf is not finite"),
         ({"scene__materials": [f"m{i}" for i in range(30_000)]}, "more than 5,000 modules"),

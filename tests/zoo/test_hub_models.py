@@ -33,7 +33,7 @@ def hub(tmp_path, monkeypatch):
 def test_a_pushed_model_is_loaded_by_its_id_rolled_out_and_pulled(hub, root, tmp_path, capsys):
     assert main(["zoo", "push", "small", "lab/small", "--root", str(root)]) == 0
     identifier = capsys.readouterr().out.split()[1].rstrip(";")
-    assert identifier == f"lab/small@{hub.commits['lab/small'][0][0]}"
+    assert identifier == f"lab/small@{hub.commits['lab/small'][-1][0]}"
     state = Zoo.load("small", root).example(count=50)
     expected = Zoo.load("small", root).rollout(state, 8)
     assert torch.equal(Zoo.load(identifier).rollout(state, 8), expected)
@@ -89,7 +89,7 @@ def test_weights_that_are_not_those_of_the_card_are_refused(hub, root):
     with pytest.raises(ZooError, match="SHA-256"):
         load_model(f"lab/small@{oid}")
     with pytest.raises(ZooError, match="SHA-256"):
-        pull(HubId("lab/small", oid), root / "pulled")
+        pull(HubId("lab/small", oid), root / "pulled", "pulled")
     assert not (root / "pulled").exists()
 
 
@@ -132,5 +132,120 @@ def test_the_hub_is_told_library_licence_and_results(hub, root):
     assert result["dataset"]["name"] == "goop"
     assert result["metrics"] == [{"type": "mse", "name": "rollout mse", "value": 0.1}]
     push(root / "small", "lab/small")
-    readme = hub.commits["lab/small"][0][1]["README.md"].decode()
+    readme = hub.commits["lab/small"][-1][1]["README.md"].decode()
     assert yaml.safe_load(readme.split("---")[1])["library_name"] == "nmpm"
+
+
+@pytest.fixture
+def offline(monkeypatch):
+    """Turns the hub's client offline."""
+
+    def switch():
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+        _http.close_session()
+
+    yield switch
+    monkeypatch.undo()
+    _http.close_session()
+
+
+def damage(cache, file):
+    """Change a byte of a file in the hub's cache."""
+    for path in cache.rglob(file):
+        content = bytearray(path.resolve().read_bytes())
+        content[-1] ^= 1
+        path.resolve().write_bytes(content)
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "card.yaml"])
+def test_a_damaged_file_of_the_cache_is_fetched_again(hub, root, tmp_path, file):
+    identifier = push(root / "small", "lab/small")
+    load_model(str(identifier))
+    damage(tmp_path / "hub-cache", file)
+    assert load_model(str(identifier)).name == "small"
+    asked = len([line for line in hub.requests if line.startswith("GET") and "resolve" in line])
+    load_model(str(identifier))
+    assert asked == len([line for line in hub.requests if line.startswith("GET") and "resolve" in line])
+
+
+def test_offline_a_damaged_file_of_the_cache_is_named_with_what_to_delete(hub, root, tmp_path, offline):
+    identifier = push(root / "small", "lab/small")
+    load_model(str(identifier))
+    damage(tmp_path / "hub-cache", "model.safetensors")
+    offline()
+    with pytest.raises(ZooError, match=r"SHA-256 differs.*delete .*hub-cache/models--lab--small and load it again"):
+        load_model(str(identifier))
+
+
+@pytest.fixture
+def goop(tmp_path):
+    """A copy of a complete entry, without its variants."""
+    (tmp_path / "copy" / "goop").mkdir(parents=True)
+    for path in (shipped_folder("zoo") / "goop").glob("*.*"):
+        (tmp_path / "copy" / "goop" / path.name).write_bytes(path.read_bytes())
+    return tmp_path / "copy" / "goop"
+
+
+def test_a_pulled_model_has_its_own_name_and_source_and_can_be_pushed_on(hub, goop, home):
+    identifier = push(goop, "lab/goop")
+    pushed = hub.commits["lab/goop"][-1][1]["README.md"].decode()
+    assert 'Zoo.load("lab/goop@main")' in pushed
+    assert main(["zoo", "pull", "lab/goop@main", "goop/theirs"]) == 0
+    assert Zoo.load("goop/theirs").name == "goop/theirs"
+    assert Zoo.card("goop/theirs")["source"] == str(identifier)
+    page = (home / "zoo" / "goop" / "theirs" / "README.md").read_text()
+    assert page.startswith("# goop/theirs\n")
+    assert 'Zoo.load("goop/theirs")' in page
+    assert "(chart.png)" in page
+    push(home / "zoo" / "goop" / "theirs", "lab/again")
+    again = hub.commits["lab/again"][-1][1]["README.md"].decode()
+    assert len([line for line in again.splitlines() if line == "---"]) == 2
+    assert 'Zoo.load("lab/again@main")' in again
+
+
+def test_a_pulled_model_does_not_hide_a_shipped_one(hub, root, capsys):
+    push(root / "small", "lab/small")
+    assert main(["zoo", "pull", "lab/small@main", "goop"]) == 1
+    assert "goop exists: choose another name" in capsys.readouterr().err
+    assert Zoo.load("goop").card["dataset"].startswith("goop")
+
+
+def test_files_that_an_entry_no_longer_has_are_deleted_on_the_hub(hub, goop):
+    push(goop, "lab/goop")
+    (goop / "worst.png").unlink()
+    push(goop, "lab/goop")
+    assert set(hub.commits["lab/goop"][-1][1]) == {".gitattributes", *FILES} - {"worst.png"}
+    hub.commit("lab/goop", {"notes.txt": b"mine"})
+    push(goop, "lab/goop")
+    assert "notes.txt" in hub.commits["lab/goop"][-1][1]
+
+
+def test_a_private_model_is_not_pushed_to_a_public_repository(hub, root, capsys):
+    push(root / "small", "lab/small")
+    commits = len(hub.commits["lab/small"])
+    assert main(["zoo", "push", "small", "lab/small", "--private", "--root", str(root)]) == 1
+    assert "lab/small exists and is public" in capsys.readouterr().err
+    assert len(hub.commits["lab/small"]) == commits
+    for _ in range(2):
+        push(root / "small", "lab/hidden", private=True)
+    assert "lab/hidden" in hub.private
+
+
+def test_commands_of_the_zoo_take_folders_and_ids(hub, goop, capsys):
+    identifier = push(goop, "lab/goop")
+    for model in (str(goop), str(identifier)):
+        assert main(["zoo", "card", model]) == 0
+        assert capsys.readouterr().out.startswith("# goop\n")
+        assert main(["zoo", "verify", model]) == 0
+        assert "All that was measured is confirmed" in capsys.readouterr().out
+        assert main(["zoo", "push", model, "lab/other"]) == 0
+        capsys.readouterr()
+    assert main(["zoo", "refresh", str(goop), "--failures", "Late splashes become dust."]) == 0
+    assert capsys.readouterr().out == f"wrote {goop}\n"
+    assert not (goop.parent / "README.md").exists()
+    assert Zoo.card("goop", goop.parent)["failures"] == "Late splashes become dust."
+    assert main(["zoo", "refresh", str(identifier)]) == 1
+    assert f"`nmpm zoo pull {identifier} NAME` makes an entry of it" in capsys.readouterr().err
+    for command in (["card"], ["push"], ["refresh"]):
+        assert main(["zoo", *command, str(goop.parent), *(["lab/x"] if command == ["push"] else [])]) == 1
+        assert "`nmpm zoo add RUN NAME` makes an entry of a run" in capsys.readouterr().err

@@ -200,6 +200,6 @@ def test_known_failures_are_on_the_card_until_they_are_taken_back(goop, capsys):
 
 def test_a_refresh_with_failures_writes_the_entry_once(goop, monkeypatch):
     written = []
-    monkeypatch.setattr("nmpm.zoo.index.write_chart", written.append)
+    monkeypatch.setattr("nmpm.zoo.index.save_chart", lambda folder, _figure: written.append(folder))
     refresh(goop, failures="Splashes become dust.")
     assert written == [goop]

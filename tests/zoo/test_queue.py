@@ -205,10 +205,48 @@ def test_mistakes_in_a_queue_are_named(queue, tmp_path):
         ({"dataset": []}, "dataset: unknown key"),
         ({"datasets": [{"name": "small"}]}, "config"),
         ({"datasets": [content["datasets"][0] | {"hours": 0}]}, "hours = 0 must be positive"),
+        ({"datasets": [content["datasets"][0] | {"start": "lava"}]}, "small: start = lava is no other dataset"),
+        ({"datasets": [content["datasets"][0] | {"start": "small"}]}, "small: start = small is no other dataset"),
     ):
         path.write_text(json.dumps(content | change))
         with pytest.raises(ConfigError, match=complaint):
             Plan.read(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--data", "small"], "--data small: write NAME=FOLDER"),
+        (["--data", "small="], "--data small=: write NAME=FOLDER"),
+        (["--hours", "0"], "--hours 0.0 must be a positive number"),
+        (["--hours", "nan"], "--hours nan must be a positive number"),
+        (["--hours", "inf"], "--hours inf must be a positive number"),
+        (["--device", "abacus"], "--device abacus"),
+        (["--device", "cuda:99"], "This machine has no device 'cuda:99'"),
+    ],
+    ids=str,
+)
+def test_mistakes_in_options_are_named_before_anything_is_done(queue, capsys, options, message):
+    assert train(queue(1.0), *options) == 1
+    assert f"error: {message}" in capsys.readouterr().out
+    assert not Path("runs").exists()
+
+
+def test_what_left_out_datasets_wait_for_is_said(queue, tmp_path, capsys):
+    path = queue(1.0)
+    entries = [
+        {"name": "recorded", "config": "waterdrop.yaml", "hours": 1},
+        {"name": "later", "config": "goop.yaml", "hours": 1, "start": "recorded"},
+        {"name": "done", "config": "goop.yaml", "hours": 0.5},
+    ]
+    path.write_text(yaml.safe_dump({"extension": {"hours": 0.5, "limit": 0.5}, "datasets": entries}))
+    finished(Path("runs/done"), 0.5)
+    assert train(path) == 0
+    said = capsys.readouterr().out
+    assert "nothing is left to take" in said
+    assert "recorded waits for --data recorded=FOLDER." in said
+    assert "later waits for the training of recorded." in said
+    assert "done waits" not in said
 
 
 def test_trainings_and_an_extension_become_an_entry_with_their_curve(queue, capsys):
@@ -232,7 +270,7 @@ def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
     path = queue(1 / 3600)
     assert train(path) == 0
     folder = Path("zoo/small")
-    card = yaml.safe_load((folder / "card.yaml").read_text())
+    card = yaml.safe_load((folder / "card.yaml").read_text()) | {"sha256": "of other weights"}
     about = card["about"]
     changed = (
         card | {"about": "a better one", "curve": [[1.0, 1, 0.0]]},
@@ -251,11 +289,48 @@ def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
     assert Zoo.card("small", "zoo")["about"] == about
 
 
+def test_an_entry_that_has_the_best_weights_keeps_what_was_measured_of_them(queue, capsys):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    card_path, picture = Path("zoo/small/card.yaml"), Path("zoo/small/worst.png")
+    card = yaml.safe_load(card_path.read_text())
+    facts = {"failures": "Late splashes become dust.", "superseded_by": "other"}
+    facts |= {"speed": [card["speed"][0] | {"hardware": "a GPU"}, *card["speed"]]}
+    picture.write_bytes(b"looked at")
+    card_path.write_text(yaml.safe_dump(card | facts | {"curve": []}))
+    content = yaml.safe_load(path.read_text())
+    content["datasets"][0]["goal"] = 0.25
+    path.write_text(yaml.safe_dump(content))
+    capsys.readouterr()
+    for _ in range(2):
+        assert train(path, "--collect") == 0
+        assert "small: its best weights are already in zoo/small." in capsys.readouterr().out
+        assert yaml.safe_load(card_path.read_text()) == card | facts | {"goal": 0.25}
+        assert picture.read_bytes() == b"looked at"
+        written = card_path.stat().st_mtime_ns
+    assert train(path, "--collect") == 0
+    assert card_path.stat().st_mtime_ns == written  # there is nothing to change
+
+
+def test_an_entry_that_is_replaced_while_the_simulator_is_measured_keeps_its_card(queue, monkeypatch, capsys):
+    from nmpm.zoo.queue import collection
+
+    def replace_meanwhile(entry, *_):
+        card = yaml.safe_load((entry / "card.yaml").read_text())
+        (entry / "card.yaml").write_text(yaml.safe_dump(card | {"sha256": "of others"}))
+        return {"twin": {"mse": 0.1}}
+
+    monkeypatch.setattr(collection, "_references", replace_meanwhile)
+    assert train(queue(1 / 3600)) == 1
+    assert "its weights were replaced" in capsys.readouterr().out
+    assert "twin" not in Zoo.card("small", "zoo")
+
+
 def test_few_validations_do_not_replace_an_entry_of_many(queue, capsys):
     path = queue(1 / 3600)
     assert train(path) == 0
     folder = Path("zoo/small")
-    card = yaml.safe_load((folder / "card.yaml").read_text())
+    card = yaml.safe_load((folder / "card.yaml").read_text()) | {"sha256": "of other weights"}
     assert len(card["curve"]) < 3
     bad = [[float(at), at, 1e9] for at in range(1, 4)]
     (folder / "card.yaml").write_text(yaml.safe_dump(card | {"curve": bad}))

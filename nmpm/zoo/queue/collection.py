@@ -17,9 +17,9 @@ from nmpm.data.folder_lock import lock_folder
 from nmpm.data.simulation_request import SimulationRequest, same_trajectories
 from nmpm.errors import ZooError
 from nmpm.zoo.entries import CARD, load_entry, read_card
-from nmpm.zoo.index import refresh, write_card, write_index
+from nmpm.zoo.index import add_facts, refresh, write_index
 from nmpm.zoo.measures.simulator import measure_twin
-from nmpm.zoo.publish import replace
+from nmpm.zoo.publish import replace, weights_of
 from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.training import Training
@@ -36,6 +36,7 @@ Command = Callable[[list[str]], int]
 def collect(history: History, zoo: Path, run: Command) -> str:
     """Test a dataset's best weights and make its entry of them, also while its training goes on.
 
+    An entry that has these weights already keeps all that its card states; only goal and curve are written to it.
     An entry whose validation error is lower is kept, so that the test split chooses nothing; so is one that has more
     validations than a training whose few may be low by chance. Only for an entry whose card has no validation errors,
     from before the queue, those of the test are compared.
@@ -56,6 +57,11 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         best = history.best()
         if best is None:
             return f"{name}: nothing is validated yet."
+        former = _card(zoo / name)
+        if former and former.get("sha256") == weights_of(best.best):
+            _update(zoo / name, former, history)
+            write_index(zoo)
+            return f"{name}: its best weights are already in {zoo / name}."
         report = _merged(_tested(best, folder, run), history)
         for file in (MERGED, "report.json"):
             with atomic_write(folder / file) as part:
@@ -63,14 +69,28 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         error = report["test"]["mse"]
         if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
-        former = read_card(zoo / name) if (zoo / name / CARD).is_file() else {}
+        former = _card(zoo / name)  # again, as the test takes minutes
         dataset = history.dataset_of(history.trainings.index(best) + 1)
         replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
         refresh(zoo / name, ["speed"])
         card = read_card(zoo / name)
-        write_card(zoo / name, card | _references(zoo / name, history, dataset, simulator_facts(former, card)))
+        known = simulator_facts(former, card)
+        add_facts(zoo / name, str(card["sha256"]), _references(zoo / name, history, dataset, known))
         write_index(zoo)
         return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
+
+
+def _card(entry: Path) -> dict[str, Any]:
+    """The card of an entry; empty where there is none."""
+    return read_card(entry) if (entry / CARD).is_file() else {}
+
+
+def _update(entry: Path, card: Mapping[str, Any], history: History) -> None:
+    """Write the goal and the curve so far to the card of an entry with the best weights, where it states others."""
+    goal = history.dataset.goal
+    facts = {"curve": history.curve(), **({} if goal is None else {"goal": goal})}
+    if any(card.get(key) != value for key, value in facts.items()):
+        add_facts(entry, str(card["sha256"]), facts)
 
 
 def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from nmpm._support.bounded_files import read_yaml
+from nmpm._support.messages import suggestion
 from nmpm._support.shipped import find_config
 from nmpm.errors import ConfigError
 from nmpm.zoo.registry import check_name
@@ -124,7 +125,8 @@ class Plan:
         """The plan of a YAML file.
 
         Raises:
-            ConfigError: if it lacks a key or has an unknown one, or a name occurs twice.
+            ConfigError: if it lacks a key or has an unknown one, a name occurs twice, or a dataset starts from one that
+                is not in the file, or from itself.
             DataError: if it cannot be read.
         """
         content = read_yaml(path)
@@ -138,6 +140,8 @@ class Plan:
         unknown = sorted(set(content) - {"datasets", "extension"})
         if twice or unknown:
             raise ConfigError(f"{path}: {', '.join(twice or unknown)}: {'occurs twice' if twice else 'unknown key'}.")
+        for dataset in datasets:
+            _check_start(path, dataset, names)
         return cls(datasets, extension)
 
     def with_data(self, folders: Mapping[str, str]) -> Plan:
@@ -164,6 +168,13 @@ class Plan:
         if unknown:
             raise ConfigError(f"The queue has no {', '.join(unknown)}; it has {', '.join(sorted(known))}.")
         return Plan(tuple(d for d in self.datasets if not names or d.name in names), self.extension)
+
+
+def _check_start(path: Path, dataset: Dataset, names: list[str]) -> None:
+    others = [name for name in names if name != dataset.name]
+    if dataset.start and dataset.start not in others:
+        near = suggestion(str(dataset.start), others)
+        raise ConfigError(f"{path}: {dataset.name}: start = {dataset.start} is no other dataset of this queue.{near}")
 
 
 def new_training(dataset: Dataset) -> list[str]:
