@@ -1,7 +1,5 @@
 """Scenes at rest: unrolling makes no further calls, and nothing that would still move is frozen."""
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -97,8 +95,7 @@ def two_piles(wraps: bool) -> tuple[Emulator, Particles]:
     """A pile at rest, and one that flies to it from afar, in a channel that is much longer than the network sees."""
     walls = ("periodic", "wall") if wraps else ("wall", "wall")
     low, high = ((0.1, 3.3), (0.1, 0.9)) if wraps else ((0.08, 3.32), (0.08, 0.92))
-    scene = box(gravity=(0.0, 0.0), boundary=walls)
-    scene = dataclasses.replace(scene, bounds=((0.1, 3.3), (0.1, 0.9)), domain=(low, high))
+    scene = box(gravity=(0.0, 0.0), boundary=walls, bounds=((0.1, 3.3), (0.1, 0.9)), domain=(low, high))
     torch.manual_seed(0)
     constraints = Constraints(rest_speed=0.1)
     model = EmulatorRecipe(scene, (128, 32), 4, processor=UNet(4, 1), constraints=constraints).build().eval()

@@ -73,7 +73,7 @@ def test_evenly_spaced_frames_are_distinct_and_include_both_ends(frames, count):
 def test_from_scene_takes_the_box_and_the_names(falling):
     scene = Scene(
         bounds=((0.1, 0.9),) * 2,
-        domain=((0.08, 0.92),) * 2,
+        domain=((0.1, 0.9), (0.08, 0.92)),
         dt=0.0025,
         materials=("sand", "goop"),
         particle_volume=1e-4,
