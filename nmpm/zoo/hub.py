@@ -71,14 +71,17 @@ def download(identifier: HubId) -> Path:
         raise ZooError(f"{identifier} is not a model of nmpm: it has no {CARD}.")
     if _is_whole(folder):
         return folder
-    if not constants.HF_HUB_OFFLINE:
-        folder = _snapshot(identifier, again=True)  # else the hub's client would keep what it has
-        if _is_whole(folder):
-            return folder
-    raise ZooError(
+    damage = (
         f"{identifier}: its weights are not those that {CARD} was written for (the SHA-256 differs), or one of the two"
         f" cannot be read. If the copy on this machine is damaged, delete {folder.parents[1]} and load it again online."
     )
+    try:  # the hub's client would keep what it has
+        fetched = folder if constants.HF_HUB_OFFLINE else _snapshot(identifier, again=True)
+    except ZooError as error:
+        raise ZooError(f"{damage} {error}") from error
+    if not _is_whole(fetched):
+        raise ZooError(damage)
+    return fetched
 
 
 def _is_whole(folder: Path) -> bool:

@@ -177,6 +177,17 @@ def test_offline_a_damaged_file_of_the_cache_is_named_with_what_to_delete(hub, r
         load_model(str(identifier))
 
 
+def test_a_damaged_file_that_cannot_be_fetched_again_is_named_with_what_to_delete(hub, root, tmp_path):
+    identifier = push(root / "small", "lab/small")
+    load_model(str(identifier))
+    damage(tmp_path / "hub-cache", "model.safetensors")
+    hub.cut.add("model.safetensors")
+    with pytest.raises(ZooError, match=r"delete .*hub-cache/models--lab--small and load .* cannot be downloaded"):
+        load_model(str(identifier))
+    hub.cut.clear()
+    assert load_model(str(identifier)).name == "small"
+
+
 @pytest.fixture
 def goop(tmp_path):
     """A copy of a complete entry, without its variants."""
