@@ -24,6 +24,7 @@ SMALLER = {
     "val_check_interval=250": "val_check_interval=2",
     "frames=400": "frames=24",
     "frames=100": "frames=8",
+    "max_ms_per_frame=5.0": "max_ms_per_frame=1000.0",  # whatever else the machine does
     "range(50)": "range(3)",
     "range(20)": "range(3)",
 }
