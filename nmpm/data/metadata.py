@@ -9,6 +9,7 @@ stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `d
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -111,6 +112,9 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
     Raises:
         DataError: if the file is missing or not JSON, or a key is missing or has a wrong value.
         ConfigError: if there is no such family.
+
+    Warns:
+        UserWarning: if the file names types otherwise than the family, which is then not used.
     """
     path = Path(folder) / METADATA_FILE
     return metadata_from_dict(load_json(path), path, family)
@@ -222,8 +226,20 @@ def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozense
             f"{keys.path}: the key 'particle_types' is missing, so the type ids have no meaning. Add it, e.g."
             f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
         )
+    if fallback is not None:
+        _warn_of_unused(keys.path, str(family), types, fallback.types)
     walls = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
     return types, keys.take("static_types", parse_ids, fallback.static if fallback else walls)
+
+
+def _warn_of_unused(path: Path, family: str, types: Mapping[int, str], others: Mapping[int, str]) -> None:
+    """Warn where a file's own names of type ids are not those of the family that was given."""
+    different = [f"{i} = {name}, not {others[i]}" for i, name in types.items() if others.get(i, name) != name]
+    if different:
+        warnings.warn(
+            f"{path} names its particle types itself ({'; '.join(different)}): the family {family} is not used.",
+            stacklevel=4,
+        )
 
 
 def _sequence_length(keys: JsonKeys) -> int:
