@@ -21,7 +21,7 @@ from tests.data.convert import records
 
 Change = tuple[str, float, bytes]
 METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 6, "dim": 2, "dt": 0.0025, "gravity": [0, -9.81],
-            "particle_types": {"3": "boundary", "5": "water"}, "static_types": [3], "domain": [[0, 1], [0, 1]],
+            "particle_types": {"3": "boundary", "5": "water"}, "static_types": [3], "domain": [[0, 1], [0.1, 0.9]],
             "periodic_boundary_conditions": [False, True], "densities": {"water": 1000.0}, "vel_std": [1e-3, 1e-3],
             "particle_volume": 1e-4, "write_every": 1}  # fmt: skip
 
