@@ -122,7 +122,7 @@ def _summary(card: Mapping[str, Any]) -> str:
 
 def _card(chosen: argparse.Namespace) -> None:
     from nmpm.errors import ZooError
-    from nmpm.zoo.cards import readme
+    from nmpm.zoo.cards import MALFORMED, readme
     from nmpm.zoo.entries import read_card
     from nmpm.zoo.registry import find_entry
 
@@ -134,7 +134,7 @@ def _card(chosen: argparse.Namespace) -> None:
         return
     try:
         text = readme(card)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except MALFORMED as error:
         raise ZooError(
             f"The card of {chosen.name} is not complete ({error}): `nmpm zoo card {chosen.name} --yaml` shows what it"
             " has."

@@ -18,6 +18,8 @@ CONSTRAINTS = {
     "bounds": "bounds = {value} (no particle leaves the scene's bounds)",
 }
 """What each constraint enforces, by its key in `card.yaml`."""
+MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
+"""What `readme` and charts raise where a card or a table lacks something, or has other kinds of values."""
 PICTURES = {
     "chart.png": "errors over frames and over training",
     "rollout.png": "rollout",

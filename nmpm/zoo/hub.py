@@ -23,7 +23,7 @@ from nmpm._support.bounded_files import read_bounded, read_yaml
 from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
-from nmpm.zoo.cards import PICTURES, readme
+from nmpm.zoo.cards import MALFORMED, PICTURES, readme
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.pretrained import SIMULATED
 
@@ -211,7 +211,7 @@ def _page(card: Mapping[str, Any], entry: Path, load: str) -> str:
     """The README of an entry, by which `Zoo.load(load)` loads it; empty for a card without what it shows."""
     try:
         return readme(card, [path.name for path in entry.iterdir()], load)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError):
+    except MALFORMED:
         return ""
 
 

@@ -12,7 +12,7 @@ import yaml
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import one_line
 from nmpm.errors import ZooError
-from nmpm.zoo.cards import intervals, readme, twin_ratio
+from nmpm.zoo.cards import MALFORMED, intervals, readme, twin_ratio
 from nmpm.zoo.charts import CHART, draw_chart, save_chart
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.golden import golden_rollout
@@ -35,8 +35,6 @@ steps (mostly half as many): at 1, a model is as accurate as the data themselves
 scene. `docs/concepts.md` explains the terms.
 """
 COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "trivial", "trained", "ms per frame")
-MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
-"""What text and charts raise where a card or a table lacks something, or has other kinds of values."""
 
 
 def write_index(root: Path) -> Path:
