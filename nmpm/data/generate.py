@@ -15,10 +15,10 @@ import json
 import logging
 import os
 import shutil
-import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from queue import SimpleQueue
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.version import __version__
@@ -32,17 +32,17 @@ from nmpm.data.format import (
     write_metadata,
     write_split,
 )
-from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, write_part
+from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, request_path, write_part
 from nmpm.data.progress import progress_bar
-from nmpm.data.seeds import DRAWS, seed_of_draw, simulate_first_stable
+from nmpm.data.seeds import DRAWS, seed_of_draw
 from nmpm.data.shard import Shard
 from nmpm.data.simulation_request import SimulationRequest
+from nmpm.data.simulation_workers import Worker, start_workers
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import DataError
 from nmpm.sim import Preset
 from nmpm.sim.preset import BOUNDARY
 
-_REQUEST = "request.json"
 _KEY = "simulation"
 
 _log = logging.getLogger(__name__)
@@ -141,7 +141,7 @@ def _is_complete(request: SimulationRequest, folder: Path) -> bool:
 
 def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
     """Writes the request beside the parts, or checks that existing parts belong to the same request."""
-    path = folder / PARTS / _REQUEST
+    path = request_path(folder)
     if path.is_file():
         request.check_same(json.loads(path.read_text(encoding="utf-8")), folder)
         return
@@ -182,29 +182,28 @@ def _simulate_parts(request: SimulationRequest, folder: Path, wanted: Sequence[t
     if not missing:
         return
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
-    # Threads suffice, as the simulators' compiled loops release the GIL.
-    pool, stopped = ThreadPoolExecutor(min(workers, len(missing))), threading.Event()
+    started = start_workers(request, folder, workers, len(missing))
+    idle: SimpleQueue[Worker] = SimpleQueue()
+    for worker in started:
+        idle.put(worker)
+    pool = ThreadPoolExecutor(len(started))
     try:
         with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
-            for future in as_completed(
-                [pool.submit(_simulate_part, request, folder, s, i, stopped) for s, i in missing]
-            ):
+            for future in as_completed([pool.submit(_simulate_part, idle, s, i) for s, i in missing]):
                 future.result()
                 advance()
-    except BaseException:  # Ctrl-C, or a simulation that failed: the others need not end before it shows
-        stopped.set()
-        raise
-    finally:
+    finally:  # after Ctrl-C or a simulation that failed, too: the others need not end before it shows
+        for worker in started:
+            worker.stop()
         pool.shutdown(cancel_futures=True)
 
 
-def _simulate_part(request: SimulationRequest, folder: Path, split: str, index: int, stopped: threading.Event) -> None:
-    def stop_early(_: int) -> None:
-        if stopped.is_set():
-            raise CancelledError
-
-    run = simulate_first_stable(request.preset, request.entropy(split, index), stop_early)
-    write_part(part_path(folder, split, index), run)
+def _simulate_part(idle: SimpleQueue[Worker], split: str, index: int) -> None:
+    worker = idle.get()
+    try:
+        worker.simulate(split, index)
+    finally:
+        idle.put(worker)
 
 
 def _assemble(request: SimulationRequest, folder: Path, split: str) -> None:

@@ -18,6 +18,11 @@ PARTS = ".parts"
 """The folder of the parts, within the dataset's."""
 
 
+def request_path(folder: Path) -> Path:
+    """The request that the parts are simulated by, as JSON."""
+    return folder / PARTS / "request.json"
+
+
 def part_path(folder: Path, split: str, index: int) -> Path:
     """The part of one trajectory."""
     return folder / PARTS / f"{split}-{index:05d}.npz"

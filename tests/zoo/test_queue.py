@@ -195,6 +195,16 @@ def test_an_entry_of_the_zoo_replaces_the_training_that_a_dataset_starts_from(tm
     assert words[words.index("--start_from") + 1] == str(tmp_path / "runs/recorded/published")
 
 
+@pytest.mark.parametrize(("hours", "following"), [(4.02, 1), (4.2, 1), (4.4, None)])
+def test_the_last_hours_may_exceed_the_limit_a_little(tmp_path, hours, following):
+    entry = tmp_path / "zoo" / "small"
+    entry.mkdir(parents=True)
+    card = {"training": {"seconds": 3600 * hours, "steps": 7}, "curve": [[900.0, 7, 0.2, 0.2]]}
+    (entry / "card.yaml").write_text(yaml.safe_dump(card))
+    history = History(Dataset("small", "goop.yaml", 2.0), tmp_path / "runs", Extension(hours=1.0, limit=5.0), entry)
+    assert history.next_round() == following
+
+
 def test_mistakes_in_a_queue_are_named(queue, tmp_path):
     path = queue(1.0)
     with pytest.raises(ConfigError, match=r"has no lava; it has small"):

@@ -10,6 +10,8 @@ from nmpm.zoo.queue.published import Published
 from nmpm.zoo.queue.training import WORDS, Training
 from nmpm.zoo.queue.validations import lowest_errors
 
+_NEARLY = 0.05
+"""Share of the planned hours by which trainings may miss them: each ends a little before or after its own."""
 COPY = "published"
 """Folder beside the trainings with the entry that the first one started from."""
 
@@ -73,7 +75,8 @@ class History:
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
         trainings, extension = self.trainings, self.extension
-        if self.planned_hours(len(trainings) + 1) > extension.limit + 1e-9 or self.hours_of(len(trainings) + 1) <= 0:
+        planned = self.planned_hours(len(trainings) + 1)
+        if planned > (1 + _NEARLY) * extension.limit or self.hours_of(len(trainings) + 1) <= 0:
             return True
         errors = lowest_errors(*(stage.curve() for stage in self.stages))
         return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
@@ -88,8 +91,8 @@ class History:
         return done + self._hours_of_first(done) + (count - 1) * self.extension.hours
 
     def entry_has_hours(self) -> bool:
-        """Whether the entry that the first training goes on from was trained for the dataset's hours, to 5%."""
-        return self._hours_of_entry() >= 0.95 * self.dataset.hours
+        """Whether the entry that the first training goes on from was trained for nearly the dataset's hours."""
+        return self._hours_of_entry() >= (1 - _NEARLY) * self.dataset.hours
 
     def _hours_of_entry(self) -> float:
         entry = self.starting_entry
