@@ -10,13 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from nmpm._support.atomic import atomic_folder
+from nmpm._support.digests import weights_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
 from nmpm.errors import ZooError
-from nmpm.training.checkpoints import load_module
+from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.cards import readme, stress_digest
 from nmpm.zoo.charts import write_chart
 from nmpm.zoo.entries import CARD
@@ -31,6 +33,8 @@ STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
 """Files of `nmpm stress --report`, with and without constraints, by the key of the card."""
 COPIED = ("rollout.png", "errors.csv")
 """Files of a run that its entry keeps."""
+_EMULATOR = "emulator."
+"""Before the names of the emulator's weights in a checkpoint."""
 
 
 def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -> Path:
@@ -67,6 +71,14 @@ def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
 def weights_of(checkpoint: Path) -> str:
     """The SHA-256 of the weights that an entry of a checkpoint has."""
     return hashlib.sha256(serialise(_rounded(checkpoint))).hexdigest()
+
+
+def round_checkpoint(checkpoint: Path, target: Path) -> None:
+    """Write a checkpoint whose weights are those that its entry has, so that what is measured of it holds for that."""
+    content, rounded = read_checkpoint(checkpoint), _rounded(checkpoint).state_dict()
+    content["state_dict"] |= {f"{_EMULATOR}{name}": value for name, value in rounded.items()}
+    content["nmpm_digest"] = weights_digest(content["state_dict"])
+    torch.save(content, target)
 
 
 def _rounded(checkpoint: Path) -> Emulator:

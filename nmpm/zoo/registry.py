@@ -114,11 +114,13 @@ class Zoo:
         Raises:
             ZooError: as `load_model`; or if no variant is within the limits, or their times are not known.
             ConfigError: if a limit is not a positive number; if `hardware` or `calibrate` is given without a limit, or
-                `variant` or a limit for a path or an id.
+                both are; if `variant` or a limit is given for a path or an id.
         """
         limits = Limits(max_mse, max_ms_per_frame, hardware)
         if not limits and (calibrate or hardware is not None):
             raise ConfigError("calibrate and hardware are of use with a limit: give max_mse or max_ms_per_frame too.")
+        if calibrate and hardware is not None:
+            raise ConfigError(f"calibrate times the models here, hardware = {hardware!r} takes stated times: give one.")
         if variant is None and not limits:
             return load_model(name, device, root)
         _check_variants(name, root)

@@ -70,6 +70,11 @@ def test_hardware_and_calibration_need_a_limit(root, option):
         Zoo.load("small", root, **option)
 
 
+def test_times_are_measured_or_stated(root):
+    with pytest.raises(ConfigError, match="hardware = 'a GPU' takes stated times: give one"):
+        Zoo.load("small", root, max_mse=1.0, hardware="a GPU", calibrate=True)
+
+
 @pytest.mark.parametrize("choice", [{"variant": "fast"}, {"max_mse": 1.0}, {"max_ms_per_frame": 1.0}], ids=str)
 def test_paths_and_ids_have_no_variants(root, monkeypatch, choice):
     monkeypatch.chdir(root)

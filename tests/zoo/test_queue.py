@@ -16,12 +16,14 @@ import yaml
 
 from nmpm.cli import main
 from nmpm.errors import ConfigError
+from nmpm.metrics import MSE
 from nmpm.zoo import Zoo
 from nmpm.zoo.queue.collection import describe_data, simulator_facts
 from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
 from nmpm.zoo.queue.training import Training
 from nmpm.zoo.queue.validations import lowest_errors
+from nmpm.zoo.scenes import iterate_test_scenes
 
 SCRIPT = Path(__file__).parents[2] / "zoo" / "train.py"
 if not SCRIPT.is_file():
@@ -297,6 +299,19 @@ def test_a_worse_model_does_not_replace_an_entry(queue, capsys, root):
     assert train(path, "--collect") == 0
     assert Zoo.card("small", "zoo")["test"]["mse"] > 0
     assert Zoo.card("small", "zoo")["about"] == about
+
+
+def test_the_figures_of_an_entry_are_those_of_its_rounded_weights(queue):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    model = Zoo.load(Path("zoo/small"))
+    assert model.card["weights"] == "float16"
+    data = yaml.safe_load(path.read_text())["datasets"][0]["options"]["data.path"]
+    scenes = iterate_test_scenes(model, None, Path(data))
+    for stated, window in zip(model.card["per_trajectory"], scenes, strict=True):
+        metric = MSE()
+        metric.update(window, model.rollout(window.initial, window.target.shape[1]))
+        assert stated["mse"] == pytest.approx(metric.per_trajectory()[0]["mse"], rel=1e-6)
 
 
 def test_an_entry_that_has_the_best_weights_keeps_what_was_measured_of_them(queue, capsys):

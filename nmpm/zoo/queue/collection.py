@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import filecmp
 import json
 import math
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from nmpm.errors import ZooError
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import add_facts, refresh, write_index
 from nmpm.zoo.measures.simulator import measure_twin
-from nmpm.zoo.publish import replace, weights_of
+from nmpm.zoo.publish import replace, round_checkpoint, weights_of
 from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.training import Training
@@ -94,15 +92,15 @@ def _update(entry: Path, card: Mapping[str, Any], history: History) -> None:
 
 
 def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
-    """The report of a test of the best weights in a folder; the former one where they are the same weights."""
+    """The report of a test of the best weights, rounded as in their entry, in a folder; the former one of the same."""
     copy, merged = folder / BEST, folder / MERGED
-    if copy.is_file() and filecmp.cmp(best.best, copy, shallow=False) and merged.is_file():
+    if copy.is_file() and merged.is_file() and weights_of(best.best) == weights_of(copy):
         report = _read(merged)
         if "particles" in report:  # else of an earlier version
             return report
     merged.unlink(missing_ok=True)
     with atomic_write(copy) as part:
-        shutil.copyfile(best.best, part)
+        round_checkpoint(best.best, part)
     if run(best.test_command(folder)):
         raise ZooError(f"The test of {copy} failed.")
     return _read(folder / "report.json")
