@@ -27,7 +27,8 @@ _EXAMPLES = """\
 examples:
   nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
   nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
-  nmpm rollout runs/goop/checkpoints/last.ckpt --device auto
+  nmpm rollout runs/goop/checkpoints/last.ckpt
+  nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs
 """
 
 

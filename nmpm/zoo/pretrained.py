@@ -196,7 +196,7 @@ class Pretrained:
         return count
 
     def to(self, device: torch.device | str) -> Pretrained:
-        """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for the fastest.
+        """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for a GPU where there is one.
 
         This model is left where it is; the returned one has a copy of its tensors if the device differs.
 
