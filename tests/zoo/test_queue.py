@@ -337,6 +337,22 @@ def test_an_entry_that_has_the_best_weights_keeps_what_was_measured_of_them(queu
     assert card_path.stat().st_mtime_ns == written  # there is nothing to change
 
 
+def test_times_of_the_same_network_stay_on_the_card(queue):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    folder = Path("zoo/small")
+    card = yaml.safe_load((folder / "card.yaml").read_text())
+    elsewhere = card["speed"][0] | {"hardware": "a GPU"}
+    former = card | {"sha256": "of other weights", "speed": [elsewhere], "curve": [[1.0, 1, 1e9]]}
+    (folder / "card.yaml").write_text(yaml.safe_dump(former))
+    assert train(path, "--collect") == 0
+    assert Zoo.card("small", "zoo")["speed"] == [elsewhere]
+    (folder / "card.yaml").write_text(yaml.safe_dump(former))
+    (folder / "config.yaml").write_text((folder / "config.yaml").read_text().replace("width: 4", "width: 8"))
+    assert train(path, "--collect") == 0
+    assert [entry["hardware"] for entry in Zoo.card("small", "zoo")["speed"]] == [card["speed"][0]["hardware"]]
+
+
 def test_an_entry_that_is_replaced_while_the_simulator_is_measured_keeps_its_card(queue, monkeypatch, capsys):
     from nmpm.zoo.queue import collection
 

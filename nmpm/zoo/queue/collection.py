@@ -67,11 +67,14 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         error = report["test"]["mse"]
         if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
-        former = _card(zoo / name)  # again, as the test takes minutes
+        former, form = _card(zoo / name), _form(zoo / name)  # again, as the test takes minutes
         dataset = history.dataset_of(history.trainings.index(best) + 1)
         replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
-        refresh(zoo / name, ["speed"])
         card = read_card(zoo / name)
+        if form == _form(zoo / name) and former.get("speed"):
+            add_facts(zoo / name, str(card["sha256"]), {"speed": former["speed"]})  # weights do not change it
+        else:
+            refresh(zoo / name, ["speed"])
         known = simulator_facts(former, card)
         add_facts(zoo / name, str(card["sha256"]), _references(zoo / name, history, dataset, known))
         write_index(zoo)
@@ -81,6 +84,12 @@ def collect(history: History, zoo: Path, run: Command) -> str:
 def _card(entry: Path) -> dict[str, Any]:
     """The card of an entry; empty where there is none."""
     return read_card(entry) if (entry / CARD).is_file() else {}
+
+
+def _form(entry: Path) -> str:
+    """How the model of an entry is built, as text; empty where there is none."""
+    path = entry / "config.yaml"
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def _update(entry: Path, card: Mapping[str, Any], history: History) -> None:
