@@ -45,7 +45,7 @@ def list_steps(device: str, out: Path) -> dict[str, list[str]]:
         "call_costs": _benchmark("call_costs", device),
         "constraints": _benchmark("constraints", device),
         "first_frame": _benchmark("first_frame", device),
-        "rollouts": _benchmark("gpu_rollouts", device),
+        "rollouts": _benchmark("gpu_rollouts", device, "--batches", "1", "64"),
         "compare": _python("-m", "nmpm", *compared, "--wider", "2", "--device", device, "--out", str(out / "compare")),
         "streaming": _python("benchmarks/streaming.py"),
         "ablation": _benchmark("ablation", device, *ablation),

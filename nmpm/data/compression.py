@@ -5,7 +5,6 @@ The chunks are those that HDF5's own filters, shuffle and gzip, write; any HDF5 
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.parallel import map_ranges, processor_count, split
 
 _LEVEL = 1
 FILTERS: Mapping[str, Any] = MappingProxyType({"shuffle": True, "compression": "gzip", "compression_opts": _LEVEL})
@@ -35,7 +34,7 @@ def write_compressed(group: Any, name: str, values: np.ndarray, rows: int, threa
     """
     chunk = (rows, *values.shape[1:])
     dataset = group.create_dataset(name, shape=values.shape, dtype=values.dtype, chunks=chunk, **FILTERS)
-    threads = threads or os.cpu_count() or 1
+    threads = threads or processor_count()
     ranges, rest = split(len(values), rows), (0,) * (values.ndim - 1)
     for first in range(0, len(ranges), _AHEAD * threads):
         batch = ranges[first : first + _AHEAD * threads]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -21,6 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.parallel import processor_count
 from nmpm._support.version import __version__
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
@@ -37,7 +37,7 @@ from nmpm.data.progress import progress_bar
 from nmpm.data.seeds import DRAWS, seed_of_draw
 from nmpm.data.shard import Shard
 from nmpm.data.simulation_request import SimulationRequest
-from nmpm.data.simulation_workers import Worker, start_workers
+from nmpm.data.simulation_workers import Worker, started_workers
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import DataError
 from nmpm.sim import Preset
@@ -65,7 +65,8 @@ def generate(
         folder: The dataset's folder; created if missing.
         counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
         seed: The seeds of all trajectories are derived from it.
-        workers: Trajectories simulated at a time; one per processor core when left out.
+        workers: Trajectories simulated at a time; one per processor core when left out. Where there is much to
+            simulate, each is a process, of about 200 MB.
         known: A complete dataset of the same preset, revision of its simulator and seed, whose trajectories are copied.
 
     Raises:
@@ -76,7 +77,7 @@ def generate(
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
         return
     with explain_write_errors(folder), lock_folder(folder):
-        _complete(request, folder, workers or os.cpu_count() or 1, known)
+        _complete(request, folder, workers or processor_count(), known)
 
 
 def generate_shard(
@@ -103,7 +104,7 @@ def generate_shard(
             return 0
         with lock_folder(folder / PARTS):
             _prepare_parts(request, folder)
-        _simulate_parts(request, folder, shard.select(request.trajectories), workers or os.cpu_count() or 1)
+        _simulate_parts(request, folder, shard.select(request.trajectories), workers or processor_count())
         # While the lock is held nobody assembles: the last shard to come here finds all parts.
         missing = len(_missing(folder, request.trajectories))
     if missing == 0:
@@ -182,20 +183,20 @@ def _simulate_parts(request: SimulationRequest, folder: Path, wanted: Sequence[t
     if not missing:
         return
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
-    started = start_workers(request, folder, workers, len(missing))
-    idle: SimpleQueue[Worker] = SimpleQueue()
-    for worker in started:
-        idle.put(worker)
-    pool = ThreadPoolExecutor(len(started))
-    try:
-        with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
-            for future in as_completed([pool.submit(_simulate_part, idle, s, i) for s, i in missing]):
-                future.result()
-                advance()
-    finally:  # after Ctrl-C or a simulation that failed, too: the others need not end before it shows
+    with started_workers(request, folder, workers, len(missing)) as started:
+        idle: SimpleQueue[Worker] = SimpleQueue()
         for worker in started:
-            worker.stop()
-        pool.shutdown(cancel_futures=True)
+            idle.put(worker)
+        pool = ThreadPoolExecutor(len(started))
+        try:
+            with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
+                for future in as_completed([pool.submit(_simulate_part, idle, s, i) for s, i in missing]):
+                    future.result()
+                    advance()
+        finally:  # after Ctrl-C or a simulation that failed, too: the others need not end before it shows
+            for worker in started:
+                worker.stop()
+            pool.shutdown(cancel_futures=True)
 
 
 def _simulate_part(idle: SimpleQueue[Worker], split: str, index: int) -> None:

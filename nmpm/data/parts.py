@@ -34,6 +34,12 @@ def write_part(path: Path, run: SimulatedTrajectory | Trajectory) -> None:
         np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)
 
 
+def remove_unfinished_parts(folder: Path, process: int) -> None:
+    """Deletes what a process that was killed left of the part that it was writing."""
+    for left in (folder / PARTS).glob(f".*.{process}.part*"):
+        left.unlink(missing_ok=True)
+
+
 def read_parts(paths: Iterable[Path], advance: Callable[[], None]) -> Iterator[Trajectory]:
     """Yields the trajectories one after the other; calls `advance` after each.
 

@@ -5,35 +5,41 @@ many threads most wait for it. Where there is much to simulate, each worker is t
 Python that runs this one. `multiprocessing` would import the caller's script in each of them, which a script without
 `if __name__ == "__main__"` does not survive.
 
-A process reads a trajectory, split and index, per line of its standard input, and answers each with a line of JSON. It
-ends with its input, and when the process that started it does.
+A process reads a trajectory, split and index, per line of its standard input, and answers each with a line that begins
+with `_ANSWER` and goes on in JSON. It ends with its input, and when the process that started it does.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
-import signal
 import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any, Protocol, TextIO, cast
 
 from nmpm import errors
-from nmpm.data.parts import part_path, request_path, write_part
+from nmpm.data.parts import part_path, remove_unfinished_parts, request_path, write_part
 from nmpm.data.seeds import simulate_first_stable
 from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import DataError, NmpmError
 from nmpm.sim.loading import preset_from_dict
 
-PER_PROCESS = 8
-"""Trajectories of a worker from which on it is a process, which takes a second or two to start."""
-_START = "from nmpm.data.simulation_workers import serve; serve()"
+FRAMES_PER_PROCESS = 1500
+"""Frames of a worker from which on it is a process: these take seconds at least, the start of a process one or two."""
+_LAST_SECONDS = 5
+"""In which a process that has closed its output ends by itself."""
+_ANSWER = "nmpm-answer "
+_START = (
+    "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "  # Ctrl-C reaches all: who started it ends it
+    "from nmpm.data.simulation_workers import serve; serve()"
+)
 _log = logging.getLogger(__name__)
 
 
@@ -44,22 +50,41 @@ class Worker(Protocol):
         """Write the part of a trajectory."""
 
     def stop(self) -> None:
-        """End it soon, also while it simulates; may be called by another thread."""
+        """End it soon, also while another thread calls `simulate`."""
+
+    def close(self) -> None:
+        """Stop it and release what it holds, when no thread calls `simulate` any more."""
 
 
-def start_workers(request: SimulationRequest, folder: Path, count: int, trajectories: int) -> Sequence[Worker]:
-    """Workers for a number of trajectories; the folder has the request beside its parts.
+@contextlib.contextmanager
+def started_workers(
+    request: SimulationRequest, folder: Path, count: int, trajectories: int
+) -> Iterator[tuple[Worker, ...]]:
+    """Workers for a number of trajectories, which are closed at the end; the folder has the request beside its parts.
 
     Args:
         request: What is simulated.
         folder: The dataset's.
         count: Workers at most.
         trajectories: That are to be simulated.
+
+    Raises:
+        DataError: if a process cannot be started.
     """
     count = min(count, trajectories)
-    if count > 1 and trajectories >= PER_PROCESS * count and _can_be_sent(request):
-        return [ProcessWorker(folder) for _ in range(count)]
-    return [ThreadWorker(request, folder) for _ in range(count)]
+    much = trajectories * request.preset.frames >= FRAMES_PER_PROCESS * count
+    in_processes = count > 1 and much and _runs_scripts() and _can_be_sent(request)
+    with contextlib.ExitStack() as stack:
+        workers: list[Worker] = []
+        for _ in range(count):
+            workers.append(ProcessWorker(folder) if in_processes else ThreadWorker(request, folder))
+            stack.callback(workers[-1].close)
+        yield tuple(workers)
+
+
+def _runs_scripts() -> bool:
+    """Whether the executable of this process is a Python, and not a program that Python is a part of."""
+    return bool(sys.executable) and not getattr(sys, "frozen", False)
 
 
 def _can_be_sent(request: SimulationRequest) -> bool:
@@ -91,10 +116,12 @@ class ThreadWorker:
         Raises:
             CancelledError: after `stop`.
         """
-        run = simulate_first_stable(self._request.preset, self._request.entropy(split, index), self._stop_early)
+        self._go_on()
+        run = simulate_first_stable(self._request.preset, self._request.entropy(split, index), self._go_on)
+        self._go_on()
         write_part(part_path(self._folder, split, index), run)
 
-    def _stop_early(self, _: int) -> None:
+    def _go_on(self, _: int = 0) -> None:
         if self._stopped.is_set():
             raise CancelledError
 
@@ -102,15 +129,22 @@ class ThreadWorker:
         """Let it end after the frame that it simulates."""
         self._stopped.set()
 
+    def close(self) -> None:
+        """Let it end; it holds nothing."""
+        self.stop()
+
 
 class _OwnedWorker(ThreadWorker):
-    """Ends this process, within a frame, when the one that started it has ended, even by kill -9."""
+    """Ends this process, within a frame, when the one that started it has ended, even by kill -9.
 
-    def __init__(self, request: SimulationRequest, folder: Path) -> None:
+    The folder's lock has ended with it: nothing may be written any more.
+    """
+
+    def __init__(self, request: SimulationRequest, folder: Path, owner: int) -> None:
         super().__init__(request, folder)
-        self._owner = os.getppid()
+        self._owner = owner
 
-    def _stop_early(self, _: int) -> None:
+    def _go_on(self, _: int = 0) -> None:
         if os.getppid() != self._owner:
             raise SystemExit
 
@@ -120,18 +154,27 @@ class ProcessWorker:
 
     Args:
         folder: The dataset's.
+
+    Raises:
+        DataError: if the process cannot be started.
     """
 
     def __init__(self, folder: Path) -> None:
-        paths = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(  # noqa: S603
-            [sys.executable, "-c", _START, str(folder.resolve())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            env=os.environ | paths,
-        )
+        self._folder = folder
+        paths = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path), "OMP_NUM_THREADS": "1"}
+        try:
+            self._process = subprocess.Popen(  # noqa: S603
+                [sys.executable, "-P", "-c", _START, str(folder.resolve()), str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                encoding="utf-8",
+                errors="replace",
+                env=os.environ | paths,
+            )
+        except OSError as error:
+            raise DataError(f"A process that simulates cannot be started ({error}): ask for fewer workers.") from error
+        self._questions, self._answers = cast(TextIO, self._process.stdin), cast(TextIO, self._process.stdout)
 
     def simulate(self, split: str, index: int) -> None:
         """Write the part of a trajectory.
@@ -150,25 +193,39 @@ class ProcessWorker:
             raise kinds.get(name, RuntimeError)(answer["text"])
 
     def _ask(self, trajectory: str) -> dict[str, Any]:
-        questions, answers = cast(TextIO, self._process.stdin), cast(TextIO, self._process.stdout)
         try:
-            questions.write(trajectory + "\n")
-            questions.flush()
-            line = answers.readline()
-        except (OSError, ValueError):  # the pipe is broken, or closed by `stop`
-            line = ""
-        if not line:
+            self._questions.write(trajectory + "\n")
+            self._questions.flush()
+            line = next((line for line in self._answers if line.startswith(_ANSWER)), "")
+            answer: dict[str, Any] = json.loads(line.removeprefix(_ANSWER))
+        except (OSError, ValueError) as error:  # a broken or closed pipe; half a line, or none
+            status = self._end()
+            why = "was it killed, or is memory short?" if status < 0 else "see its traceback above."
             raise DataError(
-                f"A process that simulated {trajectory} ended with status {self._process.wait()}: was it killed, or is"
-                " memory short? Repeat the call to continue; fewer workers take less memory."
-            )
-        answer: dict[str, Any] = json.loads(line)
+                f"A process that simulated {trajectory} ended with status {status}: {why} Repeat the call to continue;"
+                " fewer workers take less memory."
+            ) from error
         return answer
 
+    def _end(self) -> int:
+        """The status with which it ends by itself, or else is killed."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return self._process.wait(_LAST_SECONDS)
+        self._process.kill()
+        return self._process.wait()
+
     def stop(self) -> None:
-        """End it at once; a part that it writes has a temporary name."""
+        """End it at once, and delete the part that it was writing."""
         self._process.kill()
         self._process.wait()
+        remove_unfinished_parts(self._folder, self._process.pid)
+
+    def close(self) -> None:
+        """End it and close the pipes."""
+        self.stop()
+        with contextlib.suppress(OSError):  # what is left to be sent to it
+            self._questions.close()
+        self._answers.close()
 
 
 class _Texts(logging.Handler):
@@ -183,18 +240,18 @@ class _Texts(logging.Handler):
 
 
 def serve() -> None:
-    """Simulate what the standard input asks for, for the folder that the command line names, until it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a terminal; who started this one ends it
-    answers, sys.stdout = sys.stdout, sys.stderr  # nothing that prints may mix with the answers
+    """Simulate what the standard input asks for until it ends; the command line has the folder and who started this."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # nothing that prints may mix with the answers
     warnings = _Texts()
     logging.getLogger("nmpm").addHandler(warnings)
-    folder = Path(sys.argv[1])
+    folder, owner = Path(sys.argv[1]), int(sys.argv[2])
     request = _request_from(json.loads(request_path(folder).read_text(encoding="utf-8")))
-    worker = _OwnedWorker(request, folder)
+    worker = _OwnedWorker(request, folder, owner)
     for line in sys.stdin:
         split, index = line.split()
         error, text = _outcome(worker, split, int(index))
-        answers.write(json.dumps({"error": error, "text": text, "warnings": warnings.texts}) + "\n")
+        answers.write(f"{_ANSWER}{json.dumps({'error': error, 'text': text, 'warnings': warnings.texts})}\n")
         answers.flush()
         warnings.texts.clear()
 

@@ -197,8 +197,8 @@ def test_an_entry_of_the_zoo_replaces_the_training_that_a_dataset_starts_from(tm
     assert words[words.index("--start_from") + 1] == str(tmp_path / "runs/recorded/published")
 
 
-@pytest.mark.parametrize(("hours", "following"), [(4.02, 1), (4.2, 1), (4.4, None)])
-def test_the_last_hours_may_exceed_the_limit_a_little(tmp_path, hours, following):
+@pytest.mark.parametrize(("hours", "following"), [(4.02, 1), (4.04, 1), (4.06, None), (4.9, None)])
+def test_the_last_training_may_exceed_the_limit_by_a_twentieth_of_its_hours(tmp_path, hours, following):
     entry = tmp_path / "zoo" / "small"
     entry.mkdir(parents=True)
     card = {"training": {"seconds": 3600 * hours, "steps": 7}, "curve": [[900.0, 7, 0.2, 0.2]]}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
 from collections.abc import Sequence
 from threading import Lock
 
+from nmpm._support.parallel import processor_count
 from nmpm.data.format import SPLITS, Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.background import Task, map_in_threads, raise_if_abandoned, run_in_thread
@@ -33,7 +33,7 @@ class SimulatedRecordings:
 
     def __init__(self, preset: Preset, seed: int = 0, workers: int | None = None) -> None:
         self.preset, self.seed, self.scene = preset, seed, preset.scene
-        self.workers = workers or os.cpu_count() or 1
+        self.workers = workers or processor_count()
         self.reader = RecordingReader(preset_metadata(preset), self.scene)
         self._lock = Lock()
         self._requests: OrderedDict[tuple[int, ...], Task[list[Recording]]] = OrderedDict()

@@ -17,7 +17,7 @@ from nmpm.errors import ZooError
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import add_facts, refresh, write_index
 from nmpm.zoo.measures.simulator import measure_twin
-from nmpm.zoo.publish import replace, round_checkpoint, weights_of
+from nmpm.zoo.publish import is_rounded_copy, replace, round_checkpoint, weights_of
 from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.training import Training
@@ -71,8 +71,9 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         dataset = history.dataset_of(history.trainings.index(best) + 1)
         replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
         card = read_card(zoo / name)
-        if form == _form(zoo / name) and former.get("speed"):
-            add_facts(zoo / name, str(card["sha256"]), {"speed": former["speed"]})  # weights do not change it
+        same_work = form == _form(zoo / name) and former.get("particles") == card.get("particles")
+        if same_work and former.get("speed"):  # of other hardware too, and not measured beside other trainings
+            add_facts(zoo / name, str(card["sha256"]), {"speed": former["speed"]})
         else:
             refresh(zoo / name, ["speed"])
         known = simulator_facts(former, card)
@@ -103,7 +104,7 @@ def _update(entry: Path, card: Mapping[str, Any], history: History) -> None:
 def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
     """The report of a test of the best weights, rounded as in their entry, in a folder; the former one of the same."""
     copy, merged = folder / BEST, folder / MERGED
-    if copy.is_file() and merged.is_file() and weights_of(best.best) == weights_of(copy):
+    if merged.is_file() and is_rounded_copy(copy, best.best):
         report = _read(merged)
         if "particles" in report:  # else of an earlier version
             return report

@@ -10,8 +10,8 @@ from nmpm.zoo.queue.published import Published
 from nmpm.zoo.queue.training import WORDS, Training
 from nmpm.zoo.queue.validations import lowest_errors
 
-_NEARLY = 0.05
-"""Share of the planned hours by which trainings may miss them: each ends a little before or after its own."""
+_NEARLY = 0.95
+"""Share of its hours from which on a training counts as done: each ends a little before or after its time."""
 COPY = "published"
 """Folder beside the trainings with the entry that the first one started from."""
 
@@ -75,11 +75,15 @@ class History:
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
         trainings, extension = self.trainings, self.extension
-        planned = self.planned_hours(len(trainings) + 1)
-        if planned > (1 + _NEARLY) * extension.limit or self.hours_of(len(trainings) + 1) <= 0:
+        if not self._fits(len(trainings) + 1) or self.hours_of(len(trainings) + 1) <= 0:
             return True
         errors = lowest_errors(*(stage.curve() for stage in self.stages))
         return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
+
+    def _fits(self, count: int) -> bool:
+        """Whether the limit leaves nearly the hours of the last of so many trainings."""
+        beyond = self.planned_hours(count) - self.extension.limit
+        return beyond <= (1 - _NEARLY) * self.hours_of(count) + 1e-9
 
     def hours_of(self, number: int) -> float:
         """Hours of the training of that number: what the dataset still lacks, else those of an extension."""
@@ -92,7 +96,7 @@ class History:
 
     def entry_has_hours(self) -> bool:
         """Whether the entry that the first training goes on from was trained for nearly the dataset's hours."""
-        return self._hours_of_entry() >= (1 - _NEARLY) * self.dataset.hours
+        return self._hours_of_entry() >= _NEARLY * self.dataset.hours
 
     def _hours_of_entry(self) -> float:
         entry = self.starting_entry
