@@ -31,11 +31,12 @@ COUNTS = {"train": 4, "valid": 1, "test": 2}
 REQUEST = SimulationRequest(TINY, COUNTS, 5)
 
 SCRIPT = """
-import json, sys
+import json, signal, sys
 from pathlib import Path
 from nmpm.data import simulation_workers
 from nmpm.data.generate import generate
 from nmpm.sim import preset_from_dict
+signal.signal(signal.SIGINT, signal.default_int_handler)  # where tests run in the background it is ignored
 simulation_workers.FRAMES_PER_PROCESS = 1
 print("once", flush=True)
 generate(preset_from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), json.loads(sys.argv[3]), seed=5, workers=2)
@@ -67,9 +68,21 @@ def worker(prepared):
     started.close()
 
 
-def script(folder: Path, preset: MpmPreset = TINY, **options) -> subprocess.Popen[str]:
-    words = [json.dumps(preset.to_dict()), str(folder), json.dumps(COUNTS)]
-    return subprocess.Popen([sys.executable, "-c", SCRIPT, *words], stdout=subprocess.PIPE, text=True, **options)
+@pytest.fixture
+def script():
+    """Starts a script that simulates into a folder; kills it at the end of the test, however that ends."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(folder: Path, preset: MpmPreset, **options) -> subprocess.Popen[str]:
+        words = [json.dumps(preset.to_dict()), str(folder), json.dumps(COUNTS)]
+        pipes = {"stdout": subprocess.PIPE, "text": True} | options
+        started.append(subprocess.Popen([sys.executable, "-c", SCRIPT, *words], **pipes))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
 def fingerprints(folder: Path) -> dict[str, str]:
@@ -204,7 +217,7 @@ def test_a_stopped_process_leaves_no_half_written_part(worker, prepared):
 
 
 @pytest.mark.parametrize("seconds", [0.0, 3.0], ids=["at the start", "while they simulate"])
-def test_processes_end_with_a_killed_parent_and_write_nothing_more(tmp_path, seconds):
+def test_processes_end_with_a_killed_parent_and_write_nothing_more(tmp_path, script, seconds):
     folder = tmp_path / "made"
     process = script(folder, ENDLESS)
     wait_for(lambda: running_for(folder), count=2)
@@ -216,7 +229,7 @@ def test_processes_end_with_a_killed_parent_and_write_nothing_more(tmp_path, sec
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of a group of processes")
-def test_ctrl_c_ends_all_processes_at_once(tmp_path):
+def test_ctrl_c_ends_all_processes_at_once(tmp_path, script):
     folder = tmp_path / "made"
     process = script(folder, ENDLESS, stderr=subprocess.PIPE, process_group=0)
     wait_for(lambda: running_for(folder), count=2)
