@@ -17,6 +17,7 @@ from timing import Spread, describe_machine, make_timing_parser, time_alternatin
 
 from nmpm.emulator import Emulator, rollout
 from nmpm.zoo import Pretrained, Zoo
+from nmpm.zoo.speed import repeat_scene, thrown_scene
 
 BUNDLES = 4
 """Calls of the network in each timed rollout."""
@@ -31,12 +32,12 @@ def make_forms(model: Pretrained, device: torch.device) -> dict[str, Emulator]:
 def time_model(name: str, batches: list[int], rounds: int, device: torch.device) -> dict[str, object]:
     """Print and return a model's times by runtime and batch."""
     model = Zoo.load(name, device=device)
-    one = model.example(count=model.fitting_count(int(model.card["particles"]))).to(device)
+    one = thrown_scene(model)
     count = one.position.shape[1]
     forms, figures = make_forms(model, device), {}
     frames = BUNDLES * model.emulator.frames
     for batch in batches:
-        state = one.map(lambda values, b=batch: values.expand(b, *values.shape[1:]).contiguous())  # type: ignore[misc]
+        state = repeat_scene(one, batch)
         runs = {form: partial(rollout, emulator, state, frames) for form, emulator in forms.items()}
         for form, seconds in time_alternating(runs, rounds).items():
             spread = Spread.of([value / frames / batch for value in seconds])

@@ -24,6 +24,11 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.stem[:STEM]}.{os.getpid()}.part{path.suffix}")
 
 
+def temporary_files(folder: Path, process: int | str = "*") -> Iterator[Path]:
+    """Files of a folder that a process, of this number or any, was writing when it was killed, or is writing."""
+    return folder.glob(f".*.{process}.part*")
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path`, of the same suffix, and renames it to `path` on success.

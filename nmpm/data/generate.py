@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from queue import SimpleQueue
 
-from nmpm._support.atomic import atomic_write
+from nmpm._support.atomic import atomic_write, temporary_files
 from nmpm._support.parallel import processor_count
 from nmpm._support.version import __version__
 from nmpm.data.folder_lock import lock_folder
@@ -155,7 +155,7 @@ def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
 
 def _remove_stale_files(folder: Path) -> None:
     """Removes files that killed processes left incomplete; the lock guarantees that no other process is writing."""
-    for stale in [*folder.glob(".*.part*"), *(folder / PARTS).glob(".*.part*")]:
+    for stale in [*temporary_files(folder), *temporary_files(folder / PARTS)]:
         stale.unlink(missing_ok=True)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmpm._support.atomic import atomic_write
+from nmpm._support.atomic import atomic_write, temporary_files
 from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
@@ -36,7 +36,7 @@ def write_part(path: Path, run: SimulatedTrajectory | Trajectory) -> None:
 
 def remove_unfinished_parts(folder: Path, process: int) -> None:
     """Deletes what a process that was killed left of the part that it was writing."""
-    for left in (folder / PARTS).glob(f".*.{process}.part*"):
+    for left in temporary_files(folder / PARTS, process):
         left.unlink(missing_ok=True)
 
 

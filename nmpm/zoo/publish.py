@@ -10,14 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
 from nmpm._support.atomic import atomic_folder
 from nmpm._support.digests import weights_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
-from nmpm.errors import DataError, ZooError
+from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.cards import readme, stress_digest
 from nmpm.zoo.charts import write_chart
@@ -73,21 +72,8 @@ def weights_of(checkpoint: Path) -> str:
     return hashlib.sha256(serialise(_rounded(checkpoint))).hexdigest()
 
 
-def round_checkpoint(checkpoint: Path, target: Path) -> None:
-    """Write a checkpoint whose weights are those that its entry has, so that what is measured of it holds for that."""
-    torch.save(_rounded_content(checkpoint), target)
-
-
-def is_rounded_copy(copy: Path, checkpoint: Path) -> bool:
-    """Whether a file has the weights that `round_checkpoint` writes; not if it is missing or damaged."""
-    try:
-        found = read_checkpoint(copy)["nmpm_digest"]
-    except (DataError, KeyError):
-        return False
-    return bool(found == _rounded_content(checkpoint)["nmpm_digest"])
-
-
-def _rounded_content(checkpoint: Path) -> dict[str, Any]:
+def rounded_checkpoint(checkpoint: Path) -> dict[str, Any]:
+    """The content of a checkpoint, with the weights that its entry has: what is measured of it holds for the entry."""
     content, rounded = read_checkpoint(checkpoint), _rounded(checkpoint).state_dict()
     content["state_dict"] |= {f"{_EMULATOR}{name}": value for name, value in rounded.items()}
     return content | {"nmpm_digest": weights_digest(content["state_dict"])}

@@ -34,11 +34,10 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
         `best_ms_per_frame` per scene; `memory_mb` and `best_memory_mb`, the peaks of one scene and of that batch beside
         the weights, in MB, None where nothing counts them.
     """
-    count = model.fitting_count(int(model.card.get("particles", PARTICLES)))
-    state = model.example(count=count).to(model.emulator.device)
-    times = {batch: _milliseconds(model, _repeated(state, batch)) / batch for batch in BATCHES}
+    state = thrown_scene(model)
+    times = {batch: _milliseconds(model, repeat_scene(state, batch)) / batch for batch in BATCHES}
     best = min(times, key=lambda batch: times[batch])
-    memory = {batch: _peak_memory(model, _repeated(state, batch)) for batch in (1, best)}
+    memory = {batch: _peak_memory(model, repeat_scene(state, batch)) for batch in (1, best)}
     return {
         "hardware": device_name(model.emulator.device),
         "particles": state.position.shape[1],
@@ -50,7 +49,13 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
     }
 
 
-def _repeated(state: Particles, batch: int) -> Particles:
+def thrown_scene(model: Pretrained) -> Particles:
+    """A thrown block of about as many particles as the test scenes have, as far as they fit, on the model's device."""
+    count = model.fitting_count(int(model.card.get("particles", PARTICLES)))
+    return model.example(count=count).to(model.emulator.device)
+
+
+def repeat_scene(state: Particles, batch: int) -> Particles:
     """One scene, batch times."""
     return state.map(lambda values: values.expand(batch, *values.shape[1:]).contiguous())
 

@@ -1,6 +1,5 @@
 import dataclasses
 import errno
-import hashlib
 import itertools
 import json
 import os
@@ -19,11 +18,8 @@ from nmpm.data.generate import generate
 from nmpm.data.seeds import seed_of_draw
 from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError, DataError, UnstableError
-from nmpm.sim import MpmPreset, load_preset
-
-GOOP = load_preset("goop")
-TINY = dataclasses.replace(GOOP, frames=30, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
-COUNTS = {"train": 4, "valid": 1, "test": 2}
+from nmpm.sim import MpmPreset
+from tests.data.tiny_goop import COUNTS, GOOP, TINY, fingerprints
 
 SIMULATE = """
 import json, sys
@@ -32,10 +28,6 @@ from nmpm.data.generate import generate
 from nmpm.sim import preset_from_dict
 generate(preset_from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), json.loads(sys.argv[3]), seed=5, workers=2)
 """
-
-
-def fingerprints(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
 
 
 def start_simulation(folder: Path, counts: dict[str, int]) -> subprocess.Popen[bytes]:

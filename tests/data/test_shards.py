@@ -1,7 +1,6 @@
 """A dataset in shards, as the tasks of a job array simulate it."""
 
 import dataclasses
-import hashlib
 import json
 import shutil
 import subprocess
@@ -15,11 +14,10 @@ from nmpm.data.format import Split
 from nmpm.data.generate import generate, generate_shard
 from nmpm.data.shard import Shard
 from nmpm.errors import ConfigError, DataError
-from nmpm.sim import load_preset
+from tests.data import tiny_goop
+from tests.data.tiny_goop import COUNTS, fingerprints
 
-GOOP = load_preset("goop")
-TINY = dataclasses.replace(GOOP, frames=10, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
-COUNTS = {"train": 4, "valid": 1, "test": 2}
+TINY = dataclasses.replace(tiny_goop.TINY, frames=10)
 
 SIMULATE = """
 import json, sys
@@ -31,10 +29,6 @@ preset, folder, counts, index, count = sys.argv[1:]
 shard = Shard(int(index), int(count))
 print(generate_shard(preset_from_dict(json.loads(preset)), Path(folder), json.loads(counts), shard, seed=5, workers=1))
 """
-
-
-def fingerprints(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
 
 
 def run_shard(folder: Path, index: int, count: int, seed: int = 5) -> int:

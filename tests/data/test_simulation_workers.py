@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-import hashlib
 import json
 import logging
 import os
@@ -21,13 +20,11 @@ from nmpm.data.parts import part_path, request_path
 from nmpm.data.simulation_request import SimulationRequest
 from nmpm.data.simulation_workers import ProcessWorker, ThreadWorker, started_workers
 from nmpm.errors import DataError, UnstableError
-from nmpm.sim import MpmPreset, load_preset
+from nmpm.sim import MpmPreset
+from tests.data.tiny_goop import COUNTS, TINY, fingerprints
 
-GOOP = load_preset("goop")
-TINY = dataclasses.replace(GOOP, frames=30, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
 ENDLESS = dataclasses.replace(TINY, frames=500_000)
 """A trajectory of it takes minutes."""
-COUNTS = {"train": 4, "valid": 1, "test": 2}
 REQUEST = SimulationRequest(TINY, COUNTS, 5)
 
 SCRIPT = """
@@ -49,16 +46,12 @@ def in_processes(monkeypatch) -> None:
     monkeypatch.setattr(simulation_workers, "FRAMES_PER_PROCESS", 1)
 
 
-def prepare(folder: Path, request: SimulationRequest) -> Path:
-    """A folder with the request of a dataset and no parts."""
-    request_path(folder).parent.mkdir()
-    request_path(folder).write_text(json.dumps(request.to_dict()))
-    return folder
-
-
 @pytest.fixture
 def prepared(tmp_path) -> Path:
-    return prepare(tmp_path, REQUEST)
+    """A folder with the request of a dataset and no parts."""
+    request_path(tmp_path).parent.mkdir()
+    request_path(tmp_path).write_text(json.dumps(REQUEST.to_dict()))
+    return tmp_path
 
 
 @pytest.fixture
@@ -83,10 +76,6 @@ def script():
     for process in started:
         process.kill()
         process.communicate()
-
-
-def fingerprints(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
 
 
 def running_for(folder: Path) -> list[int]:

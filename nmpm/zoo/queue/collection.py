@@ -6,18 +6,21 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import torch
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import join_hardware
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.simulation_request import SimulationRequest, same_trajectories
-from nmpm.errors import ZooError
+from nmpm.errors import DataError, ZooError
+from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import add_facts, refresh, write_index
 from nmpm.zoo.measures.simulator import measure_twin
-from nmpm.zoo.publish import is_rounded_copy, replace, round_checkpoint, weights_of
+from nmpm.zoo.publish import replace, rounded_checkpoint, weights_of
 from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset
 from nmpm.zoo.queue.training import Training
@@ -67,11 +70,11 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         error = report["test"]["mse"]
         if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
             return f"{name}: the entry is kept, as {reason}."
-        former, form = _card(zoo / name), _form(zoo / name)  # again, as the test takes minutes
+        former, recipe = _card(zoo / name), _recipe_text(zoo / name)  # again, as the test takes minutes
         dataset = history.dataset_of(history.trainings.index(best) + 1)
         replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
         card = read_card(zoo / name)
-        same_work = form == _form(zoo / name) and former.get("particles") == card.get("particles")
+        same_work = recipe == _recipe_text(zoo / name) and former.get("particles") == card.get("particles")
         if same_work and former.get("speed"):  # of other hardware too, and not measured beside other trainings
             add_facts(zoo / name, str(card["sha256"]), {"speed": former["speed"]})
         else:
@@ -87,8 +90,8 @@ def _card(entry: Path) -> dict[str, Any]:
     return read_card(entry) if (entry / CARD).is_file() else {}
 
 
-def _form(entry: Path) -> str:
-    """How the model of an entry is built, as text; empty where there is none."""
+def _recipe_text(entry: Path) -> str:
+    """The text of an entry's config.yaml, its model's recipe; empty where there is no entry."""
     path = entry / "config.yaml"
     return path.read_text(encoding="utf-8") if path.is_file() else ""
 
@@ -104,16 +107,25 @@ def _update(entry: Path, card: Mapping[str, Any], history: History) -> None:
 def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
     """The report of a test of the best weights, rounded as in their entry, in a folder; the former one of the same."""
     copy, merged = folder / BEST, folder / MERGED
-    if merged.is_file() and is_rounded_copy(copy, best.best):
+    content = rounded_checkpoint(best.best)
+    if merged.is_file() and _digest(copy) == content["nmpm_digest"]:
         report = _read(merged)
         if "particles" in report:  # else of an earlier version
             return report
     merged.unlink(missing_ok=True)
     with atomic_write(copy) as part:
-        round_checkpoint(best.best, part)
+        torch.save(content, part)
     if run(best.test_command(folder)):
         raise ZooError(f"The test of {copy} failed.")
     return _read(folder / "report.json")
+
+
+def _digest(checkpoint: Path) -> str | None:
+    """That of a checkpoint's weights; None where it is missing, damaged or states none."""
+    try:
+        return cast("str | None", read_checkpoint(checkpoint).get("nmpm_digest"))
+    except DataError:
+        return None
 
 
 def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
