@@ -82,7 +82,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | Non
         *_failure_lines(card),
         *_speed_lines(card),
         f"Trained for {training['steps']} steps in {training['seconds'] / 60:.1f} minutes on {training['hardware']}, "
-        f"{training['precision']}; {training['parameters']:,} parameters{_storage(card)}; one run.",
+        f"{training['precision']}; {training['parameters']:,} parameters{_storage(card)}; one run.{_last_round(card)}",
         "",
         *_constraint_lines(card),
         f"`nmpm stress`: {stress_line(card)}. `held` is with these constraints, `free` with the bounds alone.",
@@ -123,6 +123,16 @@ def _twin_lines(card: Mapping[str, Any]) -> list[str]:
         f"The simulator with {twin['substeps']} substeps a frame beside itself with {twin['own_substeps']}: {figures}.",
         "",
     ]
+
+
+def _last_round(card: Mapping[str, Any]) -> str:
+    """What the last round of training gained, which may have left the weights as they were."""
+    if not (stated := card.get("last_round")):
+        return ""
+    hours, gain = f"{stated['hours']:.1f} h", stated["gain"]
+    if gain <= 0:
+        return f" A further round of training, of {hours}, did not lower its validation error."
+    return f" The last round of training, of {hours}, lowered its validation error by {100 * gain:.2g}%."
 
 
 def _failure_lines(card: Mapping[str, Any]) -> list[str]:

@@ -496,6 +496,37 @@ def test_hours_of_the_entry_count_and_its_error_is_to_be_improved(tmp_path, seco
         assert history.hours_of(len(errors) + 1) == hours
 
 
+@pytest.mark.parametrize(("gain", "following"), [(0.05, 1), (0.02, None), (-0.1, None)])
+def test_an_entry_whose_last_round_gained_too_little_is_not_trained_again(tmp_path, gain, following):
+    entry = tmp_path / "zoo" / "small"
+    entry.mkdir(parents=True)
+    card = {"training": {"seconds": 7200}, "curve": [[900.0, 5, 0.2]], "last_round": {"hours": 1.0, "gain": gain}}
+    (entry / "card.yaml").write_text(yaml.safe_dump(card))
+    dataset, extension = Dataset("small", "goop.yaml", 2.0), Extension(hours=1.0, gain=0.03, limit=4.0)
+    assert History(dataset, tmp_path / "runs", extension, entry).next_round() == following
+    assert History(dataset, tmp_path / "runs", extension).next_round() == 1  # --fresh
+
+
+def test_the_card_states_what_a_further_round_gained_though_its_weights_stay(queue, capsys):
+    assert train(queue(1 / 3600)) == 0
+    runs, card = Path("runs/small"), Path("zoo/small/card.yaml")
+    shutil.rmtree(runs)
+    content = yaml.safe_load(card.read_text())
+    assert "last_round" not in content
+    content["curve"] = [[1.0, 1, 1e-12, 1e-12]]  # better than any
+    card.write_text(yaml.safe_dump(content))
+    path = queue(1 / 3600, hours=1 / 3600, gain=0.03, limit=9.0)
+    assert train(path) == 0
+    assert "the entry is kept" in capsys.readouterr().out
+    stated = yaml.safe_load(card.read_text())
+    assert stated["last_round"]["gain"] < 0
+    assert {key: value for key, value in stated.items() if key != "last_round"} == content
+    assert "did not lower its validation error" in Path("zoo/small/README.md").read_text()
+    shutil.rmtree(runs)
+    assert train(path) == 0  # a checkout without the trainings knows it from the card
+    assert not (runs / "1").exists()
+
+
 def test_planned_hours_read_the_card_of_the_entry_once(tmp_path, monkeypatch):
     entry = tmp_path / "small"
     entry.mkdir()

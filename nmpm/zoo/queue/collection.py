@@ -40,7 +40,8 @@ def collect(history: History, zoo: Path, run: Command) -> str:
     An entry that has these weights already keeps all that its card states; only goal and curve are written to it.
     An entry whose validation error is lower is kept, so that the test split chooses nothing; so is one that has more
     validations than a training whose few may be low by chance. Only for an entry whose card has no validation errors,
-    from before the queue, those of the test are compared.
+    from before the queue, those of the test are compared. In all cases the card then states what the last round of
+    training gained, so that the queue knows it without the trainings too.
 
     Args:
         history: Of the dataset.
@@ -53,36 +54,54 @@ def collect(history: History, zoo: Path, run: Command) -> str:
     Raises:
         ZooError: if the test fails.
     """
-    name, folder = history.dataset.name, history.folder / "collected"
+    entry, folder = zoo / history.dataset.name, history.folder / "collected"
     with lock_folder(folder):
         best = history.best()
         if best is None:
-            return f"{name}: nothing is validated yet."
-        former = _card(zoo / name)
-        if former and former.get("sha256") == weights_of(best.best):
-            _update(zoo / name, former, history)
-            write_index(zoo)
-            return f"{name}: its best weights are already in {zoo / name}."
-        report = _merged(_tested(best, folder, run), history)
-        for file in (MERGED, "report.json"):
-            with atomic_write(folder / file) as part:
-                part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        error = report["test"]["mse"]
-        if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
-            return f"{name}: the entry is kept, as {reason}."
-        former, recipe = _card(zoo / name), _recipe_text(zoo / name)  # again, as the test takes minutes
-        dataset = history.dataset_of(history.trainings.index(best) + 1)
-        replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
-        card = read_card(zoo / name)
-        same_work = recipe == _recipe_text(zoo / name) and former.get("particles") == card.get("particles")
-        if same_work and former.get("speed"):  # of other hardware too, and not measured beside other trainings
-            add_facts(zoo / name, str(card["sha256"]), {"speed": former["speed"]})
-        else:
-            refresh(zoo / name, ["speed"])
-        known = simulator_facts(former, card)
-        add_facts(zoo / name, str(card["sha256"]), _references(zoo / name, history, dataset, known))
+            return f"{history.dataset.name}: nothing is validated yet."
+        said = _collect_best(history, best, entry, zoo, run)
+        _state_last_round(history, best, entry)
         write_index(zoo)
-        return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {zoo / name}."
+    return said
+
+
+def _collect_best(history: History, best: Training, entry: Path, zoo: Path, run: Command) -> str:
+    """Make the entry of these weights, or leave it; what was done, in words."""
+    name, folder = history.dataset.name, history.folder / "collected"
+    former = _card(entry)
+    if former and former.get("sha256") == weights_of(best.best):
+        _update(entry, former, history)
+        return f"{name}: its best weights are already in {entry}."
+    report = _merged(_tested(best, folder, run), history)
+    for file in (MERGED, "report.json"):
+        with atomic_write(folder / file) as part:
+            part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    error = report["test"]["mse"]
+    if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
+        return f"{name}: the entry is kept, as {reason}."
+    former, recipe = _card(entry), _recipe_text(entry)  # again, as the test takes minutes
+    dataset = history.dataset_of(history.trainings.index(best) + 1)
+    replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
+    card = read_card(entry)
+    same_work = recipe == _recipe_text(entry) and former.get("particles") == card.get("particles")
+    if same_work and former.get("speed"):  # of other hardware too, and not measured beside other trainings
+        add_facts(entry, str(card["sha256"]), {"speed": former["speed"]})
+    else:
+        refresh(entry, ["speed"])
+    known = simulator_facts(former, card)
+    add_facts(entry, str(card["sha256"]), _references(entry, history, dataset, known))
+    return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {entry}."
+
+
+def _state_last_round(history: History, best: Training, entry: Path) -> None:
+    """Write to the entry's card what the last round of training gained, where the entry has the best weights so far."""
+    card, gain, start = _card(entry), history.last_gain(), history.starting_entry
+    own = {weights_of(best.best), *([] if start is None else [start.weights()])}
+    if gain is None or not math.isfinite(gain) or card.get("sha256") not in own:
+        return
+    facts = {"last_round": {"hours": round(history.trainings[-1].seconds() / 3600, 2), "gain": round(gain, 4)}}
+    if card.get("last_round") != facts["last_round"]:
+        add_facts(entry, str(card["sha256"]), facts)
 
 
 def _card(entry: Path) -> dict[str, Any]:

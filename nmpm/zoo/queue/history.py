@@ -74,11 +74,25 @@ class History:
 
     def stops(self) -> bool:
         """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
-        trainings, extension = self.trainings, self.extension
-        if not self._fits(len(trainings) + 1) or self.hours_of(len(trainings) + 1) <= 0:
+        following = len(self.trainings) + 1
+        if not self._fits(following) or self.hours_of(following) <= 0:
             return True
-        errors = lowest_errors(*(stage.curve() for stage in self.stages))
-        return bool(trainings) and len(errors) > 1 and errors[-1] > (1 - extension.gain) * min(errors[:-1])
+        gain = self.last_gain()
+        return gain is not None and gain < self.extension.gain
+
+    def last_gain(self) -> float | None:
+        """Share of the validation error by which the last training lowered what all before it had reached.
+
+        Before the first training that which the card of the entry states; None where nothing does, where the training
+        goes on, and where it is the first of all.
+        """
+        trainings, entry = self.trainings, self.starting_entry
+        if not trainings:
+            return None if entry is None else entry.last_gain()
+        *former, last = lowest_errors(*(stage.curve() for stage in self.stages))
+        if not trainings[-1].finished or not former:
+            return None
+        return 1 - last / min(former) if min(former) > 0 else 0.0
 
     def _fits(self, count: int) -> bool:
         """Whether the limit leaves nearly the hours of the last of so many trainings."""

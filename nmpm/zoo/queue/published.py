@@ -52,6 +52,15 @@ class Published:
         """Steps of training."""
         return int(self.card.get("training", {}).get("steps", 0))
 
+    def last_gain(self) -> float | None:
+        """Share of the validation error that its last round of training gained; None where its card states none."""
+        gain = self.card.get("last_round", {}).get("gain")
+        return None if gain is None else float(gain)
+
+    def weights(self) -> str:
+        """SHA-256 of its weights."""
+        return str(self.card.get("sha256", ""))
+
     def hardware(self) -> str:
         """What it was trained on."""
         return str(self.card.get("training", {}).get("hardware", ""))
