@@ -61,6 +61,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | Non
     """
     training, test = card["training"], card["test"]
     names = figure_names(test)
+    emd = ", exact earth mover's distance (`emd`) in domain length" if "emd" in names else ""
     lines = [
         f"# {card['name']}",
         "",
@@ -68,7 +69,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | Non
         "",
         *_lifecycle_lines(card),
         f"Test error ×10⁻³ of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
-        " length² (`mse`: over all frames), exact earth mover's distance (`emd`) in domain length.",
+        f" length² (`mse`: over all frames){emd}.",
         "",
         f"| predictor | {' | '.join(names)} |",
         f"|---|{'---:|' * len(names)}",

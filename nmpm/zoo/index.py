@@ -29,7 +29,7 @@ Pretrained models, one folder each: `card.yaml` (what it is and how good), `conf
 again, `nmpm zoo add RUN NAME` adds one and `python zoo/train.py` trains them all. `nmpm zoo refresh` writes this table.
 
 Errors are full-rollout MSE ×10⁻³ in domain length², over test scenes, with the 95% interval of their mean; beside them
-the goal of `queue.yaml` and the better of two trivial predictors, nothing moves and free fall. *At 100*: the error
+the goal of `queue.yaml`, a fixed target, and the better of two trivial predictors, nothing moves and free fall. *At 100*: the error
 over the first 100 frames. *Twins*: the error divided by that of the simulator's *twin*, its own result with other time
 steps (mostly half as many): at 1, a model is as accurate as the data themselves. Milliseconds are per frame of one
 scene. `docs/concepts.md` explains the terms.
