@@ -115,7 +115,7 @@ def check_options(chosen: argparse.Namespace) -> None:
 
 def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
     """Train until no dataset is left that this process could take."""
-    failed: set[str] = set()
+    failed = collect_ended(plan, chosen)
     while True:
         done = False
         for history, number in ready(plan, chosen, failed):
@@ -132,6 +132,21 @@ def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
             left_out = "".join(f" {text}." for text in waits(plan, chosen))
             say(f"nothing is left to take.{left_out} {remaining(plan, chosen)} Failed: {names}.")
             return 1 if failed else 0
+
+
+def collect_ended(plan: Plan, chosen: argparse.Namespace) -> set[str]:
+    """Collect trainings that have ended where a former process died or failed before; the datasets where this fails."""
+    from nmpm.zoo.queue.collection import is_collected
+
+    failed = set()
+    for history in histories(plan, chosen):
+        ended = history.dataset.publish and history.trainings and history.trainings[-1].finished
+        if not ended or is_collected(history):
+            continue
+        with taken(history.folder) as mine:
+            if mine and collect_entry(history, chosen.zoo):
+                failed.add(history.dataset.name)
+    return failed
 
 
 def ready(plan: Plan, chosen: argparse.Namespace, failed: set[str]) -> Iterator[tuple[History, int]]:
@@ -151,15 +166,15 @@ def train(history: History, number: int, chosen: argparse.Namespace) -> bool:
     try:
         simulate(history.dataset_of(number), chosen.threads)
         status = fit(history.open(number), chosen.device)
+        if status == 130:
+            raise KeyboardInterrupt
+        return status == 0 and collect_entry(history, chosen.zoo) == 0
     except NmpmError as error:
         say(f"{history.dataset.name}: {error}")
         return False
     except Exception:
         say(f"{history.dataset.name}: {traceback.format_exc()}")
         return False
-    if status == 130:
-        raise KeyboardInterrupt
-    return status == 0 and collect_entry(history, chosen.zoo) == 0
 
 
 def fit(training: Training, device: str) -> int:

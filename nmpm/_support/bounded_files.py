@@ -16,6 +16,7 @@ from nmpm._support.regular_files import check_mode
 from nmpm.errors import DataError
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_CONTROL = re.compile(r"[^\n\r\t\x20-\x7e\xa0-\U0010ffff]")
 _NUMBER = re.compile(r"[-+0-9_.:eE]+")
 
 
@@ -45,7 +46,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
     Raises:
         DataError: if the file cannot be read or is too large, too deep or not YAML, uses anchors, aliases or tags, or
-            holds other values, such as dates.
+            holds other values, such as dates, or control characters.
     """
     content = read_bounded(path, TEXT_BYTES)
     try:
@@ -86,9 +87,13 @@ def _check_plain(value: Any, path: Path) -> None:
         for key, item in value.items():
             if not isinstance(key, str):
                 raise DataError(f"{path} cannot be read: its key {one_line(repr(key), 60)} is not a string; quote it.")
+            _check_plain(key, path)
             _check_plain(item, path)
     elif isinstance(value, list):
         for item in value:
             _check_plain(item, path)
-    elif value is not None and not isinstance(value, str | int | float):
+    elif isinstance(value, str):
+        if _CONTROL.search(value):  # in a card they would reach the terminal of whoever prints it
+            raise DataError(f"{path} cannot be read: {one_line(repr(value), 60)} has a control character.")
+    elif value is not None and not isinstance(value, int | float):
         raise DataError(f"{path} cannot be read: it holds the {type(value).__name__} {one_line(value, 60)}; quote it.")

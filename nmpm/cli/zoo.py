@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from nmpm._support.messages import one_line
 from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import add_device_option, check_device
 
@@ -117,7 +118,7 @@ def _summary(card: Mapping[str, Any]) -> str:
     test = card.get("test")
     mse = test.get("mse") if isinstance(test, Mapping) else None
     error = f"{1e3 * mse:.3g} ×10⁻³" if isinstance(mse, int | float) else "not measured"
-    return f"full-rollout MSE {error}   {card.get('dataset', 'data not stated')}"
+    return f"full-rollout MSE {error}   {one_line(card.get('dataset', 'data not stated'))}"
 
 
 def _card(chosen: argparse.Namespace) -> None:
@@ -171,7 +172,7 @@ def _verify(chosen: argparse.Namespace) -> int:
 
     _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
     check_device(chosen.device)
-    failed = 0
+    failed, left_out = 0, []
     for name in Zoo.list(chosen.root) if chosen.name is None else [chosen.name]:
         sys.stdout.write(f"{name}\n")
         try:
@@ -182,12 +183,14 @@ def _verify(chosen: argparse.Namespace) -> int:
             if chosen.name is not None:
                 raise
             sys.stdout.write(f"  not verified: {error}\n")
+            left_out.append(name)
         except NmpmError as error:
             if chosen.name is not None:
                 raise
             sys.stdout.write(f"  FAIL  {error}\n")
             failed += 1
-    sys.stdout.write(f"{failed} figures are not confirmed.\n" if failed else "All that was measured is confirmed.\n")
+    sys.stdout.write(f"{failed} figures are not confirmed." if failed else "All that was measured is confirmed.")
+    sys.stdout.write(f" Not verified: {', '.join(left_out)}.\n" if left_out else "\n")
     return 1 if failed else 0
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
 from nmpm._support.devices import same_hardware
+from nmpm._support.numbers import is_finite
 from nmpm.errors import ConfigError, ZooError
 
 
@@ -32,7 +32,7 @@ class Limits:
     def __post_init__(self) -> None:
         for name in ("max_mse", "max_ms_per_frame"):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, Real) and float(value) > 0):
+            if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not float(value) > 0):
                 raise ConfigError(f"{name} = {value!r} must be a positive number, or be left out.")
 
     def __bool__(self) -> bool:
@@ -87,14 +87,14 @@ def _stated_times(card: Mapping[str, Any]) -> list[tuple[str, float]]:
     entries = card.get("speed")
     found = [entry for entry in entries if isinstance(entry, Mapping)] if isinstance(entries, list) else []
     times = [(str(entry.get("hardware")), entry.get("ms_per_frame")) for entry in found]
-    return [(name, float(time)) for name, time in times if isinstance(time, int | float)]
+    return [(name, float(time)) for name, time in times if is_finite(time) and time > 0]
 
 
 def _stated_mse(card: Mapping[str, Any]) -> float | None:
     """The full-rollout error that a card states; None where it states none that is finite."""
     test = card.get("test")
     mse = test.get("mse") if isinstance(test, Mapping) else None
-    return float(mse) if isinstance(mse, int | float) and math.isfinite(mse) else None
+    return float(mse) if is_finite(mse) else None
 
 
 def _measured(cards: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:

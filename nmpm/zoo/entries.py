@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +45,24 @@ def read_card(folder: Path) -> dict[str, Any]:
             " --upgrade nmpm."
         )
     return card
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Lets one process at a time write to the entries of a zoo; the lock is that of the zoo's folder itself.
+
+    Args:
+        folder: Of an entry. A variant's lies within that of its dataset, which may be replaced.
+    """
+    zoo = folder.resolve().parent
+    zoo = zoo.parent if (zoo / CARD).is_file() else zoo
+    zoo.mkdir(parents=True, exist_ok=True)
+    handle = os.open(zoo, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def load_entry(folder: Path) -> Pretrained:

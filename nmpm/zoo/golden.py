@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, rollout
-from nmpm.errors import ZooError
+from nmpm.errors import ConfigError, ZooError
 from nmpm.zoo.pretrained import Pretrained
 
 FRAMES = 32
@@ -44,7 +44,7 @@ def golden_distance(model: Pretrained, golden: Mapping[str, Any]) -> float:
     try:
         seed, count, frames = (int(golden[key]) for key in ("seed", "count", "frames"))
         stated = torch.tensor(golden["position"], dtype=torch.float64)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         reason = one_line(repr(error))
         raise ZooError(f"{model.name}: the golden rollout of its card cannot be read: {reason}.") from error
     if stated.shape != (PROBES, model.scene.dim) or seed < 0 or count < 1 or not 1 <= frames <= FRAMES:
@@ -53,7 +53,11 @@ def golden_distance(model: Pretrained, golden: Mapping[str, Any]) -> float:
             f" {PROBES} positions in {model.scene.dim} dimensions."
         )
     spacing = torch.tensor(model.emulator.grid.spacing, dtype=torch.float64)
-    return float(((_positions(model.emulator, seed, count, frames) - stated) / spacing).norm(dim=-1).max())
+    try:
+        found = _positions(model.emulator, seed, count, frames)
+    except ConfigError as error:  # such as more particles than fit
+        raise ZooError(f"{model.name}: the golden rollout of its card cannot be repeated: {error}") from error
+    return float(((found - stated) / spacing).norm(dim=-1).max())
 
 
 def _positions(emulator: Emulator, seed: int, count: int, frames: int) -> Tensor:

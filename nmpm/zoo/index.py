@@ -14,7 +14,7 @@ from nmpm._support.messages import one_line
 from nmpm.errors import ZooError
 from nmpm.zoo.cards import MALFORMED, intervals, readme, twin_ratio
 from nmpm.zoo.charts import CHART, draw_chart, save_chart
-from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.entries import CARD, load_entry, read_card, writing
 from nmpm.zoo.golden import golden_rollout
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
 from nmpm.zoo.measures import MEASURES
@@ -29,10 +29,10 @@ Pretrained models, one folder each: `card.yaml` (what it is and how good), `conf
 again, `nmpm zoo add RUN NAME` adds one and `python zoo/train.py` trains them all. `nmpm zoo refresh` writes this table.
 
 Errors are full-rollout MSE ×10⁻³ in domain length², over test scenes, with the 95% interval of their mean; beside them
-the goal of `queue.yaml`, a fixed target, and the better of two trivial predictors, nothing moves and free fall. *At 100*: the error
-over the first 100 frames. *Twins*: the error divided by that of the simulator's *twin*, its own result with other time
-steps (mostly half as many): at 1, a model is as accurate as the data themselves. Milliseconds are per frame of one
-scene. `docs/concepts.md` explains the terms.
+the goal of `queue.yaml`, a fixed target, and the better of two trivial predictors, nothing moves and free fall. *At
+100*: the error over the first 100 frames. *Twins*: the error divided by that of the simulator's *twin*, its own result
+with other time steps (mostly half as many): at 1, a model is as accurate as the data themselves. Milliseconds are per
+frame of one scene. `docs/concepts.md` explains the terms.
 """
 COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "trivial", "trained", "ms per frame")
 
@@ -86,12 +86,13 @@ def refresh(
     model = load_entry(folder)
     weights = str(model.card["sha256"])
     golden = {} if "golden" in model.card else {"golden": golden_rollout(model.emulator)}
-    card = read_card_of(folder, weights, "the golden rollout")
-    card = {"format": CARD_FORMAT} | card | {"lifecycle": lifecycle(card)} | golden
-    if failures is not None:
-        card.pop("failures", None)
-        card |= {"failures": " ".join(failures.split())} if failures.strip() else {}
-    write_card(folder, card)
+    with writing(folder):
+        card = read_card_of(folder, weights, "the golden rollout")
+        card = {"format": CARD_FORMAT} | card | {"lifecycle": lifecycle(card)} | golden
+        if failures is not None:
+            card.pop("failures", None)
+            card |= {"failures": " ".join(failures.split())} if failures.strip() else {}
+        write_card(folder, card)
     for name in measures:
         measured = model.to(device) if name == "speed" else model
         add_facts(folder, weights, MEASURES[name](measured, folder, data))
@@ -108,7 +109,8 @@ def add_facts(folder: Path, weights: str, facts: Mapping[str, Any]) -> None:
     Raises:
         ZooError: if the entry has other weights by now.
     """
-    write_card(folder, {**read_card_of(folder, weights, ", ".join(facts)), **facts})
+    with writing(folder):
+        write_card(folder, {**read_card_of(folder, weights, ", ".join(facts)), **facts})
 
 
 def read_card_of(folder: Path, weights: str, measured: str) -> dict[str, Any]:

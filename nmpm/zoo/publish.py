@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.cards import readme, stress_digest
 from nmpm.zoo.charts import write_chart
-from nmpm.zoo.entries import CARD
+from nmpm.zoo.entries import CARD, writing
 from nmpm.zoo.golden import golden_rollout
 from nmpm.zoo.index import write_index
 from nmpm.zoo.lifecycle import CARD_FORMAT, lifecycle
@@ -32,6 +32,7 @@ STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
 """Files of `nmpm stress --report`, with and without constraints, by the key of the card."""
 COPIED = ("rollout.png", "errors.csv")
 """Files of a run that its entry keeps."""
+Keep = Callable[[Mapping[str, Any], str], Mapping[str, Any]]
 _EMULATOR = "emulator."
 """Before the names of the emulator's weights in a checkpoint."""
 
@@ -59,10 +60,18 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
     return target
 
 
-def replace(run: Path, name: str, root: Path, about: str = "") -> Path:
-    """Like `add`, in place of the entry `root/name` where there is one."""
+def replace(run: Path, name: str, root: Path, about: str = "", keep: Keep | None = None) -> Path:
+    """Like `add`, in place of the entry `root/name` where there is one.
+
+    Args:
+        run: As for `add`.
+        name: Of the entry.
+        root: The zoo's folder.
+        about: As for `add`.
+        keep: Given the new card and the text of its config.yaml, what that takes over from the former entry's card.
+    """
     target = _writable_zoo(root) / check_name(name)
-    _publish(run, name, target, about)
+    _publish(run, name, target, about, keep)
     write_index(root)
     return target
 
@@ -79,29 +88,40 @@ def rounded_checkpoint(checkpoint: Path) -> dict[str, Any]:
     return content | {"nmpm_digest": weights_digest(content["state_dict"])}
 
 
+def _digest(checkpoint: Path) -> str:
+    """That of a checkpoint's weights, as reports of its test state it."""
+    return weights_digest(read_checkpoint(checkpoint)["state_dict"])
+
+
 def _rounded(checkpoint: Path) -> Emulator:
     """The emulator of a checkpoint as its entry stores it."""
     return round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
 
 
-def _publish(run: Path, name: str, target: Path, about: str) -> None:
+def _publish(run: Path, name: str, target: Path, about: str, keep: Keep | None = None) -> None:
     checkpoint, report = run / BEST, run / "report.json"
     for needed in (checkpoint, report):
         if not needed.is_file():
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
+    figures = _read_json(report)
+    if figures.get("weights", digest := _digest(checkpoint)) != digest:
+        raise ZooError(f"{report} is of other weights than {checkpoint}: test these by `nmpm test --ckpt_path best`.")
     emulator = _rounded(checkpoint)
     weights = serialise(emulator)
     files = [path for path in (run / file for file in COPIED) if path.is_file()]
     try:
-        card = _card(name, about, _read_json(report), emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
+        card = _card(name, about, figures, emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
         present = {key: run / file for key, file in STRESS_REPORTS.items() if (run / file).is_file()}
         card |= {key: stress_digest(_read_json(path)) for key, path in present.items()}
-        text = readme(card, [path.name for path in files])
+        readme(card, ())
     except (KeyError, TypeError) as error:
         raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
-    texts = {"config.yaml": _yaml(emulator.recipe.to_dict()), "card.yaml": _yaml(card), "README.md": text}
+    recipe = _yaml(emulator.recipe.to_dict())
     try:
-        _write(target, weights, texts, files)
+        with writing(target):
+            card |= {} if keep is None else keep(card, recipe)
+            text = readme(card, [path.name for path in files])
+            _write(target, weights, {"config.yaml": recipe, "card.yaml": _yaml(card), "README.md": text}, files)
     except OSError as error:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader, SplitRecordings
 from nmpm.data.progress import progress_bar
-from nmpm.data.simulation_request import SimulationRequest
+from nmpm.data.simulation_request import SimulationRequest, same_trajectories
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
@@ -25,13 +25,15 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
     """The test scenes in the order of the card, one at a time, with so many frames to predict; all where None.
 
     Raises:
-        ConfigError: if they cannot be had: recorded data without `data`, or simulated by another revision.
+        ConfigError: if they cannot be had: recorded data without `data`, simulated by another revision, or `data` with
+            other test scenes than the card's.
         DataError: if the data cannot be read.
     """
     if data is not None:
         paths, metadata = split_paths(data), read_metadata(data, "deepmind")
         if "test" not in paths:
             raise ConfigError(f"{data} has no test.h5.")
+        _check_same_scenes(model, metadata.extra.get("simulation"), data)
         for window in EvaluationLoader(SplitRecordings(Split(paths["test"]), metadata, model.scene), 1):
             yield window if frames is None else dataclasses.replace(window, frames=window.frames[:, : frames + 2])
         return
@@ -47,7 +49,7 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
 
 def track_test_scenes(what: str, model: Pretrained, data: Path | None) -> Iterator[Window]:
     """All of `iterate_test_scenes` whole, with a progress bar that says what is done with them."""
-    with progress_bar(f"{what} of {model.name}", len(model.card["per_trajectory"])) as advance:
+    with progress_bar(f"{what} of {model.name}", _count(model)) as advance:
         for window in iterate_test_scenes(model, None, data):
             yield window
             advance()
@@ -72,8 +74,37 @@ def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
     if model.preset not in preset_names():
         raise ConfigError(f"{model.name} was tested on recorded data ({model.card.get('dataset')}): give their folder.")
     preset = load_preset(str(model.preset))
-    count = len(model.card["per_trajectory"])
-    return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": count})
+    return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": _count(model)})
+
+
+def _count(model: Pretrained) -> int:
+    """Number of test scenes that a model's card has errors of.
+
+    Raises:
+        ZooError: if it has none.
+    """
+    rows = model.card.get("per_trajectory")
+    if not isinstance(rows, list) or not rows:
+        raise ZooError(f"{model.name}: its card states no errors of single test scenes (per_trajectory).")
+    return len(rows)
+
+
+def _check_same_scenes(model: Pretrained, found: object, data: Path) -> None:
+    """Compare how a folder's data were simulated with what a model's card states; recorded data have neither.
+
+    Raises:
+        ConfigError: if the test scenes differ.
+    """
+    stated = model.card.get("simulation")
+    if not isinstance(stated, Mapping):
+        return
+    counts = [request.get("counts") if isinstance(request, Mapping) else None for request in (stated, found)]
+    tests = [count.get("test") if isinstance(count, Mapping) else None for count in counts]
+    if not isinstance(found, Mapping) or not same_trajectories(stated, found) or tests[0] != tests[1]:
+        raise ConfigError(
+            f"{data} has other test scenes than the card of {model.name} is of: other scenes, seeds, revision of the"
+            " simulator or number. Without a folder they are simulated."
+        )
 
 
 def _stated_simulation(model: Pretrained, stated: Any) -> tuple[Preset, SimulationRequest]:

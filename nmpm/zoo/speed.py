@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from nmpm._support.devices import device_name, same_hardware
+from nmpm._support.messages import one_line
 from nmpm.emulator import rollout
+from nmpm.errors import ZooError
 from nmpm.evaluation.machine import peak_bytes, wall_clock
 from nmpm.particles import Particles
+from nmpm.zoo.entries import read_card
 from nmpm.zoo.pretrained import Pretrained
 
 BATCHES = (1, 4, 16)
@@ -19,9 +22,9 @@ PARTICLES = 1000
 
 
 def speed_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
-    """The key `speed` of a card: what `measure_speed` finds, beside what is known of other hardware."""
+    """The key `speed` of a card: what `measure_speed` finds, beside what the card knows of other hardware by then."""
     found = measure_speed(model)
-    known = model.card.get("speed", [])
+    known = read_card(folder).get("speed") or []
     others = [entry for entry in known if not same_hardware(entry["hardware"], found["hardware"])]
     return {"speed": [*others, found]}
 
@@ -51,7 +54,10 @@ def measure_speed(model: Pretrained) -> dict[str, Any]:
 
 def thrown_scene(model: Pretrained) -> Particles:
     """A thrown block of about as many particles as the test scenes have, as far as they fit, on the model's device."""
-    count = model.fitting_count(int(model.card.get("particles", PARTICLES)))
+    stated = model.card.get("particles", PARTICLES)
+    if not isinstance(stated, int) or isinstance(stated, bool) or stated < 1:
+        raise ZooError(f"{model.name}: particles of its card should be their number, not {one_line(repr(stated), 60)}.")
+    count = model.fitting_count(stated)
     return model.example(count=count).to(model.emulator.device)
 
 

@@ -1,4 +1,4 @@
-"""States from plain arrays in the units of the data, with checks for the mistakes that would silently give a wrong rollout."""
+"""States from plain arrays in the data's units, checked for the mistakes that would silently give a wrong rollout."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nmpm._support.atomic import atomic_folder
 from nmpm.emulator import Emulator
-from nmpm.zoo.entries import load_entry
+from nmpm.zoo.entries import load_entry, writing
 from nmpm.zoo.golden import golden_distance, golden_rollout
 from nmpm.zoo.index import read_card_of, write_card
 from nmpm.zoo.pretrained import Pretrained
@@ -71,7 +71,7 @@ def halve(folder: Path) -> bool:
     weights = serialise(half)
     if half is emulator or weights == (folder / WEIGHTS).read_bytes():
         return False
-    with atomic_folder(folder) as new:
+    with writing(folder), atomic_folder(folder) as new:
         shutil.copytree(folder, new, dirs_exist_ok=True)
         (new / WEIGHTS).write_bytes(weights)
         facts = {

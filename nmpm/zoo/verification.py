@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmpm.errors import ConfigError, ZooError
+from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
 from nmpm.particles import Window
@@ -67,7 +67,7 @@ def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> I
         data: Folder of recorded data that the model was tested on; simulated scenes need none.
 
     Raises:
-        ConfigError: if the test scenes cannot be had: recorded data without `data`, or a card that states no errors.
+        ConfigError: if the test scenes cannot be had: recorded data without `data`.
         DataError: if the data cannot be read.
         ZooError: if the card is malformed, or states nothing of the test scenes that can be measured.
     """
@@ -89,12 +89,11 @@ def _stated_rows(model: Pretrained) -> Rows:
     """The errors of single test scenes that a model's card states.
 
     Raises:
-        ConfigError: if it states none.
-        ZooError: if they are not figures by their names.
+        ZooError: if it states none, or they are not figures by their names.
     """
     rows = model.card.get("per_trajectory")
     if not rows:
-        raise ConfigError(f"{model.name}: its card states no errors of single test scenes.")
+        raise ZooError(f"{model.name}: its card states no errors of single test scenes (per_trajectory).")
     if not isinstance(rows, list) or not all(row and _is_figures(row) for row in rows):
         raise ZooError(f"{model.name}: per_trajectory of its card should list the figures of each test scene by name.")
     return rows

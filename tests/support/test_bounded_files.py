@@ -29,6 +29,8 @@ def test_plain_data_are_read(tmp_path):
         ("a: 2026-11-21\n", "holds the date 2026-11-21; quote it"),
         ("a: 2026-13-45\n", "cannot be read"),
         ("1: a\n", "its key 1 is not a string"),
+        ('a: "b\\e]0;c\\a"\n', "has a control character"),
+        ('"a\\x9b": 1\n', "has a control character"),
         ("- a\n", "should hold keys and values"),
         ("", "should hold keys and values"),
         ("a: 1\n---\nb: 1\n", "cannot be read"),
@@ -49,6 +51,11 @@ def test_other_yaml_is_refused_at_once(tmp_path, monkeypatch, text, message, c_l
         read_yaml(path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value).replace(str(tmp_path), "")) < 300
+
+
+def test_text_keeps_its_lines_and_characters(tmp_path):
+    (tmp_path / "a.yaml").write_text('a: "line\\nline\\t×10⁻³ \\U0001F4A1"\n')
+    assert read_yaml(tmp_path / "a.yaml") == {"a": "line\nline\t×10⁻³ \U0001f4a1"}
 
 
 def test_large_files_are_not_read(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 import torch
 import yaml
 
+from nmpm._support.digests import weights_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder
 from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
@@ -91,6 +92,17 @@ def test_names_that_are_taken_and_folders_that_cannot_be_written(run, tmp_path):
     with pytest.raises(ZooError, match="cannot be written"):
         add(run, "mine", tmp_path / "file")
     assert sorted(path.name for path in shipped_folder("zoo").glob(".*")) == []
+
+
+def test_a_report_of_other_weights_is_refused(run, small):
+    path = run / "report.json"
+    report = json.loads(path.read_text())
+    module = EmulatorModule.of(small, unroll=2)
+    path.write_text(json.dumps(report | {"weights": weights_digest(module.state_dict())}))
+    add(run, "mine")
+    path.write_text(json.dumps(report | {"weights": "of others"}))
+    with pytest.raises(ZooError, match=r"report.json is of other weights than .*best.ckpt: test these"):
+        add(run, "others")
 
 
 @pytest.mark.parametrize("write", [add, replace])

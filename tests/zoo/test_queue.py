@@ -216,7 +216,7 @@ def test_mistakes_in_a_queue_are_named(queue, tmp_path):
         ({"datasets": [dict(content["datasets"][0]) | {"options": {}} for _ in range(2)]}, "small: occurs twice"),
         ({"dataset": []}, "dataset: unknown key"),
         ({"datasets": [{"name": "small"}]}, "config"),
-        ({"datasets": [content["datasets"][0] | {"hours": 0}]}, "hours = 0 must be positive"),
+        ({"datasets": [content["datasets"][0] | {"hours": 0}]}, "hours = 0 must be a positive number"),
         ({"datasets": [content["datasets"][0] | {"start": "lava"}]}, "small: start = lava is no other dataset"),
         ({"datasets": [content["datasets"][0] | {"start": "small"}]}, "small: start = small is no other dataset"),
     ):
@@ -249,7 +249,7 @@ def test_what_left_out_datasets_wait_for_is_said(queue, tmp_path, capsys):
     entries = [
         {"name": "recorded", "config": "waterdrop.yaml", "hours": 1},
         {"name": "later", "config": "goop.yaml", "hours": 1, "start": "recorded"},
-        {"name": "done", "config": "goop.yaml", "hours": 0.5},
+        {"name": "done", "config": "goop.yaml", "hours": 0.5, "publish": False},
     ]
     path.write_text(yaml.safe_dump({"extension": {"hours": 0.5, "limit": 0.5}, "datasets": entries}))
     finished(Path("runs/done"), 0.5)
@@ -359,9 +359,12 @@ def test_an_entry_that_is_replaced_while_the_simulator_is_measured_keeps_its_car
     def replace_meanwhile(entry, *_):
         card = yaml.safe_load((entry / "card.yaml").read_text())
         (entry / "card.yaml").write_text(yaml.safe_dump(card | {"sha256": "of others"}))
-        return {"twin": {"mse": 0.1}}
+        return {"mse": 0.1}
 
-    monkeypatch.setattr(collection, "_references", replace_meanwhile)
+    monkeypatch.setattr(collection, "_twin", replace_meanwhile)
+    monkeypatch.setattr(Dataset, "generation", lambda _: ("small", {}))
+    monkeypatch.setattr(collection, "describe_data", lambda *_: "")
+    monkeypatch.setattr("nmpm.data.catalog.ensure", lambda *_, **__: Path())
     assert train(queue(1 / 3600)) == 1
     assert "its weights were replaced" in capsys.readouterr().out
     assert "twin" not in Zoo.card("small", "zoo")
@@ -496,15 +499,146 @@ def test_hours_of_the_entry_count_and_its_error_is_to_be_improved(tmp_path, seco
         assert history.hours_of(len(errors) + 1) == hours
 
 
-@pytest.mark.parametrize(("gain", "following"), [(0.05, 1), (0.02, None), (-0.1, None)])
-def test_an_entry_whose_last_round_gained_too_little_is_not_trained_again(tmp_path, gain, following):
+def last_round(**stated) -> dict:
+    """A card of a model that was trained for two hours."""
+    stated = {"hours": 1.0, "gain": 0.02, "options": {}} | stated
+    return {"training": {"seconds": 7200}, "curve": [[900.0, 5, 0.2]], "last_round": stated}
+
+
+@pytest.mark.parametrize(
+    ("stated", "hours", "following"),
+    [
+        ({"gain": 0.05}, 2.0, 1),
+        ({"gain": 0.02}, 2.0, None),
+        ({"gain": -0.1}, 2.0, None),
+        ({"gain": 0.02, "options": {"model.mirror": [0]}}, 2.0, 1),  # a round of another kind
+        ({"gain": 0.02}, 3.0, 1),  # the first hours are not over
+    ],
+    ids=str,
+)
+def test_an_entry_whose_last_round_gained_too_little_is_not_trained_again(tmp_path, stated, hours, following):
     entry = tmp_path / "zoo" / "small"
     entry.mkdir(parents=True)
-    card = {"training": {"seconds": 7200}, "curve": [[900.0, 5, 0.2]], "last_round": {"hours": 1.0, "gain": gain}}
-    (entry / "card.yaml").write_text(yaml.safe_dump(card))
-    dataset, extension = Dataset("small", "goop.yaml", 2.0), Extension(hours=1.0, gain=0.03, limit=4.0)
+    (entry / "card.yaml").write_text(yaml.safe_dump(last_round(**stated)))
+    dataset = Dataset("small", "goop.yaml", hours, options={"data.path": "anywhere"})
+    extension = Extension(hours=1.0, gain=0.03, limit=4.0)
     assert History(dataset, tmp_path / "runs", extension, entry).next_round() == following
     assert History(dataset, tmp_path / "runs", extension).next_round() == 1  # --fresh
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"last_round": [1]}, "last_round"),
+        ({"last_round": {"hours": 1.0, "gain": "much"}}, "last_round"),
+        ({"last_round": {"hours": 1.0, "gain": float("nan")}}, "last_round"),
+        ({"training": {"seconds": "long"}}, "training"),
+        ({"training": 5}, "training"),
+        ({"curve": [1, 2]}, "curve"),
+    ],
+    ids=str,
+)
+def test_a_malformed_card_is_named(queue, tmp_path, capsys, change, key):
+    (tmp_path / "zoo" / "small").mkdir(parents=True)
+    (tmp_path / "zoo" / "small" / "card.yaml").write_text(yaml.safe_dump(last_round() | change))
+    assert train(queue(1.0), "--status") == 1
+    assert f"small/card.yaml: {key} should be" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("value", ["last_round", "training"])
+def test_what_a_card_leaves_empty_counts_as_not_stated(tmp_path, value):
+    (tmp_path / "small").mkdir()
+    (tmp_path / "small" / "card.yaml").write_text(yaml.safe_dump(last_round() | {value: None}))
+    history = History(Dataset("small", "goop.yaml", 2.0), tmp_path / "runs", Extension(), tmp_path / "small")
+    assert history.next_round() == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"gain": 3}, "is a share"),
+        ({"gain": float("nan")}, "gain = nan"),
+        ({"rate": 0}, "rate = 0"),
+        ({"hours": -1}, "hours = -1"),
+        ({"limit": "5"}, "limit = '5'"),
+    ],
+    ids=str,
+)
+def test_values_of_an_extension_are_checked(values, message):
+    with pytest.raises(ConfigError, match=message):
+        Extension(**values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"hours": float("nan")}, "hours = nan"),
+        ({"goal": float("inf")}, "goal = inf"),
+        ({"publish": "no"}, "publish = 'no'"),
+        ({"options": None}, "options must be keys"),
+        ({"extend": []}, "extend must be keys"),
+    ],
+    ids=str,
+)
+def test_values_of_a_dataset_are_checked(values, message):
+    with pytest.raises(ConfigError, match=message):
+        Dataset(**{"name": "small", "config": "goop.yaml", "hours": 1.0} | values)
+
+
+def test_a_variant_starts_from_the_training_of_its_dataset(tmp_path):
+    finished(tmp_path / "goop", 0.5)
+    history = History(Dataset("goop/fast", "goop.yaml", 0.5, start="goop"), tmp_path / "goop" / "fast", Extension())
+    assert not history.waits_for()
+
+
+def test_a_copy_of_an_entry_that_no_training_started_from_is_not_taken(tmp_path):
+    folder, entry = tmp_path / "runs", tmp_path / "zoo"
+    for place in (folder / "published", entry):
+        place.mkdir(parents=True)
+        (place / "card.yaml").write_text(yaml.safe_dump(last_round()))
+    dataset = Dataset("small", "goop.yaml", 2.0)
+    fresh = History(dataset, folder, Extension())
+    assert fresh.starting_entry is None
+    assert fresh.hours_of(1) == 2.0
+    assert History(dataset, folder, Extension(), entry).starting_entry.folder == entry
+    fresh.open(1)
+    assert fresh.starting_entry is None
+
+
+def test_an_interrupted_collection_ends_the_queue_and_the_next_call_makes_up_for_it(queue, monkeypatch, capsys):
+    path = queue(1 / 3600)
+    from nmpm.cli import main as run
+
+    with monkeypatch.context() as patched:
+        patched.setattr("nmpm.cli.main", lambda given: 130 if given[0] == "test" else run(given))
+        assert train(path) == 130
+    assert not Path("zoo/small").exists()
+    assert train(path) == 0
+    assert "now in zoo/small" in capsys.readouterr().out
+    written = Path("zoo/small/card.yaml").stat().st_mtime_ns
+    assert train(path) == 0  # it is collected
+    assert Path("zoo/small/card.yaml").stat().st_mtime_ns == written
+    assert "small:" not in capsys.readouterr().out
+
+
+def test_the_twin_is_measured_again_for_other_test_scenes(tmp_path, monkeypatch):
+    from nmpm.zoo.measures.simulator import Twin
+    from nmpm.zoo.queue import collection
+
+    measured = []
+    monkeypatch.setattr(collection, "load_entry", lambda folder: folder)
+    monkeypatch.setattr(collection, "measure_twin", lambda *_: measured.append(1) or Twin(5, 10, {"mse": 0.1}))
+
+    def twin(**counts):
+        generate = {"counts": {"train": 1, "valid": 1, "test": 1} | counts}
+        dataset = Dataset("small", "goop.yaml", 1.0, options={"data.generate": generate})
+        return collection._twin(tmp_path / "zoo", History(dataset, tmp_path, Extension()), dataset)
+
+    assert twin()["mse"] == 0.1
+    assert twin(train=9)["mse"] == 0.1
+    assert len(measured) == 1
+    assert twin(test=2)["mse"] == 0.1
+    assert len(measured) == 2
 
 
 def test_the_card_states_what_a_further_round_gained_though_its_weights_stay(queue, capsys):
@@ -520,6 +654,7 @@ def test_the_card_states_what_a_further_round_gained_though_its_weights_stay(que
     assert "the entry is kept" in capsys.readouterr().out
     stated = yaml.safe_load(card.read_text())
     assert stated["last_round"]["gain"] < 0
+    assert set(stated["last_round"]["options"]) == set(TINY)  # not the folder of the data
     assert {key: value for key, value in stated.items() if key != "last_round"} == content
     assert "did not lower its validation error" in Path("zoo/small/README.md").read_text()
     shutil.rmtree(runs)

@@ -1,5 +1,8 @@
 """Refreshed entries keep what their cards state and what others write meanwhile; incomplete cards are refused."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import yaml
 
@@ -49,6 +52,47 @@ def test_an_entry_that_is_replaced_meanwhile_keeps_its_own_card(entry, replaced,
     assert "golden" not in Zoo.load("small", entry.parent).card  # it can be loaded
     with pytest.raises(ZooError, match="were replaced"):
         add_facts(entry, "0" * 64, {"twin": {}})
+
+
+def test_facts_that_are_written_at_the_same_time_all_stay(entry):
+    weights = Zoo.card("small", entry.parent)["sha256"]
+    start = threading.Barrier(6)
+
+    def write(number: int) -> None:
+        start.wait()
+        add_facts(entry, weights, {f"fact{number}": number})
+
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(write, range(6)))
+    card = Zoo.card("small", entry.parent)
+    assert [card.get(f"fact{number}") for number in range(6)] == list(range(6))
+    assert not list(entry.parent.glob("**/.*"))
+
+
+def test_times_of_other_hardware_that_are_written_during_the_measurement_stay(entry, monkeypatch):
+    elsewhere = {"hardware": "a GPU", "particles": 9, "ms_per_frame": 1.0, "best_batch": 1, "best_ms_per_frame": 1.0}
+
+    def measure(model):
+        add_facts(entry, model.card["sha256"], {"speed": [elsewhere]})
+        return elsewhere | {"hardware": "a CPU"}
+
+    monkeypatch.setattr("nmpm.zoo.speed.measure_speed", measure)
+    refresh(entry, ["speed"])
+    assert [time["hardware"] for time in Zoo.card("small", entry.parent)["speed"]] == ["a GPU", "a CPU"]
+
+
+@pytest.mark.parametrize(
+    ("measure", "change", "message"),
+    [
+        ("speed", {"particles": "many"}, "particles of its card should be their number, not 'many'"),
+        ("quality", {"per_trajectory": []}, "states no errors of single test scenes"),
+    ],
+)
+def test_a_card_that_a_measure_cannot_use_is_named(entry, measure, change, message):
+    path = entry / "card.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    with pytest.raises(ZooError, match=message):
+        refresh(entry, [measure])
 
 
 def test_weights_that_are_replaced_while_they_are_rounded_stay(entry, replaced, monkeypatch):

@@ -21,6 +21,8 @@ LUCKY = [[float(at), at, 10 * error, error] for at, error in enumerate((0.9, 0.3
         ([STEADY, []], [0.05, math.inf]),
         ([[], EARLIER], [math.inf, 0.2]),
         ([LUCKY], [0.4]),
+        ([[[0.0, 0, math.nan, math.nan], *LUCKY]], [0.4]),
+        ([[[0.0, 0, math.nan, math.nan]], STEADY], [math.inf, 0.05]),
         ([[*LUCKY, [8.0, 8, 1.0, 0.1]]], [0.3]),  # at the end, too, a low one counts for a third
     ],
 )
@@ -40,6 +42,8 @@ def test_the_mse_is_that_where_the_overall_error_is_lowest():
         ([*LUCKY, [8.0, 8, 9.0, 0.9], [9.0, 9, 9.0, 0.9]], False),  # it has become worse
         (STEADY, False),  # the last is the lowest, and kept
         (EARLIER[:1], False),
+        ([*LUCKY, [8.0, 8, math.nan, math.nan]], False),
+        ([[8.0, 8, math.nan, math.nan]], False),
         ([point[:3] for point in LUCKY], True),  # of earlier versions
     ],
 )

@@ -20,6 +20,7 @@ from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.index import refresh, write_index
 from nmpm.zoo.lifecycle import lifecycle
 from nmpm.zoo.measures.simulator import measure_twin
+from nmpm.zoo.scenes import iterate_test_scenes
 from nmpm.zoo.verification import Check, verify
 
 SHIPPED = shipped_folder("zoo")
@@ -101,6 +102,12 @@ def test_headline_figures_are_the_means_of_those_of_the_scenes():
     [
         ({"golden": {"seed": 0}}, "golden rollout of its card cannot be read: KeyError"),
         ({"golden": 5}, "golden rollout of its card cannot be read"),
+        (
+            {"golden": {"seed": float("inf"), "count": 300, "frames": 32, "position": []}},
+            "cannot be read: OverflowError",
+        ),
+        ({"golden": {"seed": 0, "count": 10**6, "frames": 32, "position": [[1, 2]] * 8}}, "cannot be repeated"),
+        ({"per_trajectory": None}, "states no errors of single test scenes"),
         ({"golden": {"seed": 0, "count": 300, "frames": 32, "position": [[1, 2]]}}, "8 positions in 2 dimensions"),
         ({"golden": {"seed": 0, "count": 300, "frames": 10**9, "position": [[1, 2]] * 8}}, "up to 32 frames"),
         ({"per_trajectory": [5]}, "should list the figures of each test scene"),
@@ -120,6 +127,12 @@ def test_malformed_cards_are_not_confirmed(change, message):
     quick = {} if "golden" in change else {"golden": None}
     with pytest.raises(ZooError, match=message):
         list(verify(dataclasses.replace(model, card=model.card | quick | change)))
+
+
+def test_a_folder_with_other_test_scenes_than_the_cards_is_refused(make_dataset):
+    model = Zoo.load("goop", SHIPPED)
+    with pytest.raises(ConfigError, match="has other test scenes than the card of goop is of"):
+        next(iterate_test_scenes(model, 10, make_dataset()))
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ from nmpm._support.devices import join_hardware
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.simulation_request import SimulationRequest, same_trajectories
-from nmpm.errors import DataError, ZooError
+from nmpm.errors import DataError, UnstableError, ZooError
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo.entries import CARD, load_entry, read_card
 from nmpm.zoo.index import add_facts, refresh, write_index
@@ -30,6 +31,10 @@ from nmpm.zoo.runs import BEST
 
 MERGED = "merged.json"
 """The report of the test with what all trainings took."""
+DONE = "collected.txt"
+"""How many of the trainings have been collected that had ended."""
+INTERRUPTED = 130
+"""Exit status of `nmpm` after an interruption."""
 Command = Callable[[list[str]], int]
 """Runs `nmpm` with these words and returns its exit status."""
 
@@ -53,6 +58,7 @@ def collect(history: History, zoo: Path, run: Command) -> str:
 
     Raises:
         ZooError: if the test fails.
+        KeyboardInterrupt: if the test is interrupted.
     """
     entry, folder = zoo / history.dataset.name, history.folder / "collected"
     with lock_folder(folder):
@@ -62,15 +68,17 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         said = _collect_best(history, best, entry, zoo, run)
         _state_last_round(history, best, entry)
         write_index(zoo)
+        with atomic_write(folder / DONE) as part:
+            part.write_text(f"{_ended(history)}\n", encoding="utf-8")
     return said
 
 
 def _collect_best(history: History, best: Training, entry: Path, zoo: Path, run: Command) -> str:
     """Make the entry of these weights, or leave it; what was done, in words."""
     name, folder = history.dataset.name, history.folder / "collected"
-    former = _card(entry)
-    if former and former.get("sha256") == weights_of(best.best):
-        _update(entry, former, history)
+    dataset = history.dataset_of(history.trainings.index(best) + 1)
+    if _card(entry).get("sha256") == weights_of(best.best):
+        _complete(entry, history, dataset)
         return f"{name}: its best weights are already in {entry}."
     report = _merged(_tested(best, folder, run), history)
     for file in (MERGED, "report.json"):
@@ -79,18 +87,21 @@ def _collect_best(history: History, best: Training, entry: Path, zoo: Path, run:
     error = report["test"]["mse"]
     if (reason := _reason_to_keep(name, zoo, best.curve(), error)) is not None:
         return f"{name}: the entry is kept, as {reason}."
-    former, recipe = _card(entry), _recipe_text(entry)  # again, as the test takes minutes
-    dataset = history.dataset_of(history.trainings.index(best) + 1)
-    replace(folder, name, zoo, dataset.about or describe_data(history.dataset, dataset))
-    card = read_card(entry)
-    same_work = recipe == _recipe_text(entry) and former.get("particles") == card.get("particles")
-    if same_work and former.get("speed"):  # of other hardware too, and not measured beside other trainings
-        add_facts(entry, str(card["sha256"]), {"speed": former["speed"]})
-    else:
-        refresh(entry, ["speed"])
-    known = simulator_facts(former, card)
-    add_facts(entry, str(card["sha256"]), _references(entry, history, dataset, known))
+    about = dataset.about or describe_data(history.dataset, dataset)
+    replace(folder, name, zoo, about, partial(kept_facts, entry))
+    _complete(entry, history, dataset)
     return f"{name}: {1e3 * error:.4g} ×10⁻³ on the test split, now in {entry}."
+
+
+def is_collected(history: History) -> bool:
+    """Whether all trainings that have ended are collected: not so if the process died or failed in the last one."""
+    done = history.folder / "collected" / DONE
+    return done.is_file() and done.read_text(encoding="utf-8").strip() == str(_ended(history))
+
+
+def _ended(history: History) -> int:
+    """Number of trainings that have ended."""
+    return sum(training.finished for training in history.trainings)
 
 
 def _state_last_round(history: History, best: Training, entry: Path) -> None:
@@ -99,9 +110,14 @@ def _state_last_round(history: History, best: Training, entry: Path) -> None:
     own = {weights_of(best.best), *([] if start is None else [start.weights()])}
     if gain is None or not math.isfinite(gain) or card.get("sha256") not in own:
         return
-    facts = {"last_round": {"hours": round(history.trainings[-1].seconds() / 3600, 2), "gain": round(gain, 4)}}
-    if card.get("last_round") != facts["last_round"]:
-        add_facts(entry, str(card["sha256"]), facts)
+    number = len(history.trainings)
+    stated = {
+        "hours": round(history.trainings[-1].seconds() / 3600, 2),
+        "gain": round(gain, 4),
+        "options": history.dataset_of(number).recipe(),
+    }
+    if card.get("last_round") != stated:
+        add_facts(entry, str(card["sha256"]), {"last_round": stated})
 
 
 def _card(entry: Path) -> dict[str, Any]:
@@ -115,12 +131,33 @@ def _recipe_text(entry: Path) -> str:
     return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
-def _update(entry: Path, card: Mapping[str, Any], history: History) -> None:
-    """Write the goal and the curve so far to the card of an entry with the best weights, where it states others."""
-    goal = history.dataset.goal
-    facts = {"curve": history.curve(), **({} if goal is None else {"goal": goal})}
+def kept_facts(entry: Path, card: Mapping[str, Any], recipe: str) -> dict[str, Any]:
+    """What a new card takes over from that of an entry: the simulator's uncertainty, and times of the same network.
+
+    Times are of other hardware too, and were not measured beside other trainings.
+
+    Args:
+        entry: Folder of the former entry.
+        card: The new card.
+        recipe: The text of its config.yaml.
+    """
+    former = _card(entry)
+    same_work = recipe == _recipe_text(entry) and former.get("particles") == card.get("particles")
+    times = {"speed": former["speed"]} if same_work and former.get("speed") else {}
+    return {**times, **simulator_facts(former, card)}
+
+
+def _complete(entry: Path, history: History, dataset: Dataset) -> None:
+    """Bring goal and curve of a card up to date, and measure times and the twin if it lacks them."""
+    card = read_card(entry)
+    weights = str(card["sha256"])
+    facts = {"curve": history.curve(), **({} if dataset.goal is None else {"goal": dataset.goal})}
     if any(card.get(key) != value for key, value in facts.items()):
-        add_facts(entry, str(card["sha256"]), facts)
+        add_facts(entry, weights, facts)
+    if not card.get("speed"):
+        refresh(entry, ["speed"])
+    if "twin" not in card and dataset.generation() is not None and (twin := _twin(entry, history, dataset)):
+        add_facts(entry, weights, {"twin": twin})
 
 
 def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
@@ -134,7 +171,10 @@ def _tested(best: Training, folder: Path, run: Command) -> dict[str, Any]:
     merged.unlink(missing_ok=True)
     with atomic_write(copy) as part:
         torch.save(content, part)
-    if run(best.test_command(folder)):
+    status = run(best.test_command(folder))
+    if status == INTERRUPTED:
+        raise KeyboardInterrupt
+    if status:
         raise ZooError(f"The test of {copy} failed.")
     return _read(folder / "report.json")
 
@@ -155,25 +195,25 @@ def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[
     return {key: former[key] for key in ("twin", "floor") if same and key in former}
 
 
-def _references(entry: Path, history: History, dataset: Dataset, known: Mapping[str, Any]) -> dict[str, Any]:
-    """What a card states beside the errors of the model: the goal, and how uncertain the simulator itself is.
+def _twin(entry: Path, history: History, dataset: Dataset) -> dict[str, Any] | None:
+    """Errors of the simulator's twin, measured once for the same test scenes; None where it is unstable.
 
-    Args:
-        entry: Its folder.
-        history: Of the dataset.
-        dataset: With the values of the training whose weights these are.
-        known: From `simulator_facts`.
+    They do not depend on the model, so that they are kept beside the trainings.
     """
-    goal = {} if dataset.goal is None else {"goal": dataset.goal}
-    if "twin" in known or dataset.generation() is None:  # the former card states it, or the data are recorded
-        return {**known, **goal}
-    kept = history.folder / "twin.json"
-    if not kept.is_file():  # measured once, as it does not depend on the model
-        data = catalog.dataset_folder(*_request(dataset))
-        twin = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None)
+    kept, (name, request) = history.folder / "twin.json", _request(dataset)
+    stated = json.loads(json.dumps(request.to_dict()))
+    scenes = {key: stated[key] for key in ("preset", "seed", "revision")} | {"test": stated["counts"]["test"]}
+    found = _read(kept) if kept.is_file() else {}
+    if found.get("scenes") != scenes:
+        data = catalog.dataset_folder(name, request)
+        try:
+            twin = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None).to_dict()
+        except UnstableError:
+            twin = None
+        found = {"scenes": scenes, "twin": twin}
         with atomic_write(kept) as part:
-            part.write_text(json.dumps(twin.to_dict(), indent=1), encoding="utf-8")
-    return {**known, **goal, "twin": _read(kept)}
+            part.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    return cast("dict[str, Any] | None", found["twin"])
 
 
 def _request(dataset: Dataset) -> tuple[str, SimulationRequest]:

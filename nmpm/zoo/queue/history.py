@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,10 +46,9 @@ class History:
     @property
     def starting_entry(self) -> Published | None:
         """The entry that the first training goes on from; None where it starts from random weights."""
-        copy = Published.find(self.folder / COPY)
-        if copy is not None or self.entry is None or self.trainings:
-            return copy
-        return Published.find(self.entry)
+        if self.trainings:
+            return Published.find(self.folder / COPY)
+        return None if self.entry is None else Published.find(self.entry)
 
     @property
     def stages(self) -> list[Published | Training]:
@@ -83,14 +84,15 @@ class History:
     def last_gain(self) -> float | None:
         """Share of the validation error by which the last training lowered what all before it had reached.
 
-        Before the first training that which the card of the entry states; None where nothing does, where the training
-        goes on, and where it is the first of all.
+        Before the first training that which the card of the entry states of a round with the same options, if it has
+        the dataset's hours. None where nothing does, where the training goes on, and where no earlier error is known.
         """
         trainings, entry = self.trainings, self.starting_entry
         if not trainings:
-            return None if entry is None else entry.last_gain()
+            known = entry is not None and self.entry_has_hours()
+            return entry.last_gain(self.dataset_of(1).recipe()) if entry is not None and known else None
         *former, last = lowest_errors(*(stage.curve() for stage in self.stages))
-        if not trainings[-1].finished or not former:
+        if not trainings[-1].finished or not former or not math.isfinite(min(former)):
             return None
         return 1 - last / min(former) if min(former) > 0 else 0.0
 
@@ -131,6 +133,8 @@ class History:
         if number <= len(trainings):
             return trainings[number - 1]
         dataset, hours = self.dataset_of(number), self.hours_of(number)
+        if not trainings and self.starting_entry is None:
+            shutil.rmtree(self.folder / COPY, ignore_errors=True)  # left by a process that died before it could start
         training, weights = Training(self.folder / str(number)), self._weights()
         training.start(
             new_training(dataset)
@@ -164,7 +168,8 @@ class History:
 
     def _origin(self) -> History:
         """The trainings that the first one starts from."""
-        return History(self.dataset, self.folder.parent / self.dataset.start, self.extension)
+        runs = self.folder.parents[len(Path(self.dataset.name).parts) - 1]
+        return History(self.dataset, runs / self.dataset.start, self.extension)
 
     def hours_left(self) -> tuple[float, float]:
         """Hours of training that are left without further extensions, and with all that the limit allows."""

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 from nmpm._support.bounded_files import read_yaml
 from nmpm._support.messages import suggestion
+from nmpm._support.numbers import is_finite
 from nmpm._support.shipped import find_config
 from nmpm.errors import ConfigError
 from nmpm.zoo.registry import check_name
@@ -31,14 +32,26 @@ class Extension:
     Args:
         hours: Of each extension.
         rate: Factor on the configuration's learning rate.
-        gain: Relative improvement of the validation error per extension below which a dataset stops.
+        gain: Relative improvement of the validation error per extension below which a dataset stops; negative not to
+            stop for it.
         limit: Hours of all trainings of a dataset.
+
+    Raises:
+        ConfigError: if a value is not a finite number, or outside of its range.
     """
 
     hours: float = 1.0
     rate: float = 0.5
     gain: float = 0.03
     limit: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("hours", "rate", "gain", "limit"):
+            value = getattr(self, name)
+            if not is_finite(value) or (name != "gain" and value < 0) or (name == "rate" and value == 0):
+                raise ConfigError(f"extension: {name} = {value!r} should be a finite number, and positive.")
+        if self.gain >= 1:
+            raise ConfigError(f"extension: gain = {self.gain} is a share, such as 0.03 for 3%.")
 
 
 @dataclass(frozen=True)
@@ -71,14 +84,22 @@ class Dataset:
 
     def __post_init__(self) -> None:
         check_name(self.name)
-        if self.hours <= 0:
-            raise ConfigError(f"{self.name}: hours = {self.hours} must be positive.")
-        if self.goal is not None and self.goal <= 0:
-            raise ConfigError(f"{self.name}: goal = {self.goal} must be positive.")
+        for name, value in (("hours", self.hours), ("goal", 1.0 if self.goal is None else self.goal)):
+            if not is_finite(value) or value <= 0:
+                raise ConfigError(f"{self.name}: {name} = {value!r} must be a positive number.")
+        if not isinstance(self.publish, bool):
+            raise ConfigError(f"{self.name}: publish = {self.publish!r} must be true or false.")
+        for name in ("options", "extend"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ConfigError(f"{self.name}: {name} must be keys of the configuration with their values.")
 
     def extended(self) -> Dataset:
         """The dataset as trainings see it that go on from its weights."""
         return dataclasses.replace(self, options={**self.options, **self.extend}, extend={})
+
+    def recipe(self) -> dict[str, Any]:
+        """The options without the folder of the data: what tells one kind of training from another."""
+        return {key: value for key, value in self.options.items() if key != "data.path"}
 
     def generation(self) -> tuple[str, dict[str, Any]] | None:
         """Name and options of the simulated data, as `nmpm.data.catalog.ensure` takes them; None for recorded data."""

@@ -7,6 +7,7 @@ row.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 Curve = Sequence[Sequence[float]]
@@ -19,8 +20,9 @@ def lowest_errors(*curves: Curve) -> list[float]:
     """The error where each curve is lowest, all by the same measure.
 
     Infinite for an empty curve, and for one with less than a group of validations where another has a group: it may be
-    low by chance.
+    low by chance. Validations with a value that is not finite do not count.
     """
+    curves = tuple(_finite(curve) for curve in curves)
     overall = all(_states_overall(curve) for curve in curves if curve)
     least = GROUP if any(len(curve) >= GROUP for curve in curves) else 1
     column = _OVERALL if overall else _MSE
@@ -28,16 +30,19 @@ def lowest_errors(*curves: Curve) -> list[float]:
 
 
 def lowest_mse(curve: Curve) -> float:
-    """The full rollout's MSE where a curve, which is not empty, is lowest."""
-    return _lowest(curve)[_MSE]
+    """The full rollout's MSE where a curve is lowest; infinite where no validation is finite."""
+    finite = _finite(curve)
+    return _lowest(finite)[_MSE] if finite else math.inf
 
 
 def ends_lowest(curve: Curve) -> bool:
-    """Whether a curve, which is not empty, is lower at its end than around its lowest single validation.
+    """Whether a curve is lower at its end than around its lowest single validation.
 
-    A training keeps the weights of that validation, and the last ones.
+    A training keeps the weights of that validation, and the last ones. False where the last validation is not finite.
     """
-    points, column = _measured(curve)
+    points, column = _measured(_finite(curve))
+    if not points or list(points[-1]) != list(curve[-1]):
+        return False
     single = min(range(len(points)), key=lambda at: points[at][column])
     return _mean(points[-GROUP:], column) < _mean(_around(points, single), column)
 
@@ -58,6 +63,11 @@ def _around(points: Curve, at: int) -> Curve:
 
 def _mean(points: Curve, column: int) -> float:
     return sum(point[column] for point in points) / len(points)
+
+
+def _finite(curve: Curve) -> list[Sequence[float]]:
+    """The validations of which all values are finite."""
+    return [point for point in curve if all(math.isfinite(value) for value in point)]
 
 
 def _measured(curve: Curve) -> tuple[Curve, int]:
