@@ -115,7 +115,7 @@ def check_options(chosen: argparse.Namespace) -> None:
 
 def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
     """Train until no dataset is left that this process could take."""
-    failed = collect_ended(plan, chosen)
+    uncollected, failed = collect_ended(plan, chosen), set[str]()
     while True:
         done = False
         for history, number in ready(plan, chosen, failed):
@@ -128,6 +128,7 @@ def train_all(plan: Plan, chosen: argparse.Namespace) -> int:
                     failed.add(history.dataset.name)
             break
         if not done:
+            failed |= uncollected
             names = ", ".join(sorted(failed)) or "none"
             left_out = "".join(f" {text}." for text in waits(plan, chosen))
             say(f"nothing is left to take.{left_out} {remaining(plan, chosen)} Failed: {names}.")
@@ -203,7 +204,7 @@ def simulate(dataset: Dataset, threads: int | None) -> None:
 
 
 def collect_entry(history: History, zoo: Path) -> int:
-    """Make the entry of the best weights so far; the exit status."""
+    """Make the entry of the best weights so far; the exit status, 1 where something fails."""
     from nmpm.cli import main as nmpm
     from nmpm.errors import NmpmError
     from nmpm.zoo.queue.collection import collect
@@ -214,6 +215,9 @@ def collect_entry(history: History, zoo: Path) -> int:
         say(collect(history, zoo, nmpm))
     except NmpmError as error:
         say(f"{history.dataset.name}: {error}")
+        return 1
+    except Exception:
+        say(f"{history.dataset.name}: {traceback.format_exc()}")
         return 1
     return 0
 

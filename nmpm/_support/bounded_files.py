@@ -82,6 +82,25 @@ def _check_events(text: str) -> None:
             raise ValueError(f"line {line} has a number of more than {DIGITS} digits.")
 
 
+def check_characters(value: object, path: Path) -> None:
+    """Refuse control characters but line breaks and tabs, which would reach the terminal of whoever prints the text.
+
+    Args:
+        value: Text, or lists and mappings of it; other values are left out.
+        path: Of the file that the text is of.
+
+    Raises:
+        DataError: naming the text.
+    """
+    if isinstance(value, Mapping):
+        value = [*value.keys(), *value.values()]
+    if isinstance(value, list | tuple):
+        for item in value:
+            check_characters(item, path)
+    elif isinstance(value, str) and _CONTROL.search(value):
+        raise DataError(f"{path}: {one_line(repr(value), 60)} has a control character.")
+
+
 def _check_plain(value: Any, path: Path) -> None:
     if isinstance(value, Mapping):
         for key, item in value.items():
@@ -93,7 +112,6 @@ def _check_plain(value: Any, path: Path) -> None:
         for item in value:
             _check_plain(item, path)
     elif isinstance(value, str):
-        if _CONTROL.search(value):  # in a card they would reach the terminal of whoever prints it
-            raise DataError(f"{path} cannot be read: {one_line(repr(value), 60)} has a control character.")
+        check_characters(value, path)
     elif value is not None and not isinstance(value, int | float):
         raise DataError(f"{path} cannot be read: it holds the {type(value).__name__} {one_line(value, 60)}; quote it.")

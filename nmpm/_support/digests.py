@@ -18,6 +18,11 @@ def weights_digest(weights: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
+def float32_digest(weights: Mapping[str, Tensor]) -> str:
+    """That of the weights in float32, which a test in another precision than the training's leaves as it is."""
+    return weights_digest({k: v.float() if v.is_floating_point() else v for k, v in weights.items()})
+
+
 def short_digest(weights: Mapping[str, Tensor]) -> str:
     """The first 12 digits of `weights_digest`, for tables."""
     return weights_digest(weights)[:12]

@@ -6,7 +6,7 @@ import fcntl
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -49,20 +49,25 @@ def read_card(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Lets one process at a time write to the entries of a zoo; the lock is that of the zoo's folder itself.
+    """Lets one process at a time write to the entries of a zoo. What is locked are folders, without a file in them.
 
     Args:
-        folder: Of an entry. A variant's lies within that of its dataset, which may be replaced.
+        folder: Of an entry. As a variant's lies within that of its dataset, which may be replaced, the two folders that
+            an entry lies in are locked: of any two entries of a zoo they have one in common.
     """
-    zoo = folder.resolve().parent
-    zoo = zoo.parent if (zoo / CARD).is_file() else zoo
-    zoo.mkdir(parents=True, exist_ok=True)
-    handle = os.open(zoo, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+    with ExitStack() as locks:
+        inner = folder.resolve().parent
+        for place in (inner.parent, inner):  # in this order, so that none waits for ever
+            place.mkdir(parents=True, exist_ok=True)
+            try:
+                handle = os.open(place, os.O_RDONLY)
+            except PermissionError:  # a folder around a zoo that others own
+                if place == inner:
+                    raise
+                continue
+            locks.callback(os.close, handle)
+            fcntl.flock(handle, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(handle)
 
 
 def load_entry(folder: Path) -> Pretrained:

@@ -24,7 +24,7 @@ from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.cards import MALFORMED, PICTURES, readme
-from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.entries import CARD, load_entry, read_card, writing
 from nmpm.zoo.pretrained import SIMULATED
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def pull(identifier: HubId, target: Path, name: str) -> Path:
     folder = download(identifier)
     load_entry(folder)
     card = read_card(folder) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
-    with atomic_folder(target) as new:
+    with writing(target), atomic_folder(target) as new:
         if target.is_dir():  # variants lie within it
             shutil.copytree(target, new, dirs_exist_ok=True)
         for file in FILES:

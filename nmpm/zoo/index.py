@@ -10,8 +10,9 @@ import torch
 import yaml
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.bounded_files import check_characters
 from nmpm._support.messages import one_line
-from nmpm.errors import ZooError
+from nmpm.errors import DataError, ZooError
 from nmpm.zoo.cards import MALFORMED, intervals, readme, twin_ratio
 from nmpm.zoo.charts import CHART, draw_chart, save_chart
 from nmpm.zoo.entries import CARD, load_entry, read_card, writing
@@ -39,6 +40,11 @@ COLUMNS = ("model", "state", "data", "MSE", "95%", "goal", "at 100", "twins", "t
 
 def write_index(root: Path) -> Path:
     """Write the table of a zoo's models, `README.md` in its folder; entries with a damaged card are left out."""
+    with writing(root / CARD):
+        return _write_index(root)
+
+
+def _write_index(root: Path) -> Path:
     rows, scenes = [], []
     for name in Zoo.list(root):
         try:
@@ -131,6 +137,10 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
     Raises:
         ZooError: if they cannot be made, as something is missing; nothing is written.
     """
+    try:
+        check_characters(card, folder / CARD)
+    except DataError as error:
+        raise ZooError(str(error)) from error
     try:
         chart = draw_chart(folder, card)
         pictures = {path.name for path in folder.iterdir()} | ({CHART} if chart else set())

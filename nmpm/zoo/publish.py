@@ -13,12 +13,14 @@ from typing import Any
 import yaml
 
 from nmpm._support.atomic import atomic_folder
-from nmpm._support.digests import weights_digest
+from nmpm._support.bounded_files import check_characters
+from nmpm._support.digests import float32_digest, weights_digest
+from nmpm._support.messages import one_line
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
-from nmpm.errors import ZooError
+from nmpm.errors import DataError, ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
-from nmpm.zoo.cards import readme, stress_digest
+from nmpm.zoo.cards import MALFORMED, readme, stress_digest
 from nmpm.zoo.charts import write_chart
 from nmpm.zoo.entries import CARD, writing
 from nmpm.zoo.golden import golden_rollout
@@ -90,7 +92,7 @@ def rounded_checkpoint(checkpoint: Path) -> dict[str, Any]:
 
 def _digest(checkpoint: Path) -> str:
     """That of a checkpoint's weights, as reports of its test state it."""
-    return weights_digest(read_checkpoint(checkpoint)["state_dict"])
+    return float32_digest(read_checkpoint(checkpoint)["state_dict"])
 
 
 def _rounded(checkpoint: Path) -> Emulator:
@@ -119,11 +121,28 @@ def _publish(run: Path, name: str, target: Path, about: str, keep: Keep | None =
     recipe = _yaml(emulator.recipe.to_dict())
     try:
         with writing(target):
-            card |= {} if keep is None else keep(card, recipe)
-            text = readme(card, [path.name for path in files])
+            card, text = _with_kept(card, {} if keep is None else keep(card, recipe), target, files)
             _write(target, weights, {"config.yaml": recipe, "card.yaml": _yaml(card), "README.md": text}, files)
     except OSError as error:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
+
+
+def _with_kept(
+    card: dict[str, Any], kept: Mapping[str, Any], target: Path, files: Sequence[Path]
+) -> tuple[dict[str, Any], str]:
+    """The card with what it takes over from the former one, and its README.
+
+    Raises:
+        ZooError: if either cannot be shown.
+    """
+    path, card = target / CARD, {**card, **kept}
+    try:
+        check_characters(card, path)
+        return card, readme(card, [file.name for file in files])
+    except DataError as error:
+        raise ZooError(str(error)) from error
+    except MALFORMED as error:
+        raise ZooError(f"{path} has {', '.join(kept)} that are malformed ({one_line(repr(error))}).") from error
 
 
 def new_entry_folder(name: str, root: str | Path | None) -> Path:

@@ -5,7 +5,7 @@ import pytest
 import torch
 import yaml
 
-from nmpm._support.digests import weights_digest
+from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder
 from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
@@ -98,7 +98,7 @@ def test_a_report_of_other_weights_is_refused(run, small):
     path = run / "report.json"
     report = json.loads(path.read_text())
     module = EmulatorModule.of(small, unroll=2)
-    path.write_text(json.dumps(report | {"weights": weights_digest(module.state_dict())}))
+    path.write_text(json.dumps(report | {"weights": float32_digest(module.state_dict())}))
     add(run, "mine")
     path.write_text(json.dumps(report | {"weights": "of others"}))
     with pytest.raises(ZooError, match=r"report.json is of other weights than .*best.ckpt: test these"):

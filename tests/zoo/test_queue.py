@@ -18,7 +18,7 @@ from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.metrics import MSE
 from nmpm.zoo import Zoo
-from nmpm.zoo.queue.collection import describe_data, simulator_facts
+from nmpm.zoo.queue.collection import describe_data, is_collected, simulator_facts
 from nmpm.zoo.queue.history import History
 from nmpm.zoo.queue.plan import Dataset, Extension, Plan, continued_training, new_training
 from nmpm.zoo.queue.training import Training
@@ -364,6 +364,7 @@ def test_an_entry_that_is_replaced_while_the_simulator_is_measured_keeps_its_car
     monkeypatch.setattr(collection, "_twin", replace_meanwhile)
     monkeypatch.setattr(Dataset, "generation", lambda _: ("small", {}))
     monkeypatch.setattr(collection, "describe_data", lambda *_: "")
+    monkeypatch.setattr(collection, "kept_facts", lambda *_: {"simulation": {"seed": 0}})
     monkeypatch.setattr("nmpm.data.catalog.ensure", lambda *_, **__: Path())
     assert train(queue(1 / 3600)) == 1
     assert "its weights were replaced" in capsys.readouterr().out
@@ -511,7 +512,7 @@ def last_round(**stated) -> dict:
         ({"gain": 0.05}, 2.0, 1),
         ({"gain": 0.02}, 2.0, None),
         ({"gain": -0.1}, 2.0, None),
-        ({"gain": 0.02, "options": {"model.mirror": [0]}}, 2.0, 1),  # a round of another kind
+        ({"gain": 0.02, "options": {"model.mirror": "[0]"}}, 2.0, 1),  # a round of another kind
         ({"gain": 0.02}, 3.0, 1),  # the first hours are not over
     ],
     ids=str,
@@ -621,6 +622,47 @@ def test_an_interrupted_collection_ends_the_queue_and_the_next_call_makes_up_for
     assert "small:" not in capsys.readouterr().out
 
 
+def test_a_round_with_other_options_is_trained_though_the_last_one_gained_nothing(tmp_path):
+    finished(tmp_path, 0.5, 0.6)
+    extension = Extension(hours=0.5, gain=0.03, limit=2.0)
+    history = History(Dataset("small", "goop.yaml", 0.5, extend={"model.mirror": [0]}), tmp_path, extension)
+    assert history.next_round() == 3
+    words = ["fit", "--config", "x.yaml", "--trainer.max_steps", "-1", "--model.mirror", "[0]", "--start_from", "y"]
+    (tmp_path / "2" / "words.json").write_text(json.dumps([*words, "--model.optimizer.init_args.lr", "0.1"]))
+    assert history.next_round() is None
+
+
+def test_a_collection_of_an_earlier_version_is_not_made_again(tmp_path):
+    finished(tmp_path, 0.5)
+    history = History(Dataset("small", "goop.yaml", 0.5), tmp_path, Extension())
+    assert not is_collected(history)
+    (tmp_path / "collected").mkdir()
+    merged = tmp_path / "collected" / "merged.json"
+    merged.touch()
+    os.utime(merged, (1.0, 1.0))  # of a training before
+    assert not is_collected(history)
+    os.utime(merged)
+    assert is_collected(history)
+    (tmp_path / "collected" / "collected.txt").write_text("0")
+    assert not is_collected(history)
+
+
+def test_a_collection_that_always_fails_keeps_no_other_dataset_from_training(queue, monkeypatch, capsys):
+    path = queue(1 / 3600)
+    assert train(path) == 0
+    (Path("runs/small/collected/collected.txt")).unlink()
+    (Path("runs/small/collected/merged.json")).write_text("{")
+    content = yaml.safe_load(path.read_text())
+    content["datasets"].append(content["datasets"][0] | {"name": "other"})
+    path.write_text(json.dumps(content))
+    monkeypatch.setattr("nmpm.zoo.queue.collection.read_checkpoint", lambda _: {"nmpm_digest": "of others"})
+    monkeypatch.setattr("nmpm.zoo.queue.collection.rounded_checkpoint", lambda _: {}["a mistake"])
+    assert train(path) == 1
+    said = capsys.readouterr().out
+    assert "a mistake" in said
+    assert "other, training 1" in said
+
+
 def test_the_twin_is_measured_again_for_other_test_scenes(tmp_path, monkeypatch):
     from nmpm.zoo.measures.simulator import Twin
     from nmpm.zoo.queue import collection
@@ -630,8 +672,9 @@ def test_the_twin_is_measured_again_for_other_test_scenes(tmp_path, monkeypatch)
     monkeypatch.setattr(collection, "measure_twin", lambda *_: measured.append(1) or Twin(5, 10, {"mse": 0.1}))
 
     def twin(**counts):
-        generate = {"counts": {"train": 1, "valid": 1, "test": 1} | counts}
-        dataset = Dataset("small", "goop.yaml", 1.0, options={"data.generate": generate})
+        stated = {"preset": {"name": "small"}, "seed": 0, "revision": 1, "counts": {"train": 1, "test": 1} | counts}
+        monkeypatch.setattr(collection, "read_card", lambda _: {"simulation": stated})
+        dataset = Dataset("small", "goop.yaml", 1.0)
         return collection._twin(tmp_path / "zoo", History(dataset, tmp_path, Extension()), dataset)
 
     assert twin()["mse"] == 0.1

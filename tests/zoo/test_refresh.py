@@ -1,6 +1,7 @@
 """Refreshed entries keep what their cards state and what others write meanwhile; incomplete cards are refused."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -10,6 +11,7 @@ from nmpm.cli import main
 from nmpm.errors import ZooError
 from nmpm.zoo import Zoo
 from nmpm.zoo import index as module
+from nmpm.zoo.entries import writing
 from nmpm.zoo.index import add_facts, refresh
 from nmpm.zoo.storage import halve
 
@@ -67,6 +69,31 @@ def test_facts_that_are_written_at_the_same_time_all_stay(entry):
     card = Zoo.card("small", entry.parent)
     assert [card.get(f"fact{number}") for number in range(6)] == list(range(6))
     assert not list(entry.parent.glob("**/.*"))
+
+
+def test_a_variant_is_not_written_while_its_dataset_is(entry):
+    reached, done = threading.Event(), []
+
+    def write() -> None:
+        reached.set()
+        with writing(entry / "fast"):
+            done.append("variant")
+
+    with ThreadPoolExecutor(1) as pool:
+        with writing(entry):
+            future = pool.submit(write)
+            reached.wait()
+            time.sleep(0.1)
+            done.append("dataset")
+        future.result()
+    assert done == ["dataset", "variant"]
+
+
+def test_text_that_could_not_be_read_again_is_not_written(entry):
+    before = (entry / "card.yaml").read_bytes()
+    with pytest.raises(ZooError, match=r"card.yaml: 'Late \\x96 dust' has a control character"):
+        refresh(entry, failures="Late \x96 dust")
+    assert (entry / "card.yaml").read_bytes() == before
 
 
 def test_times_of_other_hardware_that_are_written_during_the_measurement_stay(entry, monkeypatch):

@@ -19,7 +19,7 @@ from torch import Tensor
 from nmpm._support.atomic import atomic_write
 from nmpm._support.collectives import all_gather
 from nmpm._support.devices import device_name, join_hardware
-from nmpm._support.digests import weights_digest
+from nmpm._support.digests import float32_digest
 from nmpm._support.version import __version__
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.evaluation.figures import PREDICTORS, figure_names, table_row
@@ -136,7 +136,7 @@ class ReportWriter(Callback):
         datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         return {
             "dataset": datamodule.description,
-            "weights": weights_digest(module.state_dict()),
+            "weights": float32_digest(module.state_dict()),
             "test": _logged(trainer, "test/"),
             "per_trajectory": dict(per_trajectory),
             "training": {

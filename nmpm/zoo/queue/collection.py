@@ -62,14 +62,14 @@ def collect(history: History, zoo: Path, run: Command) -> str:
     """
     entry, folder = zoo / history.dataset.name, history.folder / "collected"
     with lock_folder(folder):
-        best = history.best()
+        ended, best = _ended(history), history.best()
         if best is None:
             return f"{history.dataset.name}: nothing is validated yet."
         said = _collect_best(history, best, entry, zoo, run)
         _state_last_round(history, best, entry)
         write_index(zoo)
         with atomic_write(folder / DONE) as part:
-            part.write_text(f"{_ended(history)}\n", encoding="utf-8")
+            part.write_text(f"{ended}\n", encoding="utf-8")
     return said
 
 
@@ -94,9 +94,12 @@ def _collect_best(history: History, best: Training, entry: Path, zoo: Path, run:
 
 
 def is_collected(history: History) -> bool:
-    """Whether all trainings that have ended are collected: not so if the process died or failed in the last one."""
-    done = history.folder / "collected" / DONE
-    return done.is_file() and done.read_text(encoding="utf-8").strip() == str(_ended(history))
+    """Whether all trainings that have ended are collected: not so if a process died or failed in a collection."""
+    done, merged = (history.folder / "collected" / name for name in (DONE, MERGED))
+    if done.is_file():
+        return done.read_text(encoding="utf-8").strip() == str(_ended(history))
+    report = history.trainings[-1].folder / "report.json"  # by an earlier version, which left no such file
+    return merged.is_file() and report.is_file() and merged.stat().st_mtime >= report.stat().st_mtime
 
 
 def _ended(history: History) -> int:
@@ -110,12 +113,8 @@ def _state_last_round(history: History, best: Training, entry: Path) -> None:
     own = {weights_of(best.best), *([] if start is None else [start.weights()])}
     if gain is None or not math.isfinite(gain) or card.get("sha256") not in own:
         return
-    number = len(history.trainings)
-    stated = {
-        "hours": round(history.trainings[-1].seconds() / 3600, 2),
-        "gain": round(gain, 4),
-        "options": history.dataset_of(number).recipe(),
-    }
+    last = history.trainings[-1]
+    stated = {"hours": round(last.seconds() / 3600, 2), "gain": round(gain, 4), "options": last.recipe()}
     if card.get("last_round") != stated:
         add_facts(entry, str(card["sha256"]), {"last_round": stated})
 
@@ -152,11 +151,12 @@ def _complete(entry: Path, history: History, dataset: Dataset) -> None:
     card = read_card(entry)
     weights = str(card["sha256"])
     facts = {"curve": history.curve(), **({} if dataset.goal is None else {"goal": dataset.goal})}
-    if any(card.get(key) != value for key, value in facts.items()):
+    if json.dumps([card.get(key) for key in facts]) != json.dumps(list(facts.values())):  # NaN equals NaN there
         add_facts(entry, weights, facts)
     if not card.get("speed"):
         refresh(entry, ["speed"])
-    if "twin" not in card and dataset.generation() is not None and (twin := _twin(entry, history, dataset)):
+    simulated = dataset.generation() is not None and card.get("simulation")
+    if simulated and "twin" not in card and (twin := _twin(entry, history, dataset)):
         add_facts(entry, weights, {"twin": twin})
 
 
@@ -189,10 +189,15 @@ def _digest(checkpoint: Path) -> str | None:
 
 def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
     """How uncertain the simulator itself is, from the card of a former model with the same simulated test scenes."""
-    before, now = former.get("simulation", {}), card.get("simulation", {})
-    as_many = before.get("counts", {}).get("test") == now.get("counts", {}).get("test")
-    same = bool(now) and as_many and same_trajectories(before, now)
+    before, now = former.get("simulation") or {}, card.get("simulation") or {}
+    same = bool(now) and _same_test_scenes(before, now)
     return {key: former[key] for key in ("twin", "floor") if same and key in former}
+
+
+def _same_test_scenes(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two simulations, as cards state them, have the same test scenes."""
+    as_many = one.get("counts", {}).get("test") == other.get("counts", {}).get("test")
+    return as_many and same_trajectories(*(json.loads(json.dumps(request)) for request in (one, other)))
 
 
 def _twin(entry: Path, history: History, dataset: Dataset) -> dict[str, Any] | None:
@@ -200,14 +205,15 @@ def _twin(entry: Path, history: History, dataset: Dataset) -> dict[str, Any] | N
 
     They do not depend on the model, so that they are kept beside the trainings.
     """
-    kept, (name, request) = history.folder / "twin.json", _request(dataset)
-    stated = json.loads(json.dumps(request.to_dict()))
-    scenes = {key: stated[key] for key in ("preset", "seed", "revision")} | {"test": stated["counts"]["test"]}
+    kept, stated = history.folder / "twin.json", read_card(entry)["simulation"]
+    scenes = {key: stated.get(key) for key in ("preset", "seed", "revision")} | {"test": stated["counts"]["test"]}
     found = _read(kept) if kept.is_file() else {}
     if found.get("scenes") != scenes:
+        name, request = _request(dataset)
         data = catalog.dataset_folder(name, request)
+        same = _same_test_scenes(stated, request.to_dict()) and (data / "test.h5").is_file()
         try:
-            twin = measure_twin(load_entry(entry), data if (data / "test.h5").is_file() else None).to_dict()
+            twin = measure_twin(load_entry(entry), data if same else None).to_dict()
         except UnstableError:
             twin = None
         found = {"scenes": scenes, "twin": twin}

@@ -74,23 +74,30 @@ class History:
         return None if (trainings or self.starting_entry) and self.stops() else len(trainings) + 1
 
     def stops(self) -> bool:
-        """Whether the finished trainings end the dataset: hours are over, or the last extension gained too little."""
+        """Whether the finished trainings end the dataset.
+
+        So it is where hours are over, or the last training gained too little with the options of the next one; before
+        the first training, by what the card of the entry states of its last one.
+        """
         following = len(self.trainings) + 1
         if not self._fits(following) or self.hours_of(following) <= 0:
             return True
-        gain = self.last_gain()
+        recipe = self.dataset_of(following).recipe()
+        if self.trainings:
+            gain = self.last_gain() if self.trainings[-1].recipe() == recipe else None
+        else:
+            entry = self.starting_entry
+            gain = entry.last_gain(recipe) if entry is not None and self.entry_has_hours() else None
         return gain is not None and gain < self.extension.gain
 
     def last_gain(self) -> float | None:
         """Share of the validation error by which the last training lowered what all before it had reached.
 
-        Before the first training that which the card of the entry states of a round with the same options, if it has
-        the dataset's hours. None where nothing does, where the training goes on, and where no earlier error is known.
+        None before the first training has ended, while one goes on, and where no earlier error is known.
         """
-        trainings, entry = self.trainings, self.starting_entry
+        trainings = self.trainings
         if not trainings:
-            known = entry is not None and self.entry_has_hours()
-            return entry.last_gain(self.dataset_of(1).recipe()) if entry is not None and known else None
+            return None
         *former, last = lowest_errors(*(stage.curve() for stage in self.stages))
         if not trainings[-1].finished or not former or not math.isfinite(min(former)):
             return None

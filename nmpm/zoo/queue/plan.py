@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,6 +22,8 @@ OPEN = "???"
 """Placeholder in a configuration for a value that the user has to give."""
 RATE = "model.optimizer.init_args.lr"
 """Key of the learning rate in a configuration."""
+_BUDGET = ("trainer.max_steps", "trainer.max_time", "trainer.val_check_interval")
+_NOT_OF_RECIPE = frozenset({*_BUDGET, RATE, "config", "start_from", "data.path"})
 VALIDATIONS = 30
 """Validations in a training: points of the curve on the card."""
 
@@ -48,10 +51,12 @@ class Extension:
     def __post_init__(self) -> None:
         for name in ("hours", "rate", "gain", "limit"):
             value = getattr(self, name)
-            if not is_finite(value) or (name != "gain" and value < 0) or (name == "rate" and value == 0):
-                raise ConfigError(f"extension: {name} = {value!r} should be a finite number, and positive.")
+            if not is_finite(value) or (name != "gain" and value < 0):
+                raise ConfigError(f"extension: {name} = {value!r} should be a finite number, not below 0.")
         if self.gain >= 1:
             raise ConfigError(f"extension: gain = {self.gain} is a share, such as 0.03 for 3%.")
+        if self.rate == 0:
+            raise ConfigError("extension: rate = 0 trains nothing.")
 
 
 @dataclass(frozen=True)
@@ -97,9 +102,9 @@ class Dataset:
         """The dataset as trainings see it that go on from its weights."""
         return dataclasses.replace(self, options={**self.options, **self.extend}, extend={})
 
-    def recipe(self) -> dict[str, Any]:
-        """The options without the folder of the data: what tells one kind of training from another."""
-        return {key: value for key, value in self.options.items() if key != "data.path"}
+    def recipe(self) -> dict[str, str]:
+        """The options as words of `nmpm fit`: what tells one kind of training from another, see `recipe_of`."""
+        return recipe_of(_words(self.config, self.hours, self.options))
 
     def generation(self) -> tuple[str, dict[str, Any]] | None:
         """Name and options of the simulated data, as `nmpm.data.catalog.ensure` takes them; None for recorded data."""
@@ -211,15 +216,17 @@ def continued_training(dataset: Dataset, hours: float, rate: float, best: Path) 
 
 def _words(config: str, hours: float, options: Mapping[str, Any]) -> list[str]:
     # Time alone ends the training, so that the learning rate comes down with it; configurations may state steps too.
-    budget = {
-        "trainer.max_steps": -1,
-        "trainer.max_time": _duration(3600 * hours),
-        "trainer.val_check_interval": _duration(3600 * hours / VALIDATIONS),
-    }
+    budget = dict(zip(_BUDGET, (-1, _duration(3600 * hours), _duration(3600 * hours / VALIDATIONS)), strict=True))
     words = ["fit", "--config", config]
     for key, value in {**budget, **options}.items():
         words += [f"--{key}", value if isinstance(value, str) else json.dumps(value)]
     return words
+
+
+def recipe_of(words: Sequence[str]) -> dict[str, str]:
+    """The options of a training's command without its time, learning rate, starting weights and folder of the data."""
+    options = {key.removeprefix("--"): value for key, value in pairwise(words) if key.startswith("--")}
+    return {key: value for key, value in options.items() if key not in _NOT_OF_RECIPE}
 
 
 def _duration(seconds: float) -> str:

@@ -60,14 +60,14 @@ class Published:
         """Steps of training."""
         return int((self.card.get("training") or {}).get("steps", 0))
 
-    def last_gain(self, options: Mapping[str, Any]) -> float | None:
+    def last_gain(self, recipe: Mapping[str, str]) -> float | None:
         """Share of the validation error that its last round of training gained.
 
         Args:
-            options: Of the round to come. None is returned where the last one had others, or the card states none.
+            recipe: Options of the round to come; None is returned where the last one had others or none is stated.
         """
         stated = self.card.get("last_round")
-        return float(stated["gain"]) if stated and stated.get("options") == dict(options) else None
+        return float(stated["gain"]) if stated and stated.get("options") == dict(recipe) else None
 
     def weights(self) -> str:
         """SHA-256 of its weights."""
@@ -98,9 +98,7 @@ def _check(path: Path, card: Mapping[str, Any]) -> None:
 
 
 def _refuse(path: Path, key: str, needed: str) -> None:
-    raise ZooError(
-        f"{path}: {key} should be {needed}. Correct it, or begin from random weights by `python zoo/train.py --fresh`."
-    )
+    raise ZooError(f"{path}: {key} should be {needed}; correct it.")
 
 
 def _is_point(point: object) -> bool:

@@ -13,7 +13,7 @@ from nmpm._support.bounded_files import read_yaml
 from nmpm._support.shipped import find_config
 from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
-from nmpm.zoo.queue.plan import RATE
+from nmpm.zoo.queue.plan import RATE, recipe_of
 from nmpm.zoo.queue.validations import ends_lowest
 from nmpm.zoo.runs import BEST
 
@@ -93,6 +93,10 @@ class Training:
         own = {"default_root_dir": str(folder), "precision": "32-true", "logger": "false"}
         options = [word for key, value in own.items() for word in (f"--trainer.{key}", value)]
         return ["test", *words[1:], *options, "--ckpt_path", "best", "--verbose", "false"]
+
+    def recipe(self) -> dict[str, str]:
+        """The options that it was started with, see `recipe_of`."""
+        return recipe_of(json.loads((self.folder / WORDS).read_text(encoding="utf-8")))
 
     def curve(self) -> list[list[float]]:
         """Seconds of training, steps, MSE and overall error of each validation so far."""
