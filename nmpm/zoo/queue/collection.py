@@ -42,11 +42,11 @@ Command = Callable[[list[str]], int]
 def collect(history: History, zoo: Path, run: Command) -> str:
     """Test a dataset's best weights and make its entry of them, also while its training goes on.
 
-    An entry that has these weights already keeps all that its card states; only goal and curve are written to it.
-    An entry whose validation error is lower is kept, so that the test split chooses nothing; so is one that has more
-    validations than a training whose few may be low by chance. Only for an entry whose card has no validation errors,
-    from before the queue, those of the test are compared. In all cases the card then states what the last round of
-    training gained, so that the queue knows it without the trainings too.
+    An entry that has these weights already keeps all that its card states; goal and curve are brought up to date, times
+    and the twin measured where it lacks them. An entry whose validation error is lower is kept, so that the test split
+    chooses nothing; so is one that has more validations than a training whose few may be low by chance. Only for an
+    entry whose card has no validation errors, from before the queue, those of the test are compared. In all cases the
+    card then states what the last round of training gained, so that the queue knows it without the trainings too.
 
     Args:
         history: Of the dataset.
