@@ -2,12 +2,13 @@
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.gradients import differentiable_rollout
-from nmpm.emulator.model import Emulator
+from nmpm.emulator.model import NETWORK_PRECISIONS, Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.rollouts import Rollout, predict_rollout, rollout, stream, stream_rollout, unroll
 from nmpm.emulator.windows import Windows
 
 __all__ = [
+    "NETWORK_PRECISIONS",
     "Bundle",
     "Emulator",
     "EmulatorRecipe",

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
@@ -35,6 +36,8 @@ from nmpm.transfer import Transfer
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe
 
+NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
+"""Precisions of the network in rollouts, by name; everything else computes in float32."""
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
 

@@ -6,7 +6,6 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -15,15 +14,13 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, Rollout, Windows, differentiable_rollout, predict_rollout
+from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, Windows, differentiable_rollout, predict_rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.states import Bodies, StateBuilder
 
-NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
-"""Precisions of a pretrained network, by name."""
 _EXAMPLE = 300
 """Particles of the example by which runtimes are compared."""
 SIMULATED = ", simulated by nmpm"

@@ -16,7 +16,7 @@ from nmpm.evaluation.compare.predictors import Candidate
 from nmpm.evaluation.machine import is_machine_failure
 from nmpm.evaluation.trade.accuracy import FAILED
 from nmpm.evaluation.trade.choice import Choice, Kind
-from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
+from nmpm.evaluation.trade.errors import GAIN, Measures, gain_failure, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 from nmpm.evaluation.trade.timing import Timing, known_times, measure_times
@@ -93,11 +93,11 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int) -> dict[str, Any]
     errors: dict[str, float] = measure_errors(scenes.scene, window, predicted, _MEASURES)
     errors["emd"] = earth_mover_of_materials(ours[-1:], theirs[-1:], window.material[0, moving], MATCHED)
     followed = errors.pop(GAIN)
-    gain = followed if prediction.gain is None else prediction.gain
+    failure = gain_failure(followed if prediction.gain is None else prediction.gain)
     curve = (ours - theirs).double().square().mean((1, 2))
     found: dict[str, Any] = {"errors": errors, "curve": [float(f"{value:.5g}") for value in curve.tolist()]}
-    if gain > MOST_GAIN:
-        found[FAILED] = f"gains {gain:.0%} of energy"
+    if failure:
+        found[FAILED] = failure
     if index == 0:
         found["frames"] = _pack(into_domain(scenes.scene, ours[shown_frames(scenes)]))
     return found

@@ -13,7 +13,7 @@ from nmpm._support.messages import one_line
 from nmpm.errors import NmpmError
 from nmpm.evaluation.machine import is_machine_failure
 from nmpm.evaluation.trade.choice import Choice, Prediction
-from nmpm.evaluation.trade.errors import GAIN, MOST_GAIN, Measures, into_domain, measure_errors
+from nmpm.evaluation.trade.errors import GAIN, Measures, gain_failure, into_domain, measure_errors
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.store import Store
 
@@ -56,8 +56,8 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
     found: dict[str, Any] = dict(measure_errors(scenes.scene, scenes.window([index]), predicted.position, measures))
     if predicted.gain is not None:
         found[GAIN] = predicted.gain
-    if found[GAIN] > MOST_GAIN:
-        found[FAILED] = f"gains {found[GAIN]:.0%} of energy"
+    if failure := gain_failure(found[GAIN]):
+        found[FAILED] = failure
     if index == 0:
         found[PICTURE] = thumbnail(scenes, predicted.position[0, shown_frame(scenes)])
     return found

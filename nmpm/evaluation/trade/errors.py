@@ -36,7 +36,7 @@ REVISION = 3
 """Increased whenever the same prediction gets other errors."""
 
 GAIN = "gain"
-MOST_GAIN = 0.05
+_MOST_GAIN = 0.05
 """A prediction that gains more energy than this share of the initial one is unstable."""
 
 _CELL = 3.0  # particle spacings: side of the cells in which particles are counted
@@ -130,6 +130,11 @@ def _energies(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> dic
     truth, _ = _energy(scene, torch.cat([start, theirs]), material, gravity)
     found = {"kinetic": float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))}
     return found | {GAIN: _gain(total)}
+
+
+def gain_failure(gain: float) -> str:
+    """Why a prediction that gains this share of the initial energy is unstable; empty if it is not."""
+    return f"gains {gain:.0%} of energy" if gain > _MOST_GAIN else ""
 
 
 def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> float:

@@ -11,13 +11,10 @@ from typing import Any
 import torch
 
 from nmpm._support.digests import weights_digest
-from nmpm.emulator import Emulator, rollout
+from nmpm.emulator import NETWORK_PRECISIONS, Emulator, rollout
 from nmpm.errors import ConfigError
 from nmpm.evaluation.trade.choice import CPU, Choice, Kind, Rollout
 from nmpm.evaluation.trade.scenes import Scenes
-
-PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
-"""Precisions of the network, by name; everything else computes in float32."""
 
 CONSTRAINTS: Mapping[str, Callable[[Emulator], Emulator]] = MappingProxyType(
     {"held": lambda emulator: emulator, "free": Emulator.unconstrained}
@@ -76,12 +73,12 @@ def over_scenes(name: str, emulator: Emulator, scenes: Scenes) -> Emulator:
 
 
 def with_precision(emulator: Emulator, name: str) -> Emulator:
-    """The emulator with its network in a precision of `PRECISIONS`.
+    """The emulator with its network in a precision of `NETWORK_PRECISIONS`.
 
     Raises:
         ConfigError: if there is no such precision, or the network cannot have it.
     """
-    return emulator.with_network(_find("precision", name, PRECISIONS))
+    return emulator.with_network(_find("precision", name, NETWORK_PRECISIONS))
 
 
 def with_constraints(emulator: Emulator, name: str) -> Emulator:

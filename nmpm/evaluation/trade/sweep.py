@@ -41,7 +41,7 @@ class ModelSettings:
     """Settings of every model; all combinations of them are measured.
 
     Args:
-        precision: Precisions of the network, see `models.PRECISIONS`.
+        precision: Precisions of the network, see `nmpm.emulator.NETWORK_PRECISIONS`.
         constraints: "held" and "free", see `models.CONSTRAINTS`.
         cells: Factors on the number of grid cells along each axis, relative to training.
         runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
