@@ -7,6 +7,7 @@ from nmpm._support.devices import device_name
 from nmpm.training.callbacks.report import ReportWriter
 
 EMULATOR = SimpleNamespace(frames=8, parameters=lambda: iter(()))
+MODULE = SimpleNamespace(emulator=EMULATOR, unroll=2, state_dict=dict)
 
 
 def trainer_on(device: str) -> SimpleNamespace:
@@ -34,7 +35,7 @@ def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
 def test_a_report_names_the_device_that_the_trainer_used(monkeypatch, device, name):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
-    figures = ReportWriter()._figures(trainer_on(device), SimpleNamespace(emulator=EMULATOR, unroll=2), {})
+    figures = ReportWriter()._figures(trainer_on(device), MODULE, {})
     assert name in figures["training"]["hardware"]
 
 
@@ -48,5 +49,5 @@ def test_a_report_names_all_that_a_training_ran_on_and_not_what_tests_it(monkeyp
         written = writer
     tested = ReportWriter()
     tested.load_state_dict(written.state_dict())
-    figures = tested._figures(trainer_on("cpu"), SimpleNamespace(emulator=EMULATOR, unroll=2), {})
+    figures = tested._figures(trainer_on("cpu"), MODULE, {})
     assert figures["training"]["hardware"] == "GPU of cuda:0; GPU of cuda:1"
