@@ -86,6 +86,13 @@ def same_trajectories(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return all(one.get(key) == other.get(key) for key in ("preset", "seed", "revision"))
 
 
+def same_test_scenes(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two requests, as `SimulationRequest.to_dict` states them, give the same test trajectories."""
+    counts = [request.get("counts") for request in (one, other)]
+    first, second = (count.get("test") if isinstance(count, Mapping) else None for count in counts)
+    return first == second and same_trajectories(one, other)
+
+
 def _is_valid_counts(counts: object) -> bool:
     """Whether these are valid numbers of trajectories for all splits."""
     if not isinstance(counts, Mapping) or set(counts) != set(SPLITS):

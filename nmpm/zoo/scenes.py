@@ -14,7 +14,7 @@ from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader, SplitRecordings
 from nmpm.data.progress import progress_bar
-from nmpm.data.simulation_request import SimulationRequest, same_trajectories
+from nmpm.data.simulation_request import SimulationRequest, same_test_scenes
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
@@ -98,9 +98,7 @@ def _check_same_scenes(model: Pretrained, found: object, data: Path) -> None:
     stated = model.card.get("simulation")
     if not isinstance(stated, Mapping):
         return
-    counts = [request.get("counts") if isinstance(request, Mapping) else None for request in (stated, found)]
-    tests = [count.get("test") if isinstance(count, Mapping) else None for count in counts]
-    if not isinstance(found, Mapping) or not same_trajectories(stated, found) or tests[0] != tests[1]:
+    if not isinstance(found, Mapping) or not same_test_scenes(stated, found):
         raise ConfigError(
             f"{data} has other test scenes than the card of {model.name} is of: other scenes, seeds, revision of the"
             " simulator or number. Without a folder they are simulated."

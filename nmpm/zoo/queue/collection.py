@@ -15,7 +15,7 @@ from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import join_hardware
 from nmpm.data import catalog
 from nmpm.data.folder_lock import lock_folder
-from nmpm.data.simulation_request import SimulationRequest, same_trajectories
+from nmpm.data.simulation_request import SimulationRequest, same_test_scenes
 from nmpm.errors import DataError, UnstableError, ZooError
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo.entries import CARD, load_entry, read_card
@@ -65,19 +65,21 @@ def collect(history: History, zoo: Path, run: Command) -> str:
         ended, best = _ended(history), history.best()
         if best is None:
             return f"{history.dataset.name}: nothing is validated yet."
-        said = _collect_best(history, best, entry, zoo, run)
-        _state_last_round(history, best, entry)
+        weights = weights_of(best.best)
+        said = _collect_best(history, best, weights, zoo, run)
+        _state_last_round(history, weights, entry)
         write_index(zoo)
         with atomic_write(folder / DONE) as part:
             part.write_text(f"{ended}\n", encoding="utf-8")
     return said
 
 
-def _collect_best(history: History, best: Training, entry: Path, zoo: Path, run: Command) -> str:
-    """Make the entry of these weights, or leave it; what was done, in words."""
+def _collect_best(history: History, best: Training, weights: str, zoo: Path, run: Command) -> str:
+    """Make the entry of the best training's weights, of this SHA-256, or leave it; what was done, in words."""
     name, folder = history.dataset.name, history.folder / "collected"
+    entry = zoo / name
     dataset = history.dataset_of(history.trainings.index(best) + 1)
-    if _card(entry).get("sha256") == weights_of(best.best):
+    if _card(entry).get("sha256") == weights:
         _complete(entry, history, dataset)
         return f"{name}: its best weights are already in {entry}."
     report = _merged(_tested(best, folder, run), history)
@@ -107,10 +109,13 @@ def _ended(history: History) -> int:
     return sum(training.finished for training in history.trainings)
 
 
-def _state_last_round(history: History, best: Training, entry: Path) -> None:
-    """Write to the entry's card what the last round of training gained, where the entry has the best weights so far."""
+def _state_last_round(history: History, weights: str, entry: Path) -> None:
+    """Write to the entry's card what the last round of training gained, where it is this dataset's.
+
+    That is, where its weights are the best of the trainings, of this SHA-256, or those that the first one started from.
+    """
     card, gain, start = _card(entry), history.last_gain(), history.starting_entry
-    own = {weights_of(best.best), *([] if start is None else [start.weights()])}
+    own = {weights} if start is None else {weights, start.weights()}
     if gain is None or not math.isfinite(gain) or card.get("sha256") not in own:
         return
     last = history.trainings[-1]
@@ -190,14 +195,8 @@ def _digest(checkpoint: Path) -> str | None:
 def simulator_facts(former: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
     """How uncertain the simulator itself is, from the card of a former model with the same simulated test scenes."""
     before, now = former.get("simulation") or {}, card.get("simulation") or {}
-    same = bool(now) and _same_test_scenes(before, now)
+    same = bool(now) and same_test_scenes(before, now)
     return {key: former[key] for key in ("twin", "floor") if same and key in former}
-
-
-def _same_test_scenes(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two simulations, as cards state them, have the same test scenes."""
-    as_many = one.get("counts", {}).get("test") == other.get("counts", {}).get("test")
-    return as_many and same_trajectories(*(json.loads(json.dumps(request)) for request in (one, other)))
 
 
 def _twin(entry: Path, history: History, dataset: Dataset) -> dict[str, Any] | None:
@@ -211,7 +210,7 @@ def _twin(entry: Path, history: History, dataset: Dataset) -> dict[str, Any] | N
     if found.get("scenes") != scenes:
         name, request = _request(dataset)
         data = catalog.dataset_folder(name, request)
-        same = _same_test_scenes(stated, request.to_dict()) and (data / "test.h5").is_file()
+        same = same_test_scenes(stated, json.loads(json.dumps(request.to_dict()))) and (data / "test.h5").is_file()
         try:
             twin = measure_twin(load_entry(entry), data if same else None).to_dict()
         except UnstableError:
