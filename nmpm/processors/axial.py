@@ -19,6 +19,7 @@ from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.convnext import ChannelNorm
 from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.patches import embed_patches, return_patches
 
 _SLOWEST = 100.0  # patches in which the slowest rotary angle turns by one radian
 
@@ -69,10 +70,10 @@ class AxialNetwork(GridProcessor):
     def forward(self, grid: Tensor) -> Tensor:
         shape = grid.shape[2:]
         cells = functional.silu(self.cells(pad_to_multiple(grid, self.patch)))
-        hidden = self.embed(cells)
+        hidden = embed_patches(self.embed, cells, self.patch)
         for layer in self.layers:
             hidden = layer(hidden)
-        joined = functional.silu(self.join(torch.cat([cells, self.back(hidden)], dim=1)))
+        joined = functional.silu(self.join(torch.cat([cells, return_patches(self.back, hidden, self.patch)], dim=1)))
         out: Tensor = crop(self.last(joined), shape).unflatten(1, (self.frames, -1))
         return out
 

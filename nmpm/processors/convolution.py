@@ -1,4 +1,10 @@
-"""Convolutions in 1, 2 or 3 axes that know how each axis ends: circular padding where it wraps, zeros at walls."""
+"""Convolutions in 1, 2 or 3 axes that know how each axis ends: circular padding where it wraps, zeros at walls.
+
+Axes of one cell are extended by a cell of zeros, which changes no result: oneDNN 3.12 (torch 2.13), on CPUs that
+multiply matrices of bfloat16 (AMX), leaves strided convolutions to one cell along the last axis uncomputed
+(https://github.com/pytorch/pytorch/issues/169688), in two dimensions as in three, and computes some 3-D convolutions
+of grids with one cell along the first axis wrongly.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +13,8 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 from torch.nn import functional
+
+from nmpm.processors.padding import crop
 
 CONVOLUTIONS: dict[int, Callable[..., nn.Module]] = {1: nn.Conv1d, 2: nn.Conv2d, 3: nn.Conv3d}
 TRANSPOSED: dict[int, Callable[..., nn.Module]] = {1: nn.ConvTranspose1d, 2: nn.ConvTranspose2d, 3: nn.ConvTranspose3d}
@@ -35,6 +43,7 @@ class Convolution(nn.Module):
     ) -> None:
         super().__init__()
         pad = (kernel - stride + 1) // 2
+        self.stride = stride
         self.padding = _circular_padding(periodic, pad)
         zeros = tuple(0 if wraps else pad for wraps in periodic)
         kind = CONVOLUTIONS[len(periodic)]
@@ -42,10 +51,8 @@ class Convolution(nn.Module):
 
     def forward(self, grid: Tensor) -> Tensor:
         """Map (B, C, *S) to (B, C', *S / stride)."""
-        if any(self.padding):
-            grid = functional.pad(grid, self.padding, mode="circular")
-        out: Tensor = self.convolution(grid)
-        return out
+        shape = [cells // self.stride for cells in grid.shape[2:]]
+        return crop(self.convolution(_extend(_wrap(grid, self.padding), shape, self.stride)), shape)
 
 
 class Upsampling(nn.Module):
@@ -54,15 +61,19 @@ class Upsampling(nn.Module):
     def __init__(self, channels: int, periodic: Sequence[bool]) -> None:
         super().__init__()
         self.padding = _circular_padding(periodic, 1)
-        cropped = tuple(3 if wraps else 1 for wraps in periodic)  # twice the padding, and the kernel's overlap
-        self.convolution = TRANSPOSED[len(periodic)](channels, channels, 4, 2, cropped)
+        # Twice the padding, and the kernel's overlap. The first of three axes is cut afterwards: where oneDNN 3.12
+        # crops it by 3, the weights' gradients of short grids are wrong, in float32 too.
+        self.cut = 2 if len(periodic) == 3 and periodic[0] else 0
+        cropped = [3 if wraps else 1 for wraps in periodic]
+        cropped[0] -= self.cut
+        self.convolution = TRANSPOSED[len(periodic)](channels, channels, 4, 2, tuple(cropped))
 
     def forward(self, grid: Tensor) -> Tensor:
         """Map (B, C, *S) to (B, C, *2S)."""
-        if any(self.padding):
-            grid = functional.pad(grid, self.padding, mode="circular")
-        out: Tensor = self.convolution(grid)
-        return out
+        shape = [2 * cells for cells in grid.shape[2:]]
+        grid = _wrap(grid, self.padding)
+        fine = self.convolution(_extend(grid, grid.shape[2:], 1))
+        return crop(fine.narrow(2, self.cut, fine.shape[2] - 2 * self.cut), shape)
 
 
 def pointwise(channels: Sequence[int], dim: int) -> nn.Sequential:
@@ -71,6 +82,16 @@ def pointwise(channels: Sequence[int], dim: int) -> nn.Sequential:
     for width, following in pairwise(channels):
         layers += [CONVOLUTIONS[dim](width, following, 1), nn.LeakyReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
+
+
+def _wrap(grid: Tensor, padding: Sequence[int]) -> Tensor:
+    return functional.pad(grid, padding, mode="circular") if any(padding) else grid
+
+
+def _extend(grid: Tensor, shape: Sequence[int], by: int) -> Tensor:
+    """Add `by` cells of zeros at the upper end of each axis that has one cell in `shape`."""
+    missing = [end for cells in reversed(shape) for end in (0, by if cells == 1 else 0)]
+    return functional.pad(grid, missing) if any(missing) else grid
 
 
 def _circular_padding(periodic: Sequence[bool], pad: int) -> list[int]:

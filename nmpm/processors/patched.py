@@ -16,6 +16,7 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.patches import cells_to_channels, channels_to_cells
 from nmpm.processors.unet import UNet
 
 
@@ -71,24 +72,3 @@ class PatchedNetwork(GridProcessor):
         fields = channels_to_cells(self.network(coarse).flatten(0, 1), self.patch)
         out: Tensor = fields.unflatten(0, (grid.shape[0], -1))
         return crop(out, grid.shape[2:], first=3)
-
-
-def cells_to_channels(grid: Tensor, patch: int) -> Tensor:
-    """(B, C, *S) → (B, C * patch ** D, *S / patch)."""
-    dim = grid.dim() - 2
-    for axis in range(dim + 1, 1, -1):
-        grid = grid.unflatten(axis, (-1, patch))
-    within, across = range(3, 2 * dim + 2, 2), range(2, 2 * dim + 2, 2)
-    coarse: Tensor = grid.permute(0, 1, *within, *across).flatten(1, dim + 1)
-    return coarse
-
-
-def channels_to_cells(fields: Tensor, patch: int) -> Tensor:
-    """(B, C * patch ** D, *S) → (B, C, *S * patch), the inverse of `cells_to_channels`."""
-    dim = fields.dim() - 2
-    split = fields.unflatten(1, (-1, *(patch,) * dim))
-    order = [place for axis in range(dim) for place in (2 + dim + axis, 2 + axis)]
-    joined: Tensor = split.permute(0, 1, *order)
-    for axis in range(2, dim + 2):
-        joined = joined.flatten(axis, axis + 1)
-    return joined

@@ -1,0 +1,96 @@
+"""Convolutions and their gradients on grids of few cells, in the precisions that trainings use."""
+
+from itertools import product
+
+import pytest
+import torch
+
+from nmpm.processors import Axial, ConvNeXt, Patched, UNet, UNetModern
+from nmpm.processors.base import GridLayout
+from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution, Upsampling
+from nmpm.processors.patches import embed_patches, return_patches
+
+CHANNELS = 24
+
+
+def fill_freed_memory():
+    """Leave large numbers in memory that the next tensors are given, so that what is not computed is seen."""
+    for size in (64, 256, 1024, 4096, 16384):
+        del [torch.full((size,), 1e6) for _ in range(20)][:]
+
+
+def results_and_gradients(layer, grid, call, precision):
+    grid = grid.detach().requires_grad_()
+    layer.zero_grad()
+    with torch.autocast("cpu", torch.bfloat16, enabled=precision == torch.bfloat16):
+        out = call(layer, grid)
+    torch.manual_seed(1)
+    out.backward(torch.randn(out.shape, dtype=torch.float64).bfloat16().to(out.dtype))
+    return [out.detach(), grid.grad, *(parameter.grad.clone() for parameter in layer.parameters())]
+
+
+def assert_as_in_double(layer, grid, call, precision):
+    """Everything agrees with the same in float64, which has loops of its own."""
+    for tensor in layer.state_dict().values():
+        tensor.copy_(tensor.bfloat16())
+    grid = grid.bfloat16().to(precision if precision == torch.float64 else torch.float32)
+    fill_freed_memory()
+    found = results_and_gradients(layer, grid, call, precision)
+    expected = results_and_gradients(layer.double(), grid.double(), call, torch.float64)
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        assert (one - other).abs().max() <= 0.02 * other.abs().max() + 1e-6, grid.shape
+
+
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("periodic", [(False, False), (True, False), (False, True), (False,) * 3, (True, False, False)])
+def test_few_cells_are_halved_and_doubled_as_in_double_precision(periodic, precision):
+    for cells in product((1, 2, 3, 6), repeat=len(periodic)):
+        torch.manual_seed(0)
+        fine = torch.randn(2, CHANNELS, *(2 * n for n in cells))
+        assert_as_in_double(
+            Convolution(CHANNELS, CHANNELS, 4, periodic, stride=2), fine, lambda layer, grid: layer(grid), precision
+        )
+        coarse = torch.randn(2, CHANNELS, *cells)
+        assert_as_in_double(Upsampling(CHANNELS, periodic), coarse, lambda layer, grid: layer(grid), precision)
+
+
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_few_patches_are_taken_and_returned_as_in_double_precision(dim, precision):
+    for cells in product((1, 2, 6), repeat=dim):
+        torch.manual_seed(0)
+        fine = torch.randn(2, CHANNELS, *(4 * n for n in cells))
+        embed = CONVOLUTIONS[dim](CHANNELS, CHANNELS, 4, 4)
+        assert_as_in_double(embed, fine, lambda layer, grid: embed_patches(layer, grid, 4), precision)
+        coarse = torch.randn(2, CHANNELS, *cells)
+        back = TRANSPOSED[dim](CHANNELS, CHANNELS, 4, 4)
+        assert_as_in_double(back, coarse, lambda layer, grid: return_patches(layer, grid, 4), precision)
+
+
+@pytest.mark.parametrize("channels", [8, 12])
+@pytest.mark.parametrize("kernel", [3, 5])
+def test_three_dimensions_of_one_cell_are_convolved_as_in_double_precision(kernel, channels):
+    for cells in product((1, 2, 3), (1, 2, 6), (1, 3, 6)):
+        torch.manual_seed(0)
+        layer = Convolution(channels, channels, kernel, (False,) * 3)
+        grid = torch.randn(2, channels, *cells)
+        assert_as_in_double(layer, grid, lambda layer, grid: layer(grid), torch.bfloat16)
+
+
+LAYOUTS = [GridLayout(5, 2, 8, (False, False)), GridLayout(5, 2, 8, (True, False)), GridLayout(6, 3, 2, (False,) * 3)]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=["box", "channel", "room"])
+@pytest.mark.parametrize("recipe", [UNet(), UNetModern(), ConvNeXt(), Axial(), Patched(Axial())], ids=str)
+def test_processors_in_bfloat16_predict_what_they_do_in_float32(recipe, layout):
+    torch.manual_seed(0)
+    network = recipe.build(layout)
+    cells = (32, 32) if layout.dim == 2 else (8, 16, 8)
+    grid = torch.randn(2, layout.in_channels, *cells)
+    with torch.no_grad():
+        expected = network(grid)
+        fill_freed_memory()
+        with torch.autocast("cpu", torch.bfloat16):
+            found = network(grid)
+    assert (found - expected).square().mean() <= 0.05**2 * expected.square().mean()
