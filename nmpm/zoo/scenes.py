@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,9 @@ from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
 from nmpm.zoo.pretrained import Pretrained
+
+Rows = Sequence[Mapping[str, float]]
+"""Figures by their names, of each test scene."""
 
 
 def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None) -> Iterator[Window]:
@@ -49,7 +52,7 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
 
 def track_test_scenes(what: str, model: Pretrained, data: Path | None) -> Iterator[Window]:
     """All of `iterate_test_scenes` whole, with a progress bar that says what is done with them."""
-    with progress_bar(f"{what} of {model.name}", _count(model)) as advance:
+    with progress_bar(f"{what} of {model.name}", len(stated_rows(model))) as advance:
         for window in iterate_test_scenes(model, None, data):
             yield window
             advance()
@@ -74,19 +77,26 @@ def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
     if model.preset not in preset_names():
         raise ConfigError(f"{model.name} was tested on recorded data ({model.card.get('dataset')}): give their folder.")
     preset = load_preset(str(model.preset))
-    return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": _count(model)})
+    return preset, SimulationRequest(preset, {"train": 0, "valid": 0, "test": len(stated_rows(model))})
 
 
-def _count(model: Pretrained) -> int:
-    """Number of test scenes that a model's card has errors of.
+def stated_rows(model: Pretrained) -> Rows:
+    """The errors of single test scenes that a model's card states, in their order.
 
     Raises:
-        ZooError: if it has none.
+        ZooError: if it states none, or they are not figures by their names.
     """
     rows = model.card.get("per_trajectory")
-    if not isinstance(rows, list) or not rows:
+    if not rows:
         raise ZooError(f"{model.name}: its card states no errors of single test scenes (per_trajectory).")
-    return len(rows)
+    if not isinstance(rows, list) or not all(row and is_figures(row) for row in rows):
+        raise ZooError(f"{model.name}: per_trajectory of its card should list the figures of each test scene by name.")
+    return rows
+
+
+def is_figures(values: object) -> bool:
+    """Whether something read from a card is numbers by their names."""
+    return isinstance(values, Mapping) and all(isinstance(value, int | float) for value in values.values())
 
 
 def _check_same_scenes(model: Pretrained, found: object, data: Path) -> None:

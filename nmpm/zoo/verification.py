@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,10 +16,8 @@ from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.zoo.golden import TOLERANCE, golden_distance
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.scenes import iterate_test_scenes
+from nmpm.zoo.scenes import Rows, is_figures, iterate_test_scenes, stated_rows
 
-Rows = Sequence[Mapping[str, float]]
-"""Figures by their names, of each test scene."""
 SHORT_SCENES, SHORT_FRAMES = 2, 100
 ROUNDING = 1e-5
 """Relative difference of a mean from the stated one that is tolerated: cards state means in float32."""
@@ -74,7 +72,7 @@ def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> I
     golden = model.card.get("golden")
     if golden is not None:
         yield Check("golden rollout, largest distance in cells", 0.0, golden_distance(model, golden), 0.0, TOLERANCE)
-    rows = _stated_rows(model)
+    rows = stated_rows(model)
     yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
     errors = [_errors(model, window) for window in islice(iterate_test_scenes(model, frames, data), count)]
@@ -85,20 +83,6 @@ def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> I
     yield from checks
 
 
-def _stated_rows(model: Pretrained) -> Rows:
-    """The errors of single test scenes that a model's card states.
-
-    Raises:
-        ZooError: if it states none, or they are not figures by their names.
-    """
-    rows = model.card.get("per_trajectory")
-    if not rows:
-        raise ZooError(f"{model.name}: its card states no errors of single test scenes (per_trajectory).")
-    if not isinstance(rows, list) or not all(row and _is_figures(row) for row in rows):
-        raise ZooError(f"{model.name}: per_trajectory of its card should list the figures of each test scene by name.")
-    return rows
-
-
 def _headline(model: Pretrained, rows: Rows) -> Iterator[Check]:
     """The figures that cards, tables and choices show beside the means of those of single test scenes.
 
@@ -107,17 +91,13 @@ def _headline(model: Pretrained, rows: Rows) -> Iterator[Check]:
     """
     test = model.card.get("test")
     own = {name: value for name, value in test.items() if "/" not in name} if isinstance(test, Mapping) else {}
-    if "mse" not in own or not _is_figures(own):
+    if "mse" not in own or not is_figures(own):
         raise ZooError(f"{model.name}: test of its card should state figures by name, such as mse.")
     for name, stated in own.items():
         found = [row[name] for row in rows if name in row]
         mean = float(np.mean(found)) if found else math.nan
         bounds = sorted((1 + sign * ROUNDING) * stated for sign in (-1, 1))
         yield Check(f"test {name}, as the mean over the card's {len(rows)} test scenes", stated, mean, *bounds)
-
-
-def _is_figures(values: object) -> bool:
-    return isinstance(values, Mapping) and all(isinstance(value, int | float) for value in values.values())
 
 
 def _scenes(rows: Rows, errors: Rows) -> Iterator[Check]:
