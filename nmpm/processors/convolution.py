@@ -73,7 +73,7 @@ class Upsampling(nn.Module):
         shape = [2 * cells for cells in grid.shape[2:]]
         grid = _wrap(grid, self.padding)
         fine = self.convolution(_extend(grid, grid.shape[2:], 1))
-        return crop(fine.narrow(2, self.cut, fine.shape[2] - 2 * self.cut), shape)
+        return crop(fine[:, :, self.cut :], shape)
 
 
 def pointwise(channels: Sequence[int], dim: int) -> nn.Sequential:

@@ -1,6 +1,7 @@
 """Convolutions and their gradients on grids of few cells, in the precisions that trainings use."""
 
 from itertools import product
+from operator import call
 
 import pytest
 import torch
@@ -19,24 +20,24 @@ def fill_freed_memory():
         del [torch.full((size,), 1e6) for _ in range(20)][:]
 
 
-def results_and_gradients(layer, grid, call, precision):
+def results_and_gradients(layer, grid, apply, precision):
     grid = grid.detach().requires_grad_()
     layer.zero_grad()
     with torch.autocast("cpu", torch.bfloat16, enabled=precision == torch.bfloat16):
-        out = call(layer, grid)
+        out = apply(layer, grid)
     torch.manual_seed(1)
     out.backward(torch.randn(out.shape, dtype=torch.float64).bfloat16().to(out.dtype))
     return [out.detach(), grid.grad, *(parameter.grad.clone() for parameter in layer.parameters())]
 
 
-def assert_as_in_double(layer, grid, call, precision):
+def assert_as_in_double(layer, grid, apply, precision):
     """Everything agrees with the same in float64, which has loops of its own."""
     for tensor in layer.state_dict().values():
         tensor.copy_(tensor.bfloat16())
-    grid = grid.bfloat16().to(precision if precision == torch.float64 else torch.float32)
+    grid = grid.bfloat16().float()
     fill_freed_memory()
-    found = results_and_gradients(layer, grid, call, precision)
-    expected = results_and_gradients(layer.double(), grid.double(), call, torch.float64)
+    found = results_and_gradients(layer, grid, apply, precision)
+    expected = results_and_gradients(layer.double(), grid.double(), apply, torch.float64)
     for one, other in zip(found, expected, strict=True):
         assert one.shape == other.shape
         assert (one - other).abs().max() <= 0.02 * other.abs().max() + 1e-6, grid.shape
@@ -48,11 +49,9 @@ def test_few_cells_are_halved_and_doubled_as_in_double_precision(periodic, preci
     for cells in product((1, 2, 3, 6), repeat=len(periodic)):
         torch.manual_seed(0)
         fine = torch.randn(2, CHANNELS, *(2 * n for n in cells))
-        assert_as_in_double(
-            Convolution(CHANNELS, CHANNELS, 4, periodic, stride=2), fine, lambda layer, grid: layer(grid), precision
-        )
+        assert_as_in_double(Convolution(CHANNELS, CHANNELS, 4, periodic, stride=2), fine, call, precision)
         coarse = torch.randn(2, CHANNELS, *cells)
-        assert_as_in_double(Upsampling(CHANNELS, periodic), coarse, lambda layer, grid: layer(grid), precision)
+        assert_as_in_double(Upsampling(CHANNELS, periodic), coarse, call, precision)
 
 
 @pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
@@ -75,7 +74,7 @@ def test_three_dimensions_of_one_cell_are_convolved_as_in_double_precision(kerne
         torch.manual_seed(0)
         layer = Convolution(channels, channels, kernel, (False,) * 3)
         grid = torch.randn(2, channels, *cells)
-        assert_as_in_double(layer, grid, lambda layer, grid: layer(grid), torch.bfloat16)
+        assert_as_in_double(layer, grid, call, torch.bfloat16)
 
 
 LAYOUTS = [GridLayout(5, 2, 8, (False, False)), GridLayout(5, 2, 8, (True, False)), GridLayout(6, 3, 2, (False,) * 3)]
