@@ -171,11 +171,11 @@ def _error_bars(axes: Any, point: Point, one: Standing) -> list[Box]:
 
 
 def _join(axes: Any, x: float, y: float, box: Box, colour: str) -> None:
-    """A thin line from a point to its name, unless that is beside it."""
+    """A dotted line from a point to its name, unless that is beside it; error bars are solid."""
     near = (min(max(x, box.left), box.right), min(max(y, box.bottom), box.top))
     if math.dist((x, y), near) > 1.5 * _MARK:
         ends = axes.transData.inverted().transform([(x, y), near])
-        axes.plot(*ends.T, color=colour, lw=0.5, scalex=False, scaley=False)
+        axes.plot(*ends.T, color=colour, lw=0.9, linestyle=":", scalex=False, scaley=False)
 
 
 def _short(point: Point) -> str:
