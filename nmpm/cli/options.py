@@ -144,10 +144,20 @@ def data_options(chosen: argparse.Namespace) -> Options:
         static=_parse("--static", chosen.static, _ids, 'type ids, e.g. 1,3, or "none"'),
         bounds=_parse("--bounds", chosen.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
         dt=chosen.dt,
-        gravity=_parse("--gravity", chosen.gravity, _numbers, "a number for each axis, e.g. 0,-9.81"),
+        gravity=gravity_option(chosen.gravity),
         periodic=_parse("--boundary", chosen.boundary, _kinds, '"wall" or "periodic" for each axis'),
         fields=_parse("--fields", chosen.fields, _field_names, "names, e.g. temperature,stiffness"),
     )
+
+
+def gravity_option(text: str | None) -> tuple[float, ...] | None:
+    """The numbers of `--gravity`.
+
+    Raises:
+        ConfigError: if they cannot be read.
+    """
+    numbers: tuple[float, ...] | None = _parse("--gravity", text, _numbers, "a number for each axis, e.g. 0,-9.81")
+    return numbers
 
 
 def new_ids(text: str | None) -> dict[int, int] | None:

@@ -16,6 +16,7 @@ from nmpm.cli.options import (
     check_device,
     check_input,
     check_output,
+    gravity_option,
 )
 from nmpm.errors import ConfigError
 
@@ -65,6 +66,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
     parser.add_argument("--blocks", type=int, default=1, help="number of blocks (default: 1)")
     parser.add_argument(
+        "--gravity",
+        metavar="X,Y[,Z]",
+        help="that pulls at thrown blocks, in length/s², for models of scenes that differ in it, e.g. 0,9.81, or"
+        " --gravity=-9.81,0 (default: downwards)",
+    )
+    parser.add_argument(
         "--precision",
         choices=["float32", "bfloat16"],
         default="float32",
@@ -86,13 +93,16 @@ def _check(chosen: argparse.Namespace) -> None:
         check_at_least(f"--{name}", getattr(chosen, name), least)
     if chosen.data is not None:
         check_input("--data", chosen.data)
+        if chosen.gravity is not None:
+            raise ConfigError("--gravity is of thrown blocks: leave it out beside --data, which has its own.")
     check_output("--out", chosen.out)
     check_device(chosen.device)
 
 
 def _thrown_state(model: Pretrained, chosen: argparse.Namespace) -> Particles:
+    gravity = gravity_option(chosen.gravity)
     try:
-        return model.example(chosen.seed, chosen.particles, chosen.blocks)
+        return model.example(chosen.seed, chosen.particles, chosen.blocks, gravity)
     except ConfigError as error:
         raise ConfigError(f"--particles {chosen.particles} --blocks {chosen.blocks}: {error}") from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,12 +54,14 @@ def predicted_trajectory(
     resting = np.broadcast_to(obstacle, (len(position), *obstacle.shape))
     types = _type_ids(scene)
     moving = np.array(list(types), dtype=np.int64)[state.material[index, real].cpu().numpy()]
-    attributes = {
+    attributes: dict[str, Any] = {
         "generator": f"nmpm {__version__}, predicted by {model}",
         "scene": json.dumps(scene.to_dict()),
         "particle_types": json.dumps({**types, BOUNDARY: "boundary"}),
         "static_types": np.array([BOUNDARY]),
     }
+    if scene.gravity_varies:
+        attributes["gravity"] = (state.gravity[index].double() / scene.dt**2).cpu().numpy()
     ids = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
     stored = {
         name: _field_frames(state.fields.get(name, values[:, 0])[index], values[index], real, len(obstacle))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -45,10 +47,16 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         domain=scene.domain,
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
-        gravity=scene.gravity,
+        gravity=own_gravity(trajectory.attributes, scene),
         title=f"{split.path.name}, trajectory {index}",
         fields={name: {label: values[:, moving]} for name, values in fields.items() if values.shape[1] > 1},
     )
+
+
+def own_gravity(attributes: Mapping[str, Any], scene: Scene) -> tuple[float, ...] | None:
+    """The gravity that a trajectory's attributes state, else its scene's."""
+    own = attributes.get("gravity")
+    return scene.gravity if own is None else tuple(np.asarray(own, dtype=np.float64).ravel().tolist())
 
 
 def combine(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
-from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, WALL, Rgb, material_colours, vary_brightness
+from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours, vary_brightness
 from nmpm.viz.spacing import particle_spacing
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
@@ -27,6 +27,10 @@ DIAMETER_LIMITS = (2.2, 24.0)
 """Smallest and largest diameter of a disc in pixels."""
 DEPTH_FADE = 0.55
 """Fraction of the background in the colour of the farthest particles of a 3-D scene."""
+ARROW_SHARE = 0.055
+"""Radius of the disc that shows gravity, as a share of the panel's shorter side."""
+ARROW_LIMITS = (9.0, 24.0)
+"""Smallest and largest radius of it in pixels."""
 CHUNK_POINTS = 1_000_000
 """Largest number of canvas points written at once."""
 
@@ -69,6 +73,8 @@ class PanelRenderer:
         self._draw_discs(canvas, projected, colours)
         # RGBX because reducing RGBA would first multiply by the opacity, which is 1 everywhere.
         image = Image.frombuffer("RGBX", canvas.shape[::-1], canvas.tobytes(), "raw", "RGBX", 0, 1)
+        if self.trajectories.tilt is not None:
+            self._draw_gravity(ImageDraw.Draw(image), self.trajectories.tilt)
         return np.asarray(image.reduce(SUPERSAMPLING))[..., :3]
 
     def count_outside(self, position: Floats) -> int:
@@ -112,6 +118,19 @@ class PanelRenderer:
         for start in range(0, len(centre), step):
             part = slice(start, start + step)
             flat[centre[part, None] + offsets] = values[part]
+
+    def _draw_gravity(self, draw: ImageDraw.ImageDraw, tilt: float) -> None:
+        """An arrow that points where gravity does, on a disc in the upper right corner."""
+        (_, _), (right, top) = self._canvas_points(np.array(self.trajectories.bounds).T)
+        radius = SUPERSAMPLING * min(max(ARROW_SHARE * min(self.width, self.height), ARROW_LIMITS[0]), ARROW_LIMITS[1])
+        x, y = right - 1.4 * radius, top + 1.4 * radius
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), (*BACKGROUND, 255), (*EDGE, 255), SUPERSAMPLING)
+        along = radius * np.array([math.sin(tilt), math.cos(tilt)])  # on the canvas, whose second axis points down
+        across = np.array([along[1], -along[0]])
+        tail, neck, tip = (np.array([x, y]) + share * along for share in (-0.7, 0.1, 0.75))
+        width = max(SUPERSAMPLING, round(0.22 * radius))
+        draw.line([tuple(tail), tuple(neck)], (*TEXT, 255), width)
+        draw.polygon([tuple(point) for point in (tip, neck + 0.4 * across, neck - 0.4 * across)], (*TEXT, 255))
 
     @cached_property
     def _background(self) -> NDArray[np.uint32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
 
+STRAIGHT = math.radians(1)
+"""Gravity within this angle of straight down needs no arrow."""
 Floats = NDArray[np.floating[Any]]
 
 
@@ -27,8 +30,8 @@ class LabelledTrajectories:
         domain: Outer side of the walls, (lower, upper) per axis; default: `bounds`.
         obstacle: (M, D) positions of particles that do not move.
         periodic: Whether each axis is periodic; default: none is.
-        gravity: (D,) external acceleration; in 3-D the axis of its largest component is drawn vertically (default:
-            the second axis).
+        gravity: (D,) external acceleration, in any unit. In 3-D the axis of its largest component is drawn vertically
+            (default: the second axis); in 2-D an arrow shows it where it is not along the second axis downwards.
         title: Title of the picture.
         fields: Further numbers of the particles by name and label, (T, N), or (1, N) if constant in time; a trajectory
             may lack one. The viewer colours by them.
@@ -64,6 +67,7 @@ class LabelledTrajectories:
         obstacle: Floats | None = None,
         title: str = "",
         fields: Mapping[str, Mapping[str, Floats]] | None = None,
+        gravity: Sequence[float] | None = None,
     ) -> LabelledTrajectories:
         """Takes box, time step, periodicity, gravity and material names from a scene.
 
@@ -74,6 +78,7 @@ class LabelledTrajectories:
             obstacle: As in `LabelledTrajectories`.
             title: As in `LabelledTrajectories`.
             fields: As in `LabelledTrajectories`.
+            gravity: As in `LabelledTrajectories`, where scenes differ in it; the scene's when left out.
         """
         return cls(
             positions,
@@ -83,7 +88,7 @@ class LabelledTrajectories:
             domain=scene.domain,
             obstacle=obstacle,
             periodic=scene.periodic,
-            gravity=scene.gravity,
+            gravity=scene.gravity if gravity is None else tuple(gravity),
             title=title,
             fields=fields or {},
         )
@@ -118,6 +123,18 @@ class LabelledTrajectories:
         """The box's length along periodic axes, zero along the others."""
         periodic = self.periodic or (False,) * self.dim
         return tuple((high - low) * wraps for (low, high), wraps in zip(self.bounds, periodic, strict=True))
+
+    @property
+    def tilt(self) -> float | None:
+        """Counterclockwise angle from straight down to gravity in a 2-D picture, in radians.
+
+        None where gravity points down, is zero or is unknown, and in 3-D, where its axis is drawn vertically.
+        """
+        if self.dim != 2 or not self.gravity:
+            return None
+        across, up = self.gravity
+        angle = math.atan2(across, -up)
+        return angle if abs(angle) > STRAIGHT and (across or up) else None
 
     def evenly_spaced_frames(self, count: int) -> list[int]:
         """Indices of at most `count` frames, evenly spaced from the first to the last."""

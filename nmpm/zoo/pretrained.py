@@ -18,6 +18,7 @@ from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, Windows, differ
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
+from nmpm.zoo.calibrated import usual_gravity
 from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.states import Bodies, StateBuilder
 
@@ -115,24 +116,35 @@ class Pretrained:
         builder = StateBuilder(self.emulator, position, dtype)
         return builder.build(velocity, material, obstacle, gravity, fields, bodies).to(self.emulator.device)
 
-    def example(self, seed: int = 0, count: int = 1000, blocks: int = 1) -> Particles:
+    def example(
+        self, seed: int = 0, count: int = 1000, blocks: int = 1, gravity: ArrayLike | Tensor | None = None
+    ) -> Particles:
         """A state to start from: blocks of particles thrown into the scene's box.
 
         Args:
             seed: Of places and velocities, 0 or more.
             count: Approximate number of particles.
             blocks: Number of blocks.
+            gravity: (D,), as for `state`; where it varies and is left out, downwards along the second axis, as strong
+                as in the root mean square of the training.
 
         Raises:
             ConfigError: if a number is too small, or the blocks do not fit into the box.
+            DataError: if gravity is not the model's.
         """
         for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
             if value < least:
                 raise ConfigError(f"{name} = {value}: it must be at least {least}.")
         try:
-            return thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
+            state = thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
         except ValueError as error:
             raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
+        if gravity is None and self.scene.gravity_varies:
+            gravity = usual_gravity(self.emulator)
+        if gravity is None:
+            return state
+        own = StateBuilder(self.emulator, state.position, state.position.dtype).gravity(gravity)
+        return dataclasses.replace(state, gravity=own)
 
     def with_network(self, precision: str) -> Pretrained:
         """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16".

@@ -14,11 +14,12 @@ from nmpm._support.messages import one_line, suggestion
 from nmpm.emulator.bodies import sample_bodies
 from nmpm.emulator.contact import Contact, obstacle_share
 from nmpm.emulator.fields import warn_of_ignored
-from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import check_inputs
 from nmpm.errors import DataError
 from nmpm.obstacles import Body
 from nmpm.particles import Particles
+from nmpm.zoo.calibrated import calibrated_range, gravity_range
 
 Bodies = Sequence[Body] | Sequence[Sequence[Body]]
 """Obstacles of all scenes, or of each."""
@@ -79,7 +80,7 @@ class StateBuilder:
             mask=torch.ones_like(kind, dtype=torch.bool),
             obstacle=solid.to(self.dtype),
             obstacle_mask=torch.ones(solid.shape[:2], dtype=torch.bool, device=solid.device),
-            gravity=(self._gravity(gravity) * dt**2).to(self.dtype),
+            gravity=self.gravity(gravity),
             fields=self._fields(fields or {}),
             obstacle_share=share,
         )
@@ -166,6 +167,14 @@ class StateBuilder:
         joined = torch.cat([solid, points.expand(self.batch, *points.shape).to(solid)], dim=1)
         return joined, torch.cat([whole, share], dim=1).to(self.dtype)
 
+    def gravity(self, given: Any) -> Tensor:
+        """(B, D) in length per frame squared, from (D,) or (B, D) in length/s²; None for the scene's.
+
+        Raises:
+            DataError: if it is not the model's, or needed.
+        """
+        return (self._gravity(given) * self.scene.dt**2).to(self.dtype)
+
     def _gravity(self, given: Any) -> Tensor:
         scene, shape = self.scene, (self.batch, self.scene.dim)
         if given is None:
@@ -196,7 +205,7 @@ class StateBuilder:
         )
 
     def _check_gravity_range(self, found: Tensor) -> None:
-        low, high = (limit / self.scene.dt for limit in self._ranges("gravity_"))
+        low, high = gravity_range(self.emulator)
         outside = (found < low - 0.01 * low.abs()) | (found > high + 0.01 * high.abs())
         if outside.any():
             scene = int(outside.any(-1).nonzero()[0])
@@ -207,7 +216,7 @@ class StateBuilder:
 
     def _check_speeds(self, velocity: Tensor, material: Tensor) -> None:
         """Compare velocities (B, N, D) in length/s with the range that the network was calibrated for."""
-        ranges = [self._ranges(f"{name}.velocity_") for name in self.scene.materials]
+        ranges = [calibrated_range(self.emulator, f"{name}.velocity_") for name in self.scene.materials]
         limits = torch.stack([torch.maximum(low.abs(), high.abs()) for low, high in ranges]).to(velocity)
         ratio = (velocity.detach().abs() / limits[material].clamp(min=1e-30)).amax(-1)
         fastest = int(ratio.argmax())
@@ -245,16 +254,6 @@ class StateBuilder:
                 " trained for that, and they may hold up the rest: move them or the obstacle.",
                 stacklevel=4,
             )
-
-    def _ranges(self, prefix: str) -> tuple[Tensor, Tensor]:
-        """Lower and upper limits (D,) of the input channels of that prefix, in length/s; infinite where unlimited."""
-        channels = [i for i, name in enumerate(self.scene.input_channels) if name.startswith(prefix)]
-        scale = torch.tensor(self.emulator.grid.spacing, dtype=torch.float64) / self.scene.dt
-        low, high = (
-            limit[channels].flatten().cpu().double() for limit in (self.emulator.input_low, self.emulator.input_high)
-        )
-        low = torch.where(low <= -UNLIMITED / 2, -torch.inf, low)
-        return low * scale, torch.where(high >= UNLIMITED / 2, torch.inf, high) * scale
 
     def _expand(self, name: str, given: Any, allowed: list[tuple[int, ...]], shape: tuple[int, ...]) -> Tensor:
         found = _numbers(name, given)

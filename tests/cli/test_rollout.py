@@ -12,6 +12,7 @@ from nmpm._support.shipped import shipped_folder
 from nmpm._support.writable import file_obstacle
 from nmpm.cli import main
 from nmpm.data.format import Split
+from nmpm.viz.files import read_labelled
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +54,9 @@ def test_another_runtime_gives_the_same_rollout_to_rounding(folder):
         (["goop", "--seed", "-1"], "--seed -1: it must be at least 0."),
         (["goop", "--trajectory", "-1"], "--trajectory -1: it must be at least 0."),
         (["goop", "--particles", "1000000"], "Use fewer particles or more blocks."),
+        (["goop", "--gravity", "down"], "--gravity down"),
+        (["goop", "--gravity", "0,-5"], "but the model knows only [0.0, -9.81]"),
+        (["wbcsph", "--gravity", "0,-50", "--particles", "50"], "outside of the range that the model was calibrated"),
         (["goop", "--data", "nowhere.h5"], "--data nowhere.h5: there is no such file."),
         (["goop", "--data", "."], "--data .: it is a folder; name a file in it"),
         (["goop", "--out", "no/where.h5"], "--out no/where.h5: the folder no does not exist"),
@@ -74,6 +78,17 @@ def test_wrong_calls_get_one_line(words, message, folder, capsys):
     assert message in said
     assert said.count("\n") == 1
     assert not list(folder.glob("*.h5"))
+
+
+def test_the_gravity_of_a_rollout_is_written_beside_it(folder, capsys):
+    few = ["rollout", "wbcsph", "--frames", "2", "--particles", "50"]
+    assert main(few) == 0
+    np.testing.assert_allclose(Split(folder / "out.h5").read(0).attributes["gravity"], [0, -9.81], rtol=1e-3)
+    assert main([*few, "--gravity", "6,7.5"]) == 0
+    np.testing.assert_allclose(Split(folder / "out.h5").read(0).attributes["gravity"], [6, 7.5], rtol=1e-6)
+    assert read_labelled(Split(folder / "out.h5")).gravity == pytest.approx((6, 7.5))
+    assert main([*few, "--gravity", "6,7.5", "--data", "out.h5"]) == 1
+    assert "--gravity is of thrown blocks" in capsys.readouterr().err
 
 
 WRITERS = [

@@ -118,3 +118,26 @@ def test_a_single_particle_is_drawn(still):
     trajectories = still([[0.5, 0.5]], ["water"])
     image = PanelRenderer(trajectories, 100).draw(first_frame(trajectories))
     assert (image == material_colour("water")).all(axis=2).sum() > 100
+
+
+@pytest.mark.parametrize(("gravity", "toward"), [((9.81, 0.0), (1, 0)), ((-1e-4, 0.0), (-1, 0)), ((0.0, 1.0), (0, 1))])
+def test_an_arrow_points_where_gravity_does_unless_that_is_down(still, gravity, toward):
+    plain = still([[0.2, 0.2]], ["water"])
+    turned = dataclasses.replace(plain, gravity=gravity)
+    drawn = PanelRenderer(turned, 300).draw(first_frame(plain)).astype(int)
+    rows, columns = np.nonzero((drawn != PanelRenderer(plain, 300).draw(first_frame(plain))).any(axis=2))
+    assert rows.max() < 60  # the disc lies in the upper right corner
+    assert columns.min() > 240
+    middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
+    dark = np.argwhere(drawn.sum(axis=2) < 300)[:, ::-1] - middle  # right and down
+    along, across = np.array([toward[0], -toward[1]]), np.array([toward[1], toward[0]])
+    head = dark[np.abs(dark @ across) > 3].mean(axis=0)  # the widest part
+    assert head @ along > 1.5
+    assert abs(head @ across) < 2
+
+
+@pytest.mark.parametrize("gravity", [(0.0, -9.81), (0.0, 0.0)])
+def test_gravity_that_is_down_or_zero_draws_no_arrow(still, gravity):
+    plain = still([[0.2, 0.2]], ["water"])
+    drawn = PanelRenderer(dataclasses.replace(plain, gravity=gravity), 300).draw(first_frame(plain))
+    np.testing.assert_array_equal(drawn, PanelRenderer(plain, 300).draw(first_frame(plain)))

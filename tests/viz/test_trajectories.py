@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.viz import LabelledTrajectories, material_names
+from nmpm.viz.trajectories import STRAIGHT
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -95,3 +96,32 @@ def test_type_ids_are_converted_to_names():
 def test_a_type_id_without_a_name_is_reported():
     with pytest.raises(DataError, match=r"type 9 .*5 water"):
         material_names([5, 9], {5: "water"})
+
+
+@given(st.floats(-3.1, 3.1), st.floats(1e-6, 100))
+def test_tilt_is_the_angle_by_which_gravity_is_turned_from_down(angle, strength):
+    down = np.array([0.0, -strength])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    trajectories = LabelledTrajectories(
+        {"a": np.full((1, 1, 2), 0.5)}, np.array(["water"]), ((0, 1),) * 2, 1.0, gravity=tuple(turn @ down)
+    )
+    if abs(angle) < 0.99 * STRAIGHT:
+        assert trajectories.tilt is None
+    elif abs(angle) > 1.01 * STRAIGHT:
+        assert trajectories.tilt == pytest.approx(angle)
+
+
+@pytest.mark.parametrize("gravity", [None, (0.0, -9.81), (0.0, 0.0), (0.05, -9.81)])
+def test_gravity_that_is_down_zero_or_unknown_has_no_tilt(falling, gravity):
+    assert dataclasses.replace(falling, gravity=gravity).tilt is None
+
+
+def test_in_3d_gravity_has_no_tilt(still):
+    assert still([[0.5, 0.5, 0.5]], ["water"], gravity=(9.81, 0.0, 0.0)).tilt is None
+
+
+def test_a_trajectory_may_have_a_gravity_of_its_own(falling):
+    scene = Scene(((0.1, 0.9),) * 2, ((0.0, 1.0),) * 2, 0.0025, ("goop",), 1e-4, gravity_varies=True)
+    own = LabelledTrajectories.from_scene(scene, falling.positions, np.array([0, 0]), gravity=[9.81, 0.0])
+    assert own.gravity == (9.81, 0.0)
+    assert LabelledTrajectories.from_scene(scene, falling.positions, np.array([0, 0])).gravity is None

@@ -150,3 +150,11 @@ def test_a_single_trajectory_has_no_error_to_show(open_page):
     assert page.locator("#errors").is_hidden()
     assert page.locator("#layout-choice").is_hidden()
     assert page.locator("#colour option").count() == 2
+
+
+def test_an_arrow_beside_the_name_points_where_gravity_does(open_page):
+    page = open_page(dataclasses.replace(one_particle(), gravity=(9.81, 0.0)))
+    arrows = page.locator("#labels small i")
+    assert arrows.count() == 2
+    assert arrows.first.evaluate("arrow => arrow.style.transform") == "rotate(-1.5708rad)"  # from down to the right
+    assert open_page(one_particle()).locator("#labels small").count() == 0

@@ -35,7 +35,8 @@ def goop(tmp_path) -> Path:
     return folder
 
 
-def test_quality_floor_and_the_worst_scene_are_on_the_card(goop, capsys):
+def test_quality_floor_and_pictures_are_on_the_card(goop, capsys):
+    former = (goop / "rollout.png").read_bytes()
     words = ["zoo", "refresh", "goop", "--measure", "quality", "floor", "--root", str(goop.parent)]
     assert main(words) == 0
     card = yaml.safe_load((goop / "card.yaml").read_text())
@@ -47,7 +48,9 @@ def test_quality_floor_and_the_worst_scene_are_on_the_card(goop, capsys):
     assert quality["worst"]["scene"] in (0, 1)
     assert 0 < floor["mse"] < 1e-2 * quality["worst"]["mse"]
     assert floor["nudge"] == NUDGE
-    assert (goop / "worst.png").read_bytes()[:4] == b"\x89PNG"
+    pictures = [(goop / name).read_bytes() for name in ("rollout.png", "worst.png")]
+    assert all(picture[:4] == b"\x89PNG" for picture in pictures)
+    assert former != pictures[0] != pictures[1]  # of the first scene, with a title in the other
     text = (goop / "README.md").read_text()
     assert "![the test scene with the largest error](worst.png)" in text
     assert "Predictability: the simulator beside itself" in text

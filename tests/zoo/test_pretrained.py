@@ -6,17 +6,34 @@ import pytest
 import torch
 
 from nmpm.emulator import EmulatorRecipe
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 from nmpm.processors import UNet
 from nmpm.zoo import Pretrained
 from tests.scenes import box
 
 
+def model_of(scene):
+    torch.manual_seed(0)
+    recipe = EmulatorRecipe(scene, cells=8, frames=2, processor=UNet(width=4, depth=1, perceptron=(4,)))
+    return Pretrained(recipe.build().eval().requires_grad_(False), {"name": "small"})
+
+
 @pytest.fixture
 def model():
-    torch.manual_seed(0)
-    recipe = EmulatorRecipe(box(), cells=8, frames=2, processor=UNet(width=4, depth=1, perceptron=(4,)))
-    return Pretrained(recipe.build().eval().requires_grad_(False), {"name": "small"})
+    return model_of(box())
+
+
+@pytest.fixture
+def turned():
+    """A model of scenes in which gravity of (6, 8) length/s² points to either side."""
+    model = model_of(box(gravity=None, gravity_varies=True))
+    emulator, dt = model.emulator, model.scene.dt
+    channels = [i for i, name in enumerate(model.scene.input_channels) if name.startswith("gravity")]
+    statistics = {"input_mean": [0.0, -8.0], "input_std": [6.0, 0.0], "input_low": [-12, -12], "input_high": [12, 12]}
+    for name, values in statistics.items():
+        cells = torch.tensor(values) * dt**2 / emulator.grid.spacing[0]
+        getattr(emulator, name)[channels] = cells.view(-1, *emulator.input_mean.shape[1:])
+    return model
 
 
 def test_over_a_wider_domain_the_same_weights_get_more_cells_of_the_same_size(model):
@@ -51,3 +68,27 @@ def test_scenes_that_a_model_cannot_take_are_refused(model, change, message):
 def test_a_model_prints_as_one_line(model):
     weights = sum(values.numel() for values in model.emulator.parameters())
     assert repr(model) == f"<Pretrained small: unknown data, UNet of {weights:,} parameters on cpu>"
+
+
+def test_examples_fall_downwards_where_gravity_varies(turned):
+    state = turned.example(count=50)
+    torch.testing.assert_close(state.gravity / turned.scene.dt**2, torch.tensor([[0.0, -10.0]]))
+    start = dataclasses.replace(state, velocity=torch.zeros_like(state.velocity))
+    assert (turned.rollout(start, 2)[..., 1] != start.position[..., 1]).any()
+
+
+def test_examples_have_the_gravity_that_is_asked_for(turned, model):
+    state = turned.example(count=50, gravity=(6.0, 7.5))
+    torch.testing.assert_close(state.gravity / turned.scene.dt**2, torch.tensor([[6.0, 7.5]]))
+    with pytest.raises(DataError, match="outside of the range"):
+        turned.example(count=50, gravity=(0.0, -30.0))
+    torch.testing.assert_close(model.example().gravity, model.example(gravity=(0.0, -9.81)).gravity)
+    with pytest.raises(DataError, match="knows only"):
+        model.example(gravity=(0.0, -5.0))
+
+
+def test_an_example_is_pulled_no_more_than_calibration_knows(turned):
+    low = turned.emulator.input_low
+    channels = [i for i, name in enumerate(turned.scene.input_channels) if name.startswith("gravity")]
+    low[channels] *= 0.5
+    torch.testing.assert_close(turned.example(count=50).gravity / turned.scene.dt**2, torch.tensor([[0.0, -6.0]]))

@@ -84,7 +84,8 @@ def draw_frames(path: Path, outcomes: Sequence[Outcome], scenes: Scenes) -> None
 def _trajectories(columns: Mapping[str, Floats], scenes: Scenes) -> LabelledTrajectories:
     first = scenes.recordings[0]
     obstacle = first.obstacle.numpy() if len(first.obstacle) else None
-    return LabelledTrajectories.from_scene(scenes.scene, columns, first.material.numpy(), obstacle)
+    material, gravity = first.material.numpy(), first.gravity.tolist()
+    return LabelledTrajectories.from_scene(scenes.scene, columns, material, obstacle, gravity=gravity)
 
 
 def _aspect(scenes: Scenes) -> float:

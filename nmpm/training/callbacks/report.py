@@ -168,7 +168,8 @@ def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Ten
     rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
     title = f"The prediction is not finite from frame {frames} on" if broken.any() else ""
-    return LabelledTrajectories.from_scene(scene, rows, window.material[0, real].numpy(), obstacle, title)
+    material, gravity = window.material[0, real].numpy(), window.gravity[0].tolist()
+    return LabelledTrajectories.from_scene(scene, rows, material, obstacle, title, gravity=gravity)
 
 
 def _simulation(datamodule: Any) -> dict[str, Any]:

@@ -94,6 +94,7 @@ def _describe_box(trajectories: LabelledTrajectories) -> dict[str, Any]:
         "domain": [list(side) for side in trajectories.outer_bounds],
         "period": list(trajectories.periods),
         "up": vertical_axis(trajectories),
+        "tilt": trajectories.tilt,
     }
 
 

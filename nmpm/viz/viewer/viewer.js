@@ -205,6 +205,7 @@ class Viewer {
       label.textContent = names.length > 1 ? `${names.slice(1).join(", ")} over ${names[0]} (grey)` : names[0];
       label.style.left = `${x + width / 2}px`;
       label.style.top = `${y - 24}px`;
+      if (scene.tilt !== null) label.append(gravityNote(scene.tilt));
       return label;
     }));
   }
@@ -264,6 +265,15 @@ class Viewer {
     this.camera.zoomBy(Math.exp(-event.deltaY / 500), right, above, width, height);
     this.show();
   }
+}
+
+/** Says where gravity points: an angle from straight down, counterclockwise in radians. */
+function gravityNote(tilt) {
+  const note = document.createElement("small"), arrow = document.createElement("i");
+  arrow.textContent = "↓";
+  arrow.style.transform = `rotate(${-tilt}rad)`;
+  note.append("gravity ", arrow);
+  return note;
 }
 
 /** The option after the chosen one, in a circle. */

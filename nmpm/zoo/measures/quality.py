@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from nmpm.evaluation.bootstrap import interval
@@ -15,12 +16,13 @@ from nmpm.viz import LabelledTrajectories, write_snapshots
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import track_test_scenes
 
-WORST = "worst.png"
+FIRST, WORST = "rollout.png", "worst.png"
+"""Pictures of the first test scene and of that with the largest error."""
 EMD_FRAMES = 3
 
 
 def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:
-    """The key `quality` of a card, and `worst.png`: the test scene with the largest error, beside its prediction.
+    """The key `quality` of a card, and pictures of test scenes beside their predictions: the first, and the worst.
 
     Returns:
         `quality`: for each of `emd` (domain length), `kinetic`, `height` and `crowding` (relative), the `mean` over the
@@ -31,10 +33,13 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     for window in track_test_scenes("quality", model, data):
         predicted = model.rollout(window.initial.to(model.emulator.device), window.target.shape[1]).cpu()
         rows.append(measure_errors(model.scene, window, predicted, Measures((), EMD_FRAMES)))
+        if len(rows) == 1:
+            write_snapshots(_beside(model, window, predicted), folder / FIRST)
         if worst is None or rows[-1]["mse"] >= max(row["mse"] for row in rows):
             worst = window, predicted
     if worst is not None:
-        _draw(model, *worst, folder / WORST)
+        title = f"{model.name}: the test scene with the largest error"
+        write_snapshots(_beside(model, *worst, title), folder / WORST)
     names = [name for name in rows[0] if name not in ("mse", GAIN) and all(name in row for row in rows)]
     index = int(np.argmax([row["mse"] for row in rows]))
     found: dict[str, Any] = {name: _summary([row[name] for row in rows]) for name in names}
@@ -46,11 +51,11 @@ def _summary(values: list[float]) -> dict[str, Any]:
     return mean | ({"interval": list(interval(values))} if len(values) > 1 else {})
 
 
-def _draw(model: Pretrained, window: Window, predicted: Tensor, path: Path) -> None:
+def _beside(model: Pretrained, window: Window, predicted: Tensor, title: str = "") -> LabelledTrajectories:
+    """A test scene and its prediction; both start with the two frames that the prediction started from."""
     moving = window.mask[0]
-    positions = {"truth": window.target[0, :, moving].numpy(), "prediction": predicted[0, :, moving].numpy()}
-    initial = window.initial
-    obstacle = None if initial.obstacle is None else initial.obstacle[0, initial.obstacle_mask[0]].numpy()
-    material = window.material[0, moving].numpy()
-    title = f"{model.name}: the test scene with the largest error"
-    write_snapshots(LabelledTrajectories.from_scene(model.scene, positions, material, obstacle, title), path)
+    truth = window.frames[0][:, moving]
+    rows = {"truth": truth.numpy(), "prediction": torch.cat([truth[:2], predicted[0][:, moving]]).numpy()}
+    obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
+    material, gravity = window.material[0, moving].numpy(), window.gravity[0].tolist()
+    return LabelledTrajectories.from_scene(model.scene, rows, material, obstacle, title, gravity=gravity)
