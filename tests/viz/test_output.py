@@ -109,6 +109,7 @@ def test_a_failing_encoder_is_reported(falling, tmp_path, monkeypatch):
     encoder.write_text("\n".join((f"#!{sys.executable}", *lines)))
     encoder.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(encoder))
+    monkeypatch.chdir(tmp_path)  # counting frames, it is told to write to "-"
     with pytest.raises(DataError, match="video encoder"):
         write_animation(falling, tmp_path / "a.mp4")
     assert not (tmp_path / "a.mp4").exists()
