@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
-    parser.add_argument("--blocks", type=int, default=1, help="number of blocks (default: 1)")
+    parser.add_argument("--blocks", type=int, help="number of blocks (default: one of each material)")
     parser.add_argument(
         "--gravity",
         metavar="X,Y[,Z]",
@@ -104,7 +104,8 @@ def _thrown_state(model: Pretrained, chosen: argparse.Namespace) -> Particles:
     try:
         return model.example(chosen.seed, chosen.particles, chosen.blocks, gravity)
     except ConfigError as error:
-        raise ConfigError(f"--particles {chosen.particles} --blocks {chosen.blocks}: {error}") from error
+        blocks = "" if chosen.blocks is None else f" --blocks {chosen.blocks}"
+        raise ConfigError(f"--particles {chosen.particles}{blocks}: {error}") from error
 
 
 def _recorded_state(model: Pretrained, path: Path, index: int) -> Particles:

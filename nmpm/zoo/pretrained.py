@@ -117,14 +117,18 @@ class Pretrained:
         return builder.build(velocity, material, obstacle, gravity, fields, bodies).to(self.emulator.device)
 
     def example(
-        self, seed: int = 0, count: int = 1000, blocks: int = 1, gravity: ArrayLike | Tensor | None = None
+        self,
+        seed: int = 0,
+        count: int = 1000,
+        blocks: int | None = None,
+        gravity: ArrayLike | Tensor | None = None,
     ) -> Particles:
         """A state to start from: blocks of particles thrown into the scene's box.
 
         Args:
             seed: Of places and velocities, 0 or more.
             count: Approximate number of particles.
-            blocks: Number of blocks.
+            blocks: Number of blocks; one of each material when left out.
             gravity: (D,), as for `state`; where it varies and is left out, downwards along the second axis, as strong
                 as in the root mean square of the training.
 
@@ -132,6 +136,7 @@ class Pretrained:
             ConfigError: if a number is too small, or the blocks do not fit into the box.
             DataError: if gravity is not the model's.
         """
+        blocks = len(self.scene.materials) if blocks is None else blocks
         for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
             if value < least:
                 raise ConfigError(f"{name} = {value}: it must be at least {least}.")

@@ -92,3 +92,10 @@ def test_an_example_is_pulled_no_more_than_calibration_knows(turned):
     channels = [i for i, name in enumerate(turned.scene.input_channels) if name.startswith("gravity")]
     low[channels] *= 0.5
     torch.testing.assert_close(turned.example(count=50).gravity / turned.scene.dt**2, torch.tensor([[0.0, -6.0]]))
+
+
+def test_an_example_has_a_block_of_each_material():
+    mixed = model_of(box(materials=("water", "sand", "goop")))
+    state = mixed.example(count=300)
+    assert state.material[0].bincount().tolist() == [100, 100, 100]
+    assert mixed.example(count=100, blocks=1).material.unique().tolist() == [0]
