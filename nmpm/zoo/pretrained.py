@@ -15,10 +15,10 @@ from torch import Tensor
 from nmpm._support.devices import find_device
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, Windows, differentiable_rollout, predict_rollout
+from nmpm.emulator.calibrated import with_usual_gravity
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
-from nmpm.zoo.calibrated import usual_gravity
 from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.states import Bodies, StateBuilder
 
@@ -144,10 +144,8 @@ class Pretrained:
             state = thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
         except ValueError as error:
             raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
-        if gravity is None and self.scene.gravity_varies:
-            gravity = usual_gravity(self.emulator)
         if gravity is None:
-            return state
+            return with_usual_gravity(self.emulator, state)
         own = StateBuilder(self.emulator, state.position, state.position.dtype).gravity(gravity)
         return dataclasses.replace(state, gravity=own)
 

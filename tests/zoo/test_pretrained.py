@@ -87,13 +87,6 @@ def test_examples_have_the_gravity_that_is_asked_for(turned, model):
         model.example(gravity=(0.0, -5.0))
 
 
-def test_an_example_is_pulled_no_more_than_calibration_knows(turned):
-    low = turned.emulator.input_low
-    channels = [i for i, name in enumerate(turned.scene.input_channels) if name.startswith("gravity")]
-    low[channels] *= 0.5
-    torch.testing.assert_close(turned.example(count=50).gravity / turned.scene.dt**2, torch.tensor([[0.0, -6.0]]))
-
-
 def test_an_example_has_a_block_of_each_material():
     mixed = model_of(box(materials=("water", "sand", "goop")))
     state = mixed.example(count=300)

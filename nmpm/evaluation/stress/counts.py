@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
+from nmpm.emulator.calibrated import with_usual_gravity
 from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject
@@ -30,7 +31,8 @@ def _with_counts(subject: Subject, size: Size) -> Iterator[Line]:
     volume, finest = _VOLUME_SHARE * subject.emulator.scene.volume, None
     for number in (10**power for power in reversed(range(8)) if 10**power <= size.particles):
         scene = dataclasses.replace(subject.emulator.scene, particle_volume=volume / number)
-        state = thrown_blocks(scene, count=number, seed=subject.seed).to(subject.device)
+        state = with_usual_gravity(subject.emulator, thrown_blocks(scene, count=number, seed=subject.seed))
+        state = state.to(subject.device)
         trace = trace_rollout(subject.emulator.over(scene), state, 2 * subject.horizon)
         centre = trace.last.mean(1)
         finest = centre if finest is None else finest
@@ -70,7 +72,8 @@ def _full_box(subject: Subject, size: Size) -> Line:
     """A box full of particles, which can hardly move; coarser ones where too many would be needed."""
     scene = subject.emulator.scene
     scene = dataclasses.replace(scene, particle_volume=max(scene.particle_volume, scene.volume / size.particles))
-    state = state_at_rest(scene, lattice(scene.bounds, scene.particle_spacing)).to(subject.device)
+    state = state_at_rest(scene, lattice(scene.bounds, scene.particle_spacing))
+    state = with_usual_gravity(subject.emulator, state).to(subject.device)
     trace = trace_rollout(subject.emulator.over(scene), state, 4 * subject.horizon)
     moved = rms_distance(subject.emulator.grid, state.mask, state.position.unsqueeze(1), trace.last.unsqueeze(1))
     figures = trace.figures() | {"moved_cells": float(moved)}

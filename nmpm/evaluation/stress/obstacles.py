@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nmpm.data.initial_states import lattice, state_at_rest
+from nmpm.emulator.calibrated import with_usual_gravity
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
 from nmpm.evaluation.stress.lines import Line, Size
@@ -83,7 +84,7 @@ def _moving_bar(emulator: Emulator, bundles: int) -> Line:
     first = (left, left + 3 * h)
     still = bar(scene, (first, (low, (low + high) / 2), *rest))
     block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), scene.particle_spacing)
-    state = state_at_rest(scene, block, still).to(emulator.device)
+    state = _at_rest(emulator, block, still)
     still = state.obstacle[0]
 
     def place(bundle: int) -> float:
@@ -111,7 +112,7 @@ def _inlet(emulator: Emulator, bundles: int) -> Line:
     ]
     if scene.dim > 1:
         sides[1] = (scene.bounds[1][1] - 8 * h[1], scene.bounds[1][1] - 2 * h[1])
-    fresh = state_at_rest(scene, lattice(tuple(sides), scene.particle_spacing)).to(emulator.device)
+    fresh = _at_rest(emulator, lattice(tuple(sides), scene.particle_spacing))
 
     def feed(state: Particles, bundle: int) -> Particles:
         return concatenate_particles(state, fresh) if bundle % 5 == 0 and bundle else state
@@ -160,9 +161,14 @@ def _block(emulator: Emulator, slab: tuple[Interval, ...], speed: float, solid: 
     scene, h = emulator.scene, emulator.grid.spacing
     box = [(low + (high - low) / 3, high - (high - low) / 3) for low, high in scene.bounds]
     box[1] = (slab[1][1] + 2 * h[1], slab[1][1] + 16 * h[1])
-    state = state_at_rest(scene, lattice(tuple(box), scene.particle_spacing), solid).to(emulator.device)
+    state = _at_rest(emulator, lattice(tuple(box), scene.particle_spacing), solid)
     down = state.velocity.new_tensor([0.0, -speed * h[1]] + [0.0] * (scene.dim - 2))
     return state.with_motion(state.position, state.velocity + down)
+
+
+def _at_rest(emulator: Emulator, position: Tensor, solid: Tensor | None = None) -> Particles:
+    """Particles (N, D) at rest, and perhaps obstacle particles (M, D), on the emulator's device."""
+    return with_usual_gravity(emulator, state_at_rest(emulator.scene, position, solid)).to(emulator.device)
 
 
 def _floats(figures: dict[str, int]) -> dict[str, float]:

@@ -14,6 +14,7 @@ from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import Recording, RecordingReader
 from nmpm.data.seeds import try_seeds
 from nmpm.emulator import Emulator
+from nmpm.emulator.calibrated import with_usual_gravity
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset
 
@@ -54,7 +55,8 @@ class Subject:
             return simulate_window(self, self.preset, count, 0).initial
         scene = self.emulator.scene
         few = max(1, min(1000, int(0.1 * scene.volume / scene.particle_volume)))
-        return thrown_blocks(scene, count=few, seed=self.seed).to(self.device)
+        state = with_usual_gravity(self.emulator, thrown_blocks(scene, count=few, seed=self.seed))
+        return state.to(self.device)
 
     def entropies(self, count: int) -> list[tuple[int, int, int]]:
         """Numbers that the seeds of scenes outside of any dataset are derived from, see `nmpm.data.seeds`."""

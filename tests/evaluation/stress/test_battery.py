@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 import json
 import math
 
@@ -273,6 +274,20 @@ def test_one_in_the_way_of_a_model_without_walls_is_left_out():
     subject = Subject("open", emulator_of(scene), 8)
     names = [line.name for line in battery(subject, TINY, {"obstacles": GROUPS["obstacles"]})]
     assert names == ["an inlet"]
+
+
+@pytest.mark.parametrize(("group", "runs"), [("counts", "trace_rollout"), ("obstacles", "unroll")])
+def test_made_up_scenes_are_not_weightless_where_gravity_varies(group, runs, monkeypatch):
+    emulator = emulator_of(box(gravity=None, gravity_varies=True))
+    emulator.input_std[[name.startswith("gravity") for name in emulator.scene.input_channels]] = 1.0
+    module, pulls = importlib.import_module(f"nmpm.evaluation.stress.{group}"), []
+    run = getattr(module, runs)
+    monkeypatch.setattr(
+        module, runs, lambda model, state, *rest: pulls.append(state.gravity) or run(model, state, *rest)
+    )
+    assert list(battery(Subject("turned", emulator, 8), TINY, {group: GROUPS[group]}))
+    assert pulls
+    assert all((pull[:, 1] < 0).all() and (pull[:, 0] == 0).all() for pull in pulls)
 
 
 def test_absolute_models_are_taken_too():

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
 from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.particles import Particles
 
 
 def calibrated_range(emulator: Emulator, prefix: str) -> tuple[Tensor, Tensor]:
@@ -32,6 +35,14 @@ def usual_gravity(emulator: Emulator) -> Tensor:
     down = torch.zeros_like(mean)
     down[1] = -(mean.square() + std.square()).sum().sqrt()
     return torch.clamp(down, *gravity_range(emulator))
+
+
+def with_usual_gravity(emulator: Emulator, state: Particles) -> Particles:
+    """A made-up state with the usual gravity where the emulator's scenes differ in it; elsewhere the state itself."""
+    if not emulator.scene.gravity_varies:
+        return state
+    pull = (usual_gravity(emulator) * emulator.scene.dt**2).to(state.gravity)
+    return dataclasses.replace(state, gravity=pull.expand(state.gravity.shape))
 
 
 def _values(emulator: Emulator, statistic: Tensor, prefix: str) -> Tensor:

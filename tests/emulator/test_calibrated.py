@@ -1,0 +1,52 @@
+"""What a model's calibration says of gravity, in the units of the data."""
+
+import pytest
+import torch
+
+from nmpm.emulator import EmulatorRecipe
+from nmpm.emulator.calibrated import calibrated_range, gravity_range, usual_gravity, with_usual_gravity
+from nmpm.processors import Pointwise
+from tests.scenes import box, cloud
+
+
+def turned(dim=2, **limits):
+    """An emulator of scenes in which gravity of 10 length/s² points to either side of down, calibrated up to 12."""
+    emulator = EmulatorRecipe(box(dim, gravity=None, gravity_varies=True), 14, 2, processor=Pointwise()).build().eval()
+    channels = [i for i, name in enumerate(emulator.scene.input_channels) if name.startswith("gravity")]
+    rest = [0.0] * (dim - 2)
+    statistics = {"input_mean": [0, -8, *rest], "input_std": [6, 0, *rest], "input_low": -12, "input_high": 12} | limits
+    for name, values in statistics.items():
+        statistic = getattr(emulator, name)
+        cells = torch.tensor(values, dtype=torch.float64) * emulator.scene.dt**2 / emulator.grid.spacing[0]
+        statistic[channels] = cells.expand(dim).reshape(dim, *statistic.shape[1:]).to(statistic)
+    return emulator
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_usual_gravity_is_the_root_mean_square_downwards(dim):
+    expected = torch.tensor([0.0, -10.0] + [0.0] * (dim - 2), dtype=torch.float64)
+    torch.testing.assert_close(usual_gravity(turned(dim)), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_usual_gravity_is_within_what_was_calibrated():
+    torch.testing.assert_close(usual_gravity(turned(input_low=-6)), torch.tensor([0.0, -6.0]).double())
+    sideways = turned(input_low=[2, -12])
+    torch.testing.assert_close(usual_gravity(sideways), torch.tensor([2.0, -10.0]).double(), rtol=1e-5, atol=1e-6)
+
+
+def test_ranges_are_in_the_units_of_the_data():
+    low, high = gravity_range(turned())
+    torch.testing.assert_close(low, torch.tensor([-12.0, -12.0]).double())
+    torch.testing.assert_close(high, -low)
+    low, high = calibrated_range(turned(), "goop.velocity_")
+    assert low.isneginf().all()
+    assert high.isposinf().all()
+
+
+def test_states_get_the_usual_gravity_where_scenes_differ_in_it():
+    emulator, dt = turned(), 0.0025
+    state = with_usual_gravity(emulator, cloud(emulator.scene, batch=3))
+    torch.testing.assert_close(state.gravity / dt**2, torch.tensor([[0.0, -10.0]]).expand(3, 2))
+    known = EmulatorRecipe(box(), 14, 2, processor=Pointwise()).build()
+    same = cloud(known.scene)
+    assert with_usual_gravity(known, same) is same
