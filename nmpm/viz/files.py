@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from nmpm._support.messages import one_line
 from nmpm.data.fields import read_fields
 from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.data.scene_inference import infer_scene
@@ -54,9 +55,21 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
 
 
 def own_gravity(attributes: Mapping[str, Any], scene: Scene) -> tuple[float, ...] | None:
-    """The gravity that a trajectory's attributes state, else its scene's."""
+    """The gravity that a trajectory's attributes state, else its scene's.
+
+    Raises:
+        DataError: if the attribute is not a number for each axis.
+    """
     own = attributes.get("gravity")
-    return scene.gravity if own is None else tuple(np.asarray(own, dtype=np.float64).ravel().tolist())
+    if own is None:
+        return scene.gravity
+    try:
+        stated = np.asarray(own, dtype=np.float64)
+    except (TypeError, ValueError):
+        stated = np.empty(0)
+    if stated.shape != (scene.dim,) or not np.isfinite(stated).all():
+        raise DataError(f"The attribute gravity = {one_line(own, 60)} should be {scene.dim} finite numbers.")
+    return tuple(stated.tolist())
 
 
 def combine(

@@ -178,3 +178,21 @@ def test_other_particles_are_refused(dataset):
     write_split(dataset / "fewer.h5", [made_up_trajectory(6, 4)])
     with pytest.raises(DataError, match="5 moving ones in 2-D, and 4"):
         view(dataset / "fewer.h5", truth=dataset / "test.h5")
+
+
+@pytest.mark.parametrize("gravity", ["down", [1.0, 2.0, 3.0], [np.nan, 0.0]])
+def test_a_gravity_that_is_none_is_reported(tmp_path, gravity):
+    write_metadata(tmp_path, made_up_metadata())
+    wrong = dataclasses.replace(made_up_trajectory(6, 5), attributes={"gravity": gravity})
+    write_split(tmp_path / "train.h5", [made_up_trajectory(6, 5)])
+    write_split(tmp_path / "out.h5", [wrong])
+    with pytest.raises(DataError, match=r"The attribute gravity = .* should be 2 finite numbers"):
+        view(tmp_path / "out.h5")
+
+
+def test_a_trajectory_is_shown_with_its_own_gravity(tmp_path):
+    write_metadata(tmp_path, made_up_metadata())
+    pulls = ([9.81, 0.0], [0.0, -9.81])
+    own = [dataclasses.replace(made_up_trajectory(6, 5), attributes={"gravity": pull}) for pull in pulls]
+    write_split(tmp_path / "train.h5", own)
+    assert description(view(tmp_path / "train.h5"))["tilt"] == pytest.approx(np.pi / 2)
