@@ -2,6 +2,7 @@
 
 import torch
 
+from nmpm.emulator import Emulator
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 
@@ -33,3 +34,12 @@ def cloud(
         obstacle_mask=torch.ones(batch, statics, dtype=torch.bool),
         gravity=torch.tensor(scene.gravity or (0.0,) * scene.dim).expand(batch, -1) * scene.dt**2,
     )
+
+
+def set_gravity_statistics(emulator: Emulator, **values: list[float]) -> None:
+    """Sets statistics of the input channels of gravity, such as `input_std`, to (D,) values in length/s²."""
+    channels = [i for i, name in enumerate(emulator.scene.input_channels) if name.startswith("gravity")]
+    for name, value in values.items():
+        statistic = getattr(emulator, name)
+        cells = torch.tensor(value, dtype=torch.float64) * emulator.scene.dt**2 / emulator.grid.spacing[0]
+        statistic[channels] = cells.view(-1, *statistic.shape[1:]).to(statistic)

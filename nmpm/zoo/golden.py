@@ -30,7 +30,7 @@ def golden_rollout(emulator: Emulator) -> dict[str, Any]:
     Of the first scenes it is the one that deforms the block most: what flies freely would hardly show that a network's
     output has changed.
     """
-    count = Pretrained(emulator, {}).fitting_count(COUNT)
+    count = Pretrained(emulator, {}).fitting_count(COUNT, blocks=1)
     paths = [_positions(emulator, seed, count, FRAMES) for seed in range(SEEDS)]
     seed = max(range(SEEDS), key=lambda seed: _deformation(emulator, seed, count, paths[seed]))
     return {"seed": seed, "count": count, "frames": FRAMES, "position": paths[seed].tolist()}

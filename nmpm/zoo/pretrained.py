@@ -196,11 +196,11 @@ class Pretrained:
     def _small_example(self) -> Particles:
         return self.example(count=self.fitting_count(_EXAMPLE)).to(self.emulator.device)
 
-    def fitting_count(self, count: int) -> int:
-        """The number of particles, halved until a block of them fits into the box."""
+    def fitting_count(self, count: int, blocks: int | None = None) -> int:
+        """The number of particles, halved until an example of so many blocks fits into the box."""
         while count > 1:
             try:
-                self.example(count=count)
+                self.example(count=count, blocks=blocks)
             except ConfigError:
                 count //= 2
             else:

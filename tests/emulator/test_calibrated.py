@@ -6,19 +6,16 @@ import torch
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.calibrated import calibrated_range, gravity_range, usual_gravity, with_usual_gravity
 from nmpm.processors import Pointwise
-from tests.scenes import box, cloud
+from tests.scenes import box, cloud, set_gravity_statistics
 
 
 def turned(dim=2, **limits):
     """An emulator of scenes in which gravity of 10 length/s² points to either side of down, calibrated up to 12."""
     emulator = EmulatorRecipe(box(dim, gravity=None, gravity_varies=True), 14, 2, processor=Pointwise()).build().eval()
-    channels = [i for i, name in enumerate(emulator.scene.input_channels) if name.startswith("gravity")]
     rest = [0.0] * (dim - 2)
-    statistics = {"input_mean": [0, -8, *rest], "input_std": [6, 0, *rest], "input_low": -12, "input_high": 12} | limits
-    for name, values in statistics.items():
-        statistic = getattr(emulator, name)
-        cells = torch.tensor(values, dtype=torch.float64) * emulator.scene.dt**2 / emulator.grid.spacing[0]
-        statistic[channels] = cells.expand(dim).reshape(dim, *statistic.shape[1:]).to(statistic)
+    usual = {"input_mean": [0, -8, *rest], "input_std": [6, 0, *rest]}
+    calibrated = {"input_low": [-12] * dim, "input_high": [12] * dim}
+    set_gravity_statistics(emulator, **usual | calibrated | limits)
     return emulator
 
 
@@ -29,7 +26,7 @@ def test_the_usual_gravity_is_the_root_mean_square_downwards(dim):
 
 
 def test_the_usual_gravity_is_within_what_was_calibrated():
-    torch.testing.assert_close(usual_gravity(turned(input_low=-6)), torch.tensor([0.0, -6.0]).double())
+    torch.testing.assert_close(usual_gravity(turned(input_low=[-6, -6])), torch.tensor([0.0, -6.0]).double())
     sideways = turned(input_low=[2, -12])
     torch.testing.assert_close(usual_gravity(sideways), torch.tensor([2.0, -10.0]).double(), rtol=1e-5, atol=1e-6)
 

@@ -9,7 +9,8 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import UNet
 from nmpm.zoo import Pretrained
-from tests.scenes import box
+from nmpm.zoo.golden import golden_distance, golden_rollout
+from tests.scenes import box, set_gravity_statistics
 
 
 def model_of(scene):
@@ -27,12 +28,8 @@ def model():
 def turned():
     """A model of scenes in which gravity of (6, 8) length/s² points to either side."""
     model = model_of(box(gravity=None, gravity_varies=True))
-    emulator, dt = model.emulator, model.scene.dt
-    channels = [i for i, name in enumerate(model.scene.input_channels) if name.startswith("gravity")]
-    statistics = {"input_mean": [0.0, -8.0], "input_std": [6.0, 0.0], "input_low": [-12, -12], "input_high": [12, 12]}
-    for name, values in statistics.items():
-        cells = torch.tensor(values) * dt**2 / emulator.grid.spacing[0]
-        getattr(emulator, name)[channels] = cells.view(-1, *emulator.input_mean.shape[1:])
+    limits = {"input_low": [-12, -12], "input_high": [12, 12]}
+    set_gravity_statistics(model.emulator, input_mean=[0, -8], input_std=[6, 0], **limits)
     return model
 
 
@@ -92,3 +89,12 @@ def test_an_example_has_a_block_of_each_material():
     state = mixed.example(count=300)
     assert state.material[0].bincount().tolist() == [100, 100, 100]
     assert mixed.example(count=100, blocks=1).material.unique().tolist() == [0]
+
+
+def test_a_golden_rollout_of_one_block_fits_where_blocks_of_each_material_do():
+    flat = ((0.1, 0.9), (0.1, 0.32))  # 11 particles high
+    mixed = model_of(box(materials=("water", "sand", "goop"), bounds=flat))
+    assert mixed.fitting_count(300) > mixed.fitting_count(300, blocks=1)
+    golden = golden_rollout(mixed.emulator)
+    assert golden["count"] == mixed.fitting_count(300, blocks=1)
+    assert golden_distance(mixed, golden) == 0

@@ -4,7 +4,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from scenes import box
+from scenes import box, set_gravity_statistics
 
 from nmpm.data.predictions import predicted_trajectory
 from nmpm.emulator import EmulatorRecipe
@@ -90,9 +90,7 @@ def test_obstacles_where_the_model_has_them():
 
 def test_gravity_where_it_varies():
     model = model_of(box(gravity=None, gravity_varies=True))
-    channels = [i for i, name in enumerate(model.scene.input_channels) if name.startswith("gravity")]
-    cells = 12.0 * model.scene.dt**2 / model.emulator.grid.spacing[0]
-    model.emulator.input_low[channels], model.emulator.input_high[channels] = -cells, cells
+    set_gravity_statistics(model.emulator, input_low=[-12, -12], input_high=[12, 12])
     state = model.state(np.stack([POSITIONS] * 2), gravity=[[0.0, -9.81], [3.0, 0.0]])
     torch.testing.assert_close(state.gravity[1], torch.tensor([3.0 * model.scene.dt**2, 0.0]))
     with pytest.raises(DataError, match="gravity is needed"):
