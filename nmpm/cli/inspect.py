@@ -230,8 +230,8 @@ def _draw(origin: FolderSource, found: Inspection, path: Path) -> None:
     import numpy as np
 
     from nmpm.data.format import Split, split_paths
+    from nmpm.data.gravity import own_gravity
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
-    from nmpm.viz.files import own_gravity
 
     metadata = origin.metadata
     trajectory = Split(next(iter(split_paths(origin.folder).values()))).read(0)
@@ -245,7 +245,7 @@ def _draw(origin: FolderSource, found: Inspection, path: Path) -> None:
         domain=origin.scene.domain,
         obstacle=trajectory.position[0, static],
         periodic=origin.scene.periodic,
-        gravity=own_gravity(trajectory.attributes, origin.scene),
+        gravity=own_gravity(trajectory.attributes, origin.scene, found.path),
         title=f"{Path(found.path).name}, first trajectory",
     )
     write_snapshots(pictured, path)

@@ -152,9 +152,9 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
     from rich.console import Console
 
     from nmpm._support.progress import terminal_progress
+    from nmpm.data.gravity import own_gravity
     from nmpm.sim.preset import BOUNDARY
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
-    from nmpm.viz.files import own_gravity
 
     with terminal_progress(Console(stderr=True)) as progress:
         task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
@@ -168,7 +168,7 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
         domain=scene.domain,
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
-        gravity=own_gravity(trajectory.attributes, scene),
+        gravity=own_gravity(trajectory.attributes, scene, preset.name),
         title=f"{preset.name}, simulated by nmpm ({preset.generator})",
     )
     write_snapshots(pictured, path)

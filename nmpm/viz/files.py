@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
-from nmpm._support.messages import one_line
 from nmpm.data.fields import read_fields
 from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.gravity import own_gravity
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -48,28 +46,10 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         domain=scene.domain,
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
-        gravity=own_gravity(trajectory.attributes, scene),
+        gravity=own_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
         title=f"{split.path.name}, trajectory {index}",
         fields={name: {label: values[:, moving]} for name, values in fields.items() if values.shape[1] > 1},
     )
-
-
-def own_gravity(attributes: Mapping[str, Any], scene: Scene) -> tuple[float, ...] | None:
-    """The gravity that a trajectory's attributes state, else its scene's.
-
-    Raises:
-        DataError: if the attribute is not a number for each axis.
-    """
-    own = attributes.get("gravity")
-    if own is None:
-        return scene.gravity
-    try:
-        stated = np.asarray(own, dtype=np.float64)
-    except (TypeError, ValueError):
-        stated = np.empty(0)
-    if stated.shape != (scene.dim,) or not np.isfinite(stated).all():
-        raise DataError(f"The attribute gravity = {one_line(own, 60)} should be {scene.dim} finite numbers.")
-    return tuple(stated.tolist())
 
 
 def combine(

@@ -1,11 +1,9 @@
-from types import SimpleNamespace
-
 import pytest
 import torch
 
+from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.particles import Window
 from nmpm.scene import Scene
-from nmpm.training.callbacks.report import labelled_trajectories
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -22,8 +20,7 @@ def test_a_non_finite_frame_ends_the_drawing_with_a_title(falling, bad):
     )
     predicted = truth[:, 2:].clone()
     predicted[0, 4:, 1, 0] = bad
-    module = SimpleNamespace(emulator=SimpleNamespace(scene=scene))
-    trajectories = labelled_trajectories(module, window, predicted)
+    trajectories = labelled_trajectories(scene, window, predicted)
     assert trajectories.frame_count == 6
     assert trajectories.title == "The prediction is not finite from frame 6 on"
-    assert labelled_trajectories(module, window, truth[:, 2:]).title == ""
+    assert labelled_trajectories(scene, window, truth[:, 2:]).title == ""

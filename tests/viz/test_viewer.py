@@ -186,7 +186,7 @@ def test_a_gravity_that_is_none_is_reported(tmp_path, gravity):
     wrong = dataclasses.replace(made_up_trajectory(6, 5), attributes={"gravity": gravity})
     write_split(tmp_path / "train.h5", [made_up_trajectory(6, 5)])
     write_split(tmp_path / "out.h5", [wrong])
-    with pytest.raises(DataError, match=r"The attribute gravity = .* should be 2 finite numbers"):
+    with pytest.raises(DataError, match=r"out.h5, trajectory 0: the attribute gravity = .* should be 2 finite numbers"):
         view(tmp_path / "out.h5")
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nmpm.data.fields import read_fields
 from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.gravity import own_gravity
 from nmpm.data.loading.background import raise_if_abandoned
 from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
@@ -131,13 +132,10 @@ class RecordingReader:
             )
 
     def _gravity(self, trajectory: Trajectory, where: str) -> Tensor:
-        known = trajectory.attributes.get("gravity", self.scene.gravity)
+        known = own_gravity(trajectory.attributes, self.scene, where)
         if known is None:
             return torch.zeros(self.scene.dim)
-        gravity = torch.as_tensor(np.asarray(known, dtype=np.float64))
-        if gravity.shape != (self.scene.dim,) or not gravity.isfinite().all():
-            raise DataError(f"{where}: the attribute gravity = {known} should be {self.scene.dim} finite numbers.")
-        return (gravity * self.scene.dt**2).float()
+        return (torch.tensor(known, dtype=torch.float64) * self.scene.dt**2).float()
 
 
 class SplitRecordings(Sequence[Recording]):

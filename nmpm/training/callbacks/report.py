@@ -23,10 +23,11 @@ from nmpm._support.digests import float32_digest
 from nmpm._support.version import __version__
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.evaluation.figures import PREDICTORS, figure_names, table_row
+from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.training.module import OVERALL, EmulatorModule
-from nmpm.viz import LabelledTrajectories, write_animation, write_snapshots
+from nmpm.viz import write_animation, write_snapshots
 
 
 class ReportWriter(Callback):
@@ -121,7 +122,7 @@ class ReportWriter(Callback):
             part.write_text(json.dumps(figures, indent=1) + "\n")
         _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()})
         if self._first_rollout is not None:
-            trajectories = labelled_trajectories(pl_module, *self._first_rollout)
+            trajectories = labelled_trajectories(pl_module.emulator.scene, *self._first_rollout)
             write_snapshots(trajectories, folder / "rollout.png")
             write_animation(trajectories, folder / "rollout.gif")
         _print_table(f"{figures['dataset']}: test", figures["test"])
@@ -153,23 +154,6 @@ class ReportWriter(Callback):
             **({} if self._first_rollout is None else {"particles": int(self._first_rollout[0].mask[0].sum())}),
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
         }
-
-
-def labelled_trajectories(module: EmulatorModule, window: Window, predicted: Tensor) -> LabelledTrajectories:
-    """The first trajectory of a batch beside its prediction, for pictures.
-
-    Both start with the two frames that the prediction started from; both end where the prediction is not finite.
-    """
-    scene, real = module.emulator.scene, window.mask[0]
-    truth = window.frames[0][:, real]
-    prediction = torch.cat([truth[:2], predicted[0][:, real]])
-    broken = ~prediction.isfinite().flatten(1).all(1)
-    frames = int(broken.int().argmax()) if broken.any() else len(prediction)
-    rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
-    obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
-    title = f"The prediction is not finite from frame {frames} on" if broken.any() else ""
-    material, gravity = window.material[0, real].numpy(), window.gravity[0].tolist()
-    return LabelledTrajectories.from_scene(scene, rows, material, obstacle, title, gravity=gravity)
 
 
 def _simulation(datamodule: Any) -> dict[str, Any]:

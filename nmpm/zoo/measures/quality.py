@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from nmpm.evaluation.bootstrap import interval
+from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.trade.errors import GAIN, Measures, measure_errors
 from nmpm.particles import Window
-from nmpm.viz import LabelledTrajectories, write_snapshots
+from nmpm.viz import write_snapshots
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import track_test_scenes
 
@@ -34,12 +34,12 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
         predicted = model.rollout(window.initial.to(model.emulator.device), window.target.shape[1]).cpu()
         rows.append(measure_errors(model.scene, window, predicted, Measures((), EMD_FRAMES)))
         if len(rows) == 1:
-            write_snapshots(_beside(model, window, predicted), folder / FIRST)
+            write_snapshots(labelled_trajectories(model.scene, window, predicted), folder / FIRST)
         if worst is None or rows[-1]["mse"] >= max(row["mse"] for row in rows):
             worst = window, predicted
     if worst is not None:
         title = f"{model.name}: the test scene with the largest error"
-        write_snapshots(_beside(model, *worst, title), folder / WORST)
+        write_snapshots(labelled_trajectories(model.scene, *worst, title), folder / WORST)
     names = [name for name in rows[0] if name not in ("mse", GAIN) and all(name in row for row in rows)]
     index = int(np.argmax([row["mse"] for row in rows]))
     found: dict[str, Any] = {name: _summary([row[name] for row in rows]) for name in names}
@@ -49,13 +49,3 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
 def _summary(values: list[float]) -> dict[str, Any]:
     mean = {"mean": float(np.mean(values))}
     return mean | ({"interval": list(interval(values))} if len(values) > 1 else {})
-
-
-def _beside(model: Pretrained, window: Window, predicted: Tensor, title: str = "") -> LabelledTrajectories:
-    """A test scene and its prediction; both start with the two frames that the prediction started from."""
-    moving = window.mask[0]
-    truth = window.frames[0][:, moving]
-    rows = {"truth": truth.numpy(), "prediction": torch.cat([truth[:2], predicted[0][:, moving]]).numpy()}
-    obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
-    material, gravity = window.material[0, moving].numpy(), window.gravity[0].tolist()
-    return LabelledTrajectories.from_scene(model.scene, rows, material, obstacle, title, gravity=gravity)

@@ -43,6 +43,16 @@ def test_gravity_of_the_trajectory_comes_first(make_dataset):
         recordings[2]
 
 
+@pytest.mark.parametrize("gravity", ["down", [float("nan"), 0.0]])
+def test_a_gravity_that_is_no_vector_is_reported(make_dataset, gravity):
+    folder = make_dataset()
+    recordings = recordings_of(folder)
+    with h5py.File(folder / "train.h5", "a") as file:
+        file["00001"].attrs["gravity"] = gravity
+    with pytest.raises(DataError, match=r"trajectory 00001: the attribute gravity = .* should be 2 finite numbers"):
+        recordings[1]
+
+
 def test_unknown_gravity_is_zero(make_dataset):
     assert recordings_of(make_dataset(gravity=None))[0].gravity.tolist() == [0, 0]
 

@@ -282,9 +282,12 @@ def test_made_up_scenes_are_not_weightless_where_gravity_varies(group, runs, mon
     emulator.input_std[[name.startswith("gravity") for name in emulator.scene.input_channels]] = 1.0
     module, pulls = importlib.import_module(f"nmpm.evaluation.stress.{group}"), []
     run = getattr(module, runs)
-    monkeypatch.setattr(
-        module, runs, lambda model, state, *rest: pulls.append(state.gravity) or run(model, state, *rest)
-    )
+
+    def noting(model, state, *rest):
+        pulls.append(state.gravity)
+        return run(model, state, *rest)
+
+    monkeypatch.setattr(module, runs, noting)
     assert list(battery(Subject("turned", emulator, 8), TINY, {group: GROUPS[group]}))
     assert pulls
     assert all((pull[:, 1] < 0).all() and (pull[:, 0] == 0).all() for pull in pulls)

@@ -1,0 +1,34 @@
+"""Test scenes beside their predictions, for pictures."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nmpm.particles import Window
+from nmpm.scene import Scene
+from nmpm.viz import LabelledTrajectories
+
+
+def labelled_trajectories(scene: Scene, window: Window, predicted: Tensor, title: str = "") -> LabelledTrajectories:
+    """The first trajectory of a batch beside its prediction, in its own gravity.
+
+    Both start with the two frames that the prediction started from; both end where the prediction is not finite, which
+    the title then says.
+
+    Args:
+        scene: Of the trajectories.
+        window: The recorded ones.
+        predicted: (B, T, N, D) positions after the first two frames, in domain length.
+        title: Of the picture.
+    """
+    real = window.mask[0]
+    truth = window.frames[0][:, real]
+    prediction = torch.cat([truth[:2], predicted[0][:, real]])
+    broken = ~prediction.isfinite().flatten(1).all(1)
+    frames = int(broken.int().argmax()) if broken.any() else len(prediction)
+    rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
+    obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()
+    title = f"The prediction is not finite from frame {frames} on" if broken.any() else title
+    material, gravity = window.material[0, real].numpy(), window.gravity[0].tolist()
+    return LabelledTrajectories.from_scene(scene, rows, material, obstacle, title, gravity=gravity)
