@@ -5,6 +5,9 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported; workers use the other cores
+
 import pytest
 import torch
 from hypothesis import HealthCheck, settings

@@ -40,12 +40,12 @@ def find_device(name: torch.device | str = "auto") -> torch.device:
     return device
 
 
-def device_name(device: torch.device) -> str:
-    """The model of a device: of the GPU, or of the processor with the number of threads that torch uses."""
+def device_name(device: torch.device, threads: int | None = None) -> str:
+    """The model of a device: of the GPU, or of the processor with the number of threads, by default those of torch."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "cpu":
-        return f"{processor_name()}, {counted(torch.get_num_threads(), 'thread')}"
+        return f"{processor_name()}, {counted(threads or torch.get_num_threads(), 'thread')}"
     return device.type
 
 

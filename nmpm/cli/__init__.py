@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 
+from nmpm._support.threads import limit_spinning
 from nmpm._support.version import __version__
 from nmpm.errors import NmpmError
 
@@ -75,6 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0 for success, 1 for an error, 2 for a wrong call, 3 for a training that has diverged, 130 for
         an interruption.
     """
+    limit_spinning()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
         sys.stdout.write(usage())

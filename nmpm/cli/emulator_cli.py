@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from jsonargparse.typing import PositiveInt
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -15,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.devices import device_name, find_device
+from nmpm._support.threads import stated_threads
 from nmpm.cli.options import check_folder
 from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
@@ -26,6 +28,7 @@ from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.stop_on_signal import StopOnSignal
+from nmpm.training.callbacks.threads import Threads
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.compatibility import check_same_recipe
 from nmpm.training.module import OVERALL, EmulatorModule
@@ -39,6 +42,10 @@ BEST = {"filename": "best", "monitor": f"valid/{OVERALL}", "enable_version_count
 # does not change.
 LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
 
+THREADS = (
+    "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
+    " used, as measured). Another number changes results by rounding."
+)
 START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
@@ -72,6 +79,7 @@ class EmulatorCLI(LightningCLI):
         parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
         parser.add_lightning_class_args(ModelCheckpoint, "resume")
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
+        parser.add_argument("--threads", type=PositiveInt | None, default=None, help=THREADS)
         if self.words[0] == "fit":
             parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate", compute_fn=self._model_scene)
@@ -137,7 +145,8 @@ class EmulatorCLI(LightningCLI):
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(Progress())
         self.stop_on_signal = StopOnSignal(self._checkpoint_file("resume"))
-        guards = [DivergenceGuard(), ReportWriter(), PredictionWriter(), self.stop_on_signal]
+        self.threads = Threads(stated_threads(self.config_init[self.subcommand]["threads"]))
+        guards = [self.threads, DivergenceGuard(), ReportWriter(), PredictionWriter(), self.stop_on_signal]
         kwargs["callbacks"] = [*callbacks, *guards]
         return super().instantiate_trainer(**kwargs)
 
@@ -183,10 +192,12 @@ class EmulatorCLI(LightningCLI):
     def _print_start(self) -> None:
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
+        device = self.trainer.strategy.root_device
+        hardware = self.threads.describe(self.trainer) if device.type == "cpu" else device_name(device)
         weights = sum(parameter.numel() for parameter in self.model.emulator.parameters())
         sys.stdout.write(
             f"Data: {self.datamodule.description}. Model: {type(self.model.emulator.recipe.processor).__name__},"
-            f" {weights:,} parameters, on {device_name(self.trainer.strategy.root_device)}.\n"
+            f" {weights:,} parameters, on {hardware}.\n"
         )
         if self.replaced_precision:
             sys.stdout.write(

@@ -12,6 +12,7 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
+    from nmpm.zoo import Pretrained
 
 MODEL = (
     "a model of the zoo (see nmpm zoo list); a path: a run, a checkpoint, or an entry's folder; or an id of the Hugging"
@@ -31,6 +32,28 @@ def add_device_option(parser: argparse.ArgumentParser, purpose: str = "") -> Non
     parser.add_argument(
         "--device", default="cpu", help=f"{purpose}auto, cpu (default), cuda or mps; cuda:1 for the second GPU"
     )
+
+
+def add_threads_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--threads`."""
+    parser.add_argument(
+        "--threads",
+        type=int,
+        help="of a CPU (default: OMP_NUM_THREADS; else the faster of one and all that may be used, as measured)",
+    )
+
+
+def choose_threads(model: Pretrained, stated: int | None) -> None:
+    """Let a model's calls on a CPU use the threads that are stated, or the faster of one and all."""
+    if model.emulator.device.type == "cpu":
+        import torch
+
+        from nmpm._support.threads import ThreadChoice, stated_threads
+
+        choice = ThreadChoice(stated_threads(stated), torch.set_num_threads)
+        torch.set_num_threads(choice.most)
+        # Programs compiled for a number of threads would be compiled anew for another.
+        model.emulator.thread_choice = None if model.emulator.runtime.fixed_shapes else choice
 
 
 def add_runtime_option(parser: argparse.ArgumentParser) -> None:

@@ -12,10 +12,12 @@ from nmpm.cli.options import (
     add_device_option,
     add_model_options,
     add_runtime_option,
+    add_threads_option,
     check_at_least,
     check_device,
     check_input,
     check_output,
+    choose_threads,
     gravity_option,
 )
 from nmpm.errors import ConfigError
@@ -40,6 +42,7 @@ def run(words: list[str]) -> None:
     from nmpm.zoo.registry import load_model
 
     model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime, chosen.precision)
+    choose_threads(model, chosen.threads)
     given = chosen.data is not None
     state = _recorded_state(model, chosen.data, chosen.trajectory) if given else _thrown_state(model, chosen)
     _write(model, state, chosen)
@@ -58,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_model_options(parser)
     add_device_option(parser)
+    add_threads_option(parser)
     parser.add_argument("--frames", type=int, default=400, help="frames to predict (default: 400)")
     parser.add_argument("--out", type=Path, default=Path("out.h5"), help="file to write (default: out.h5)")
     parser.add_argument("--data", type=Path, help="start from a trajectory of this HDF5 file (native layout)")
@@ -89,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _check(chosen: argparse.Namespace) -> None:
     """Check the numbers and paths before anything is loaded."""
-    for name, least in (("frames", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
+    for name, least in (("frames", 1), ("threads", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
         check_at_least(f"--{name}", getattr(chosen, name), least)
     if chosen.data is not None:
         check_input("--data", chosen.data)

@@ -13,8 +13,11 @@ from nmpm.cli.options import (
     add_device_option,
     add_model_options,
     add_runtime_option,
+    add_threads_option,
+    check_at_least,
     check_device,
     check_folder,
+    choose_threads,
 )
 from nmpm.errors import ConfigError
 
@@ -39,6 +42,7 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["stress", "goop"]."""
     chosen = _parser().parse_args(words[1:])
     check_device(chosen.device)
+    check_at_least("--threads", chosen.threads, 1)
     if chosen.report is not None:
         check_folder("--report", chosen.report)
     from nmpm.evaluation.stress import FULL, GROUPS, QUICK
@@ -60,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_model_options(parser)
     add_device_option(parser)
+    add_threads_option(parser)
     add_runtime_option(parser)
     parser.add_argument(
         "--full", action="store_true", help="longer and larger: tens of minutes (default: minutes, as zoo cards quote)"
@@ -90,6 +95,7 @@ def _subject(chosen: argparse.Namespace) -> Subject:
     from nmpm.zoo import load_model
 
     model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime)
+    choose_threads(model, chosen.threads)
     known = model.preset if model.preset in preset_names() else None
     preset = chosen.preset or known
     emulator = model.emulator.unconstrained() if chosen.free else model.emulator

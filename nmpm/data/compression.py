@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.parallel import map_ranges, processor_count, split
+from nmpm._support.parallel import map_ranges, split, usable_cores
 
 _LEVEL = 1
 FILTERS: Mapping[str, Any] = MappingProxyType({"shuffle": True, "compression": "gzip", "compression_opts": _LEVEL})
@@ -34,7 +34,7 @@ def write_compressed(group: Any, name: str, values: np.ndarray, rows: int, threa
     """
     chunk = (rows, *values.shape[1:])
     dataset = group.create_dataset(name, shape=values.shape, dtype=values.dtype, chunks=chunk, **FILTERS)
-    threads = threads or processor_count()
+    threads = threads or usable_cores()
     ranges, rest = split(len(values), rows), (0,) * (values.ndim - 1)
     for first in range(0, len(ranges), _AHEAD * threads):
         batch = ranges[first : first + _AHEAD * threads]

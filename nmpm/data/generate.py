@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from nmpm._support.atomic import atomic_write, temporary_files
-from nmpm._support.parallel import processor_count
+from nmpm._support.parallel import usable_cores
 from nmpm._support.version import __version__
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
@@ -77,7 +77,7 @@ def generate(
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
         return
     with explain_write_errors(folder), lock_folder(folder):
-        _complete(request, folder, workers or processor_count(), known)
+        _complete(request, folder, workers or usable_cores(), known)
 
 
 def generate_shard(
@@ -104,7 +104,7 @@ def generate_shard(
             return 0
         with lock_folder(folder / PARTS):
             _prepare_parts(request, folder)
-        _simulate_parts(request, folder, shard.select(request.trajectories), workers or processor_count())
+        _simulate_parts(request, folder, shard.select(request.trajectories), workers or usable_cores())
         # While the lock is held nobody assembles: the last shard to come here finds all parts.
         missing = len(_missing(folder, request.trajectories))
     if missing == 0:

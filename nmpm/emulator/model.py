@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from nmpm._support.threads import ThreadChoice
 from nmpm.decoders import Decoder
 from nmpm.emulator.advection import Advection
 from nmpm.emulator.bundle import Bundle as Bundle
@@ -47,6 +48,9 @@ class Emulator(nn.Module):
 
     Args:
         recipe: Its form.
+
+    Attributes:
+        thread_choice: Sets torch's number of threads for each call; None to leave it alone.
     """
 
     input_mean: Tensor
@@ -63,6 +67,7 @@ class Emulator(nn.Module):
         self.recipe = recipe
         self._plan = make_plan(recipe)
         self.runtime: Runtime = Eager()
+        self.thread_choice: ThreadChoice | None = None
         self.windows: Windows | None = Windows()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
@@ -257,7 +262,13 @@ class Emulator(nn.Module):
             particles: The state to start from.
             context: From `context` of the rollout's first state; of this state when left out.
         """
-        return self.runtime.bundle(self, particles, self.context(particles) if context is None else context)
+        context = self.context(particles) if context is None else context
+        if self.thread_choice is None:
+            return self.runtime.bundle(self, particles, context)
+        self.thread_choice.start()
+        bundle = self.runtime.bundle(self, particles, context)
+        self.thread_choice.stop()
+        return bundle
 
     def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
         """The bundle, with only the network left to the runtime."""

@@ -222,6 +222,12 @@ class Rollout(NamedTuple):
         fields = {name: torch.cat([part.fields[name] for part in parts], dim=1) for name in names}
         return cls(torch.cat([part.position for part in parts], dim=1), fields)
 
+    @classmethod
+    def stack(cls, parts: Sequence[Rollout]) -> Rollout:
+        """The scenes of several rollouts of as many frames, at least one, in one."""
+        fields = {name: torch.cat([part.fields[name] for part in parts]) for name in parts[0].fields}
+        return cls(torch.cat([part.position for part in parts]), fields)
+
     def cpu(self) -> Rollout:
         """The same on the CPU."""
         return Rollout(self.position.cpu(), {name: values.cpu() for name, values in self.fields.items()})

@@ -41,6 +41,7 @@ from nmpm.training.compatibility import (
 )
 from nmpm.training.losses import FieldError, TrainingError
 from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
+from nmpm.training.parts import MOST_PARTS, mean_over_parts, on_threads, split_rows
 from nmpm.training.precision import warn_of_slow_precision
 from nmpm.training.schedules import Schedule
 from nmpm.training.unrolling import Discount, direct, unroll_training
@@ -79,6 +80,11 @@ class EmulatorModule(LightningModule):
             the start; on a CPU it gains next to nothing.
         seed: Of the noise.
         recipe: The emulator's form: the further arguments of `EmulatorRecipe`.
+
+    Attributes:
+        parts: In how many parts a batch is computed on a CPU; None for as many as torch has threads, at most 4. Other
+            numbers change results by rounding.
+        threads: How many threads compute them; None for one each. Changes no result.
     """
 
     def __init__(
@@ -116,6 +122,8 @@ class EmulatorModule(LightningModule):
         self.augmentation.check(scene, self.emulator.grid)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
+        self.parts: int | None = None
+        self.threads: int | None = None
         plain = self.emulator.recipe.to_dict()
         del plain["format"]  # (of the checkpoint, see on_save_checkpoint)
         own = {
@@ -245,8 +253,17 @@ class EmulatorModule(LightningModule):
         batch = self.augmentation.mirrored(batch, self.emulator.scene)
         particles, emulator = self.augmentation.start(batch), self.augmentation.jittered(self.emulator)
         count, call = self.bundles(self._progress()), recomputed if self.recompute else direct
-        bundles = unroll_training(emulator, particles, count, call, self.discount)
-        error = self._error(Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles]), batch)
+
+        def mean_error(rows: slice) -> Tensor:
+            bundles = unroll_training(emulator, particles.scenes(rows), count, call, self.discount)
+            predicted = Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles])
+            return self._error(predicted, batch.scenes(rows))
+
+        rows = self.rows(batch)
+        if len(rows) == 1:
+            error = mean_error(rows[0])
+        else:
+            error = mean_over_parts(mean_error, batch.mask, rows, self.parameters(), self.threads or len(rows))
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged)
         return loss
@@ -275,7 +292,21 @@ class EmulatorModule(LightningModule):
         return predicted if predicted.fields else predicted.position
 
     def _predict(self, batch: Window) -> Rollout:
-        return predict_rollout(self.emulator, batch.initial, batch.target.shape[1])
+        start, frames, rows = batch.initial, batch.target.shape[1], self.rows(batch)
+        if len(rows) == 1:
+            return predict_rollout(self.emulator, start, frames)
+        parts = on_threads(
+            lambda part: predict_rollout(self.emulator, start.scenes(part), frames), rows, self.threads or len(rows)
+        )
+        return Rollout.stack(parts)
+
+    def rows(self, batch: Window) -> list[slice]:
+        """The rows of the parts of a batch that a thread each computes, on a CPU.
+
+        All in one where torch compiles for a shape, or noise is drawn for all windows together.
+        """
+        whole = self.device.type != "cpu" or self.compiled or self.emulator.recipe.grid_noise > 0
+        return split_rows(len(batch.frames), 1 if whole else self.parts or min(torch.get_num_threads(), MOST_PARTS))
 
     def on_validation_epoch_start(self) -> None:
         self.valid_errors.reset()

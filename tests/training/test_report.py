@@ -7,7 +7,7 @@ from nmpm._support.devices import device_name
 from nmpm.training.callbacks.report import ReportWriter
 
 EMULATOR = SimpleNamespace(frames=8, parameters=lambda: iter(()))
-MODULE = SimpleNamespace(emulator=EMULATOR, unroll=2, state_dict=dict)
+MODULE = SimpleNamespace(emulator=EMULATOR, unroll=2, state_dict=dict, threads=None)
 
 
 def trainer_on(device: str) -> SimpleNamespace:

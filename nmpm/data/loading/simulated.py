@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from threading import Lock
 
-from nmpm._support.parallel import processor_count
+from nmpm._support.parallel import usable_cores
 from nmpm.data.format import SPLITS, Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.background import Task, map_in_threads, raise_if_abandoned, run_in_thread
@@ -33,7 +33,7 @@ class SimulatedRecordings:
 
     def __init__(self, preset: Preset, seed: int = 0, workers: int | None = None) -> None:
         self.preset, self.seed, self.scene = preset, seed, preset.scene
-        self.workers = workers or processor_count()
+        self.workers = workers or usable_cores()
         self.reader = RecordingReader(preset_metadata(preset), self.scene)
         self._lock = Lock()
         self._requests: OrderedDict[tuple[int, ...], Task[list[Recording]]] = OrderedDict()

@@ -69,10 +69,11 @@ class ReportWriter(Callback):
         self.trained_hardware = str(state_dict.get("trained_hardware", ""))
         self.curve = list(state_dict.get("curve", []))
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._since, self._trained = time.monotonic(), True
         self.trained_precision = str(trainer.precision)
-        self.trained_hardware = join_hardware(self.trained_hardware, device_name(trainer.strategy.root_device))
+        hardware = device_name(trainer.strategy.root_device, getattr(pl_module, "threads", None))
+        self.trained_hardware = join_hardware(self.trained_hardware, hardware)
 
     def on_train_batch_end(
         self,
@@ -146,7 +147,7 @@ class ReportWriter(Callback):
                 "seconds": round(self.trained_seconds, 1),
                 "precision": self.trained_precision or str(trainer.precision),
                 "devices": trainer.world_size,
-                "hardware": self.trained_hardware or device_name(trainer.strategy.root_device),
+                "hardware": self.trained_hardware or device_name(trainer.strategy.root_device, module.threads),
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "curve": self.curve,

@@ -1,0 +1,98 @@
+"""How many threads work: as many as the process may use, or one where measured times say so.
+
+Threads that wait for one another inside of small operations gain little on a quiet machine, and on a busy one each
+waits for a core that does other work. So the choice is measured, and measured again, as load changes.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Mapping, MutableMapping
+
+from nmpm._support.messages import counted
+from nmpm._support.parallel import usable_cores
+
+WAITING_POLICIES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+"""Environment variables by which a user says how OpenMP's threads wait."""
+SPIN_COUNT = 1000
+"""Turns of the loop in which a waiting thread of libgomp spins before it sleeps; its default is 300,000 or more."""
+
+SKIPPED = 2
+"""First calls, in which kernels are compiled, that are not measured."""
+TRIALS = 3
+"""Calls by which a number of threads is judged, fewer if the first takes `HOPELESS` times as long as the others'."""
+HOPELESS = 3.0
+LOOK_AGAIN = 30.0
+"""Seconds from one measurement to the next, or `LOOK_AGAIN_SHARE` times what it took."""
+LOOK_AGAIN_SHARE = 50
+
+
+def limit_spinning(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Let OpenMP's threads sleep soon instead of spinning, unless the user has chosen; before torch is imported."""
+    if not any(name in environment for name in WAITING_POLICIES):
+        environment["GOMP_SPINCOUNT"] = str(SPIN_COUNT)
+
+
+def stated_threads(option: int | None, environment: Mapping[str, str] = os.environ) -> int | None:
+    """The number of threads that the user asks for, by an option or by OMP_NUM_THREADS; None without either."""
+    stated = environment.get("OMP_NUM_THREADS", "").split(",")[0]
+    return option or (int(stated) if stated.isdigit() and int(stated) > 0 else None)
+
+
+class ThreadChoice:
+    """Runs calls of the same work by the faster of one thread and of all.
+
+    Args:
+        stated: The number of threads that the user asks for; None to measure one against all usable cores.
+        apply: Is told the number before each call.
+        clock: Gives seconds.
+
+    Attributes:
+        most: All threads.
+        threads: How many the next call gets.
+        medians: Seconds of a call by number of threads, as last measured; empty before.
+    """
+
+    def __init__(
+        self, stated: int | None, apply: Callable[[int], object], clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self.most = self.threads = stated or usable_cores()
+        self._candidates = [self.most] if stated or self.most == 1 else [self.most, 1]
+        self._apply, self._clock = apply, clock
+        self._calls, self._times = 0, dict[int, list[float]]()
+        self._since, self._next_look = 0.0, -1.0
+        self.medians: dict[int, float] = {}
+
+    def __str__(self) -> str:
+        if len(self._candidates) == 1:
+            return counted(self.most, "thread")
+        return f"{counted(self.most, 'thread')}, or one where that is faster"
+
+    def start(self) -> None:
+        """Start a call, and its clock."""
+        self._apply(self.threads)
+        self._since = self._clock()
+
+    def stop(self) -> None:
+        """End a call, and choose the number of threads of the next."""
+        now = self._clock()
+        self._calls += 1
+        if len(self._candidates) == 1 or self._calls <= SKIPPED or now < self._next_look:
+            return
+        self._times.setdefault(self.threads, []).append(now - self._since)
+        untried = [threads for threads in self._candidates if not self._judged(threads)]
+        if untried:
+            self.threads = untried[0]
+            return
+        self.medians = {threads: statistics.median(times) for threads, times in self._times.items()}
+        self.threads = min(self.medians, key=self.medians.__getitem__)
+        self._next_look = now + max(LOOK_AGAIN, LOOK_AGAIN_SHARE * sum(map(sum, self._times.values())))
+        self._times = {}
+
+    def _judged(self, threads: int) -> bool:
+        """Whether a number of threads was measured often enough."""
+        mine = self._times.get(threads, [])
+        others = [seconds for other, times in self._times.items() if other != threads for seconds in times]
+        return len(mine) >= TRIALS or bool(mine and others and min(mine) > HOPELESS * max(others))

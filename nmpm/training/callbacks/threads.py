@@ -1,0 +1,89 @@
+"""Use a CPU's cores: a batch in parts that a thread each computes, or threads inside of operations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.utilities import rank_zero_info
+
+from nmpm._support.devices import processor_name
+from nmpm._support.parallel import usable_cores
+from nmpm._support.threads import ThreadChoice
+from nmpm.particles import Window
+from nmpm.training.module import EmulatorModule
+from nmpm.training.parts import MOST_PARTS
+
+
+class Threads(Callback):
+    """Splits batches in as many parts as there are cores, and measures whether one thread is faster than all.
+
+    The number of parts is in checkpoints: a training that goes on elsewhere ends with the same weights. Without several
+    windows to a batch, the threads are those inside of torch's operations.
+
+    Args:
+        stated: Number of threads that the user asks for; None to measure.
+    """
+
+    def __init__(self, stated: int | None) -> None:
+        self.stated, self._parts, self._said = stated, 0, False
+        self.choice = ThreadChoice(stated, self._apply)
+        self._module: EmulatorModule | None = None
+        self._in_parts = False
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: ARG002
+        if not isinstance(pl_module, EmulatorModule) or trainer.strategy.root_device.type != "cpu":
+            return
+        self.choice, self._module = self._make_choice(trainer), pl_module
+        if self.stated or not self._parts:
+            self._parts = min(self.choice.most, MOST_PARTS)
+        pl_module.parts, pl_module.threads = self._parts, self.choice.most
+        torch.set_num_threads(1)
+
+    def describe(self, trainer: Trainer) -> str:
+        """The processor and the threads of a trainer's processes, in words."""
+        ranks, choice = trainer.world_size, self._make_choice(trainer)
+        return f"{processor_name()}, {choice}" if ranks == 1 else f"{processor_name()}, {ranks} processes of {choice}"
+
+    def _make_choice(self, trainer: Trainer) -> ThreadChoice:
+        """Processes of one machine share its cores; their steps wait for one another, so that none measures."""
+        ranks = trainer.world_size // trainer.num_nodes
+        share = max(1, usable_cores() // ranks) if ranks > 1 else None
+        return ThreadChoice(self.stated or share, self._apply)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"parts": self._parts}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._parts = int(state_dict["parts"])
+        if self._module is not None and not self.stated:
+            self._module.parts = self._parts
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:  # noqa: ARG002
+        if self._module is not None:
+            self._in_parts = isinstance(batch, Window) and len(self._module.rows(batch)) > 1
+            self.choice.start()
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,  # noqa: ARG002
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,  # noqa: ARG002
+        batch: Any,  # noqa: ARG002
+        batch_idx: int,  # noqa: ARG002
+    ) -> None:
+        if self._module is None:
+            return
+        self.choice.stop()
+        if self.choice.medians and not self._said:
+            self._said = True
+            times = "; ".join(f"{1e3 * seconds:.0f} ms by {n}" for n, seconds in self.choice.medians.items())
+            rank_zero_info(f"Threads: {self.choice.threads} (a step takes {times}).")
+
+    def _apply(self, threads: int) -> None:
+        """Let so many threads compute the parts of a batch; where it is in one part, its operations."""
+        if self._module is not None and self._in_parts:
+            self._module.threads = threads
+        else:
+            torch.set_num_threads(threads)

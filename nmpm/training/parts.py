@@ -1,0 +1,106 @@
+"""A training step's batch in parts, each the work of one thread: forward, backward, and the sum of the gradients.
+
+Threads inside of operations as small as those of a 2-D grid gain nothing; threads that compute scenes of their own do.
+The parts do not depend on how many threads work on them, and their gradients are added in order, so that neither do
+results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nmpm._support.parallel import map_ranges
+
+T = TypeVar("T")
+
+MOST_PARTS = 4
+"""Of a batch: with more, threads wait for Python's interpreter lock, which a part holds for about 15 ms."""
+
+
+def split_rows(count: int, parts: int) -> list[slice]:
+    """The rows of a batch of `count` scenes in at most so many parts of about equal size."""
+    parts = max(1, min(count, parts))
+    ends = [count * part // parts for part in range(parts + 1)]
+    return [slice(low, high) for low, high in pairwise(ends)]
+
+
+def on_threads(function: Callable[[slice], T], rows: Sequence[slice], threads: int) -> list[T]:
+    """The function's results for each part, in order, computed under the caller's gradient and autocast modes.
+
+    Args:
+        function: Is called from several threads, in each of which torch's operations use one thread.
+        rows: From `split_rows`.
+        threads: How many work at most.
+    """
+    inner = torch.get_num_threads()
+    gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    autocast, precision = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")
+
+    def work(part: int, _: int) -> T:
+        torch.set_num_threads(1)
+        # Casts of weights are not shared: which thread makes one would decide how its gradients are added.
+        cast = torch.autocast("cpu", precision, enabled=autocast, cache_enabled=False)
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients), cast:
+            return function(rows[part])
+
+    try:
+        return map_ranges(work, [(part, part + 1) for part in range(len(rows))], threads)
+    finally:
+        torch.set_num_threads(inner)
+
+
+def mean_over_parts(
+    error: Callable[[slice], Tensor], mask: Tensor, rows: Sequence[slice], weights: Iterable[Tensor], threads: int
+) -> Tensor:
+    """The mean error () over the particles of all parts, with gradients to the weights.
+
+    Args:
+        error: The mean over the particles of a part, with gradients.
+        mask: (B, N) bool, True for particles.
+        rows: From `split_rows`.
+        weights: Those that require gradients get them.
+        threads: How many threads work at most.
+    """
+    shares = [mask[part].sum() / mask.sum() for part in rows]
+    trained = [weight for weight in weights if weight.requires_grad]
+    mean: Tensor = _MeanOverParts.apply(error, shares, rows, threads, *trained)  # type: ignore[no-untyped-call]  # (torch's stubs)
+    return mean
+
+
+class _MeanOverParts(torch.autograd.Function):
+    """Computes the gradients together with the error, in one go for each part."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        error: Callable[[slice], Tensor],
+        shares: Sequence[Tensor],
+        rows: Sequence[slice],
+        threads: int,
+        *weights: Tensor,
+    ) -> Tensor:
+        def compute(part: slice) -> tuple[Tensor, Sequence[Tensor | None]]:
+            with torch.enable_grad():
+                mean = error(part) * shares[rows.index(part)]
+            return mean.detach(), torch.autograd.grad(mean, weights, allow_unused=True)
+
+        means, gradients = zip(*on_threads(compute, rows, threads), strict=True)
+        ctx.gradients = [_add(of_parts) for of_parts in zip(*gradients, strict=True)]
+        return torch.stack(means).sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        return *(None,) * 4, *(None if gradient is None else slope * gradient for gradient in ctx.gradients)
+
+
+def _add(gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum, in order, of those that there are."""
+    given = [gradient for gradient in gradients if gradient is not None]
+    return torch.stack(given).sum(0) if len(given) > 1 else next(iter(given), None)

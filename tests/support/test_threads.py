@@ -1,0 +1,99 @@
+import os
+import subprocess
+import sys
+
+import pytest
+
+from nmpm._support.parallel import usable_cores
+from nmpm._support.threads import LOOK_AGAIN, LOOK_AGAIN_SHARE, SKIPPED, ThreadChoice, limit_spinning, stated_threads
+
+
+class Machine:
+    """A clock that the calls of a `ThreadChoice` advance by the seconds that a number of threads takes."""
+
+    def __init__(self, seconds):
+        self.seconds, self.now, self.used = seconds, 0.0, []
+
+    def call(self, choice, count=1):
+        for _ in range(count):
+            choice.start()
+            self.now += self.seconds[self.used[-1]]
+            choice.stop()
+
+
+def choice_on(machine, monkeypatch, stated=None):
+    monkeypatch.setattr("nmpm._support.threads.usable_cores", lambda: 2)
+    return ThreadChoice(stated, machine.used.append, lambda: machine.now)
+
+
+@pytest.mark.parametrize(("seconds", "best"), [({1: 0.3, 2: 0.2}, 2), ({1: 0.3, 2: 0.4}, 1), ({1: 0.3, 2: 14.0}, 1)])
+def test_the_faster_of_one_thread_and_all_is_used(monkeypatch, seconds, best):
+    machine = Machine(seconds)
+    choice = choice_on(machine, monkeypatch)
+    machine.call(choice, SKIPPED + 20)
+    assert machine.used[-10:] == [best] * 10
+    assert choice.medians == pytest.approx(seconds)
+
+
+def test_the_choice_follows_the_load_and_costs_a_small_share(monkeypatch):
+    machine = Machine({1: 0.3, 2: 0.2})
+    choice = choice_on(machine, monkeypatch)
+    machine.call(choice, 50)
+    machine.seconds = {1: 0.3, 2: 9.0}  # another program came
+    machine.call(choice, round(2 * LOOK_AGAIN / 0.2))
+    assert machine.used[-1] == 1
+    before = len(machine.used)
+    machine.call(choice, round(LOOK_AGAIN_SHARE * 10 / 0.3))
+    again = [threads for threads in machine.used[before:] if threads == 2]
+    assert sum(machine.seconds[threads] for threads in again) <= 0.05 * machine.now
+
+
+@pytest.mark.parametrize("stated", [1, 2, 5])
+def test_stated_threads_are_used_without_measuring(monkeypatch, stated):
+    machine = Machine(dict.fromkeys((1, 2, 5), 1.0))
+    machine.call(choice_on(machine, monkeypatch, stated), 20)
+    assert set(machine.used) == {stated}
+
+
+def test_an_option_goes_before_the_environment_and_both_before_measuring():
+    assert stated_threads(3, {"OMP_NUM_THREADS": "2"}) == 3
+    assert stated_threads(None, {"OMP_NUM_THREADS": "2,1"}) == 2
+    assert stated_threads(None, {"OMP_NUM_THREADS": "many"}) is None
+    assert stated_threads(None, {}) is None
+
+
+def test_a_waiting_policy_of_the_users_is_kept():
+    environment = {"OMP_WAIT_POLICY": "ACTIVE"}
+    limit_spinning(environment)
+    assert environment == {"OMP_WAIT_POLICY": "ACTIVE"}
+    limit_spinning(environment := {})
+    assert int(environment["GOMP_SPINCOUNT"]) < 300_000
+
+
+def test_importing_the_package_changes_neither_environment_nor_threads():
+    script = (
+        "import os, torch\nbefore = dict(os.environ), torch.get_num_threads()\nimport nmpm.training\n"
+        "assert before == (dict(os.environ), torch.get_num_threads())"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({"cpu.max": "200000 100000"}, 2),
+        ({"cpu.max": "max 100000", "box/cpu.max": "100000 100000"}, 1),
+        ({"box/cpu.max": "20000 100000"}, 1),
+        ({"cpu/box/cpu.cfs_quota_us": "150000", "cpu/box/cpu.cfs_period_us": "50000"}, 3),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 8),
+        ({}, 8),
+    ],
+)
+def test_quotas_of_containers_limit_the_cores(monkeypatch, tmp_path, files, cores):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text + "\n")
+    groups = tmp_path / "groups"
+    groups.write_text("4:cpu,cpuacct:/box\n2:memory:/box\n0::/box\n")
+    assert usable_cores(tmp_path, groups) == cores
