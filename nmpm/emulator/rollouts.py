@@ -301,9 +301,9 @@ def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monit
     Warns:
         UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
-    parts = list(stream_rollout(emulator, particles, frames, monitor))
+    batch, *rest = particles.position.shape
+    parts = list(stream_rollout(emulator, particles, frames, monitor)) if batch else []
     if parts:
         return Rollout.join(parts)
-    batch, *rest = particles.position.shape
-    none = particles.position.new_zeros(batch, 0, *rest)
+    none = particles.position.new_zeros(batch, frames, *rest)  # of no scene, or of no frame
     return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))

@@ -197,9 +197,11 @@ class TestEvaluation:
         assert module.val_dataloader().batches == ((0,),)
         assert module.test_dataloader().batches == ((0, 2), (1,))
 
-    def test_more_ranks_than_trajectories(self, make_dataset):
-        with pytest.raises(ConfigError, match=r"valid.h5: 2 trajectories cannot be shared by 3"):
-            as_rank(module_of(make_dataset()), 2, 3).val_dataloader()
+    def test_a_rank_without_trajectories_has_one_batch_of_none(self, make_dataset):
+        loader = as_rank(module_of(make_dataset()), 2, 3).val_dataloader()
+        (window,) = loader
+        assert loader.batches == ((),)
+        assert window.frames.shape[:2] == (0, 12)
 
     def test_nothing_to_predict(self, make_dataset):
         with pytest.raises(DataError, match="trajectory 00000: it has 2 frames, an evaluation needs 3"):

@@ -50,6 +50,22 @@ def test_two_processes_measure_what_one_measures(make_dataset, tmp_path):
     assert [predicted.particles(index) for index in range(len(predicted))] == [9, 7, 8]
 
 
+@pytest.mark.slow
+def test_two_processes_train_on_one_trajectory_of_each_split(make_dataset, tmp_path):
+    """The second process has nothing to validate or to test."""
+    one = ((30, 9),)
+    data = ["--data.path", str(make_dataset(train=one, valid=one, test=one)), "--data.batch_size", "2"]
+    words = ["--trainer.max_steps", "2", "--trainer.val_check_interval", "1"]
+    nmpm("fit", *data, *words, "--trainer.default_root_dir", str(tmp_path / "2"), devices=2)
+    best = ["--ckpt_path", str(tmp_path / "2" / "checkpoints" / "best.ckpt")]
+    nmpm("test", *data, *best, "--trainer.default_root_dir", str(tmp_path / "1"), devices=1)
+    shared, alone = (json.loads((tmp_path / root / "report.json").read_text()) for root in ("2", "1"))
+    assert shared["test"] == pytest.approx(alone["test"], rel=1e-5)
+    assert len(shared["per_trajectory"]["model"]) == 1
+    nmpm("predict", *data, *best, "--trainer.default_root_dir", str(tmp_path / "2"), devices=2)
+    assert len(Split(tmp_path / "2" / "predictions.h5")) == 1
+
+
 TRAIN_TO = """
 import sys
 from pathlib import Path

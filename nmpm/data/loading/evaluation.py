@@ -10,7 +10,6 @@ import torch
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.pinning import pin_for
 from nmpm.data.loading.recording import SplitRecordings
-from nmpm.errors import ConfigError
 from nmpm.particles import Window
 
 
@@ -18,7 +17,7 @@ class EvaluationLoader:
     """Whole trajectories in batches of equal length; each trajectory goes to exactly one rank.
 
     Those of similar numbers of particles share a batch, so that few are padded much. `batches` holds the indices of
-    each batch's trajectories.
+    each batch's trajectories. A rank without any has one batch of none, so that it takes part in all collectives.
 
     Args:
         recordings: The trajectories.
@@ -30,7 +29,6 @@ class EvaluationLoader:
 
     Raises:
         DataError: if a trajectory has fewer than 3 frames, so that there is nothing to predict.
-        ConfigError: if there are more processes than trajectories.
     """
 
     def __init__(
@@ -46,16 +44,9 @@ class EvaluationLoader:
         recordings.require_frames(3, "an evaluation")
         frames = recordings.split.frames
         order = sorted(range(len(recordings))[:limit], key=frames)
-        if len(order) < world:
-            # The other ranks would wait forever for a rank without a batch.
-            raise ConfigError(
-                f"{recordings.split.path}: {len(order)} trajectories cannot be shared by {world} processes. Evaluate"
-                " with fewer devices, or on more trajectories."
-            )
         groups = (list(group) for _, group in itertools.groupby(order[rank::world], key=frames))
-        self.batches: tuple[tuple[int, ...], ...] = tuple(
-            batch for group in groups for batch in _bucket(group, batch_size, recordings.split.particles)
-        )
+        batches = (batch for group in groups for batch in _bucket(group, batch_size, recordings.split.particles))
+        self.batches: tuple[tuple[int, ...], ...] = tuple(batches) or ((),)
 
     def __len__(self) -> int:
         return len(self.batches)
@@ -64,7 +55,8 @@ class EvaluationLoader:
         return pin_for(self.device, map(self._read, self.batches))
 
     def _read(self, indices: Sequence[int]) -> Window:
-        return collate([self.recordings[index] for index in indices], self.recordings.scene)
+        read = collate([self.recordings[index] for index in indices or (0,)], self.recordings.scene)
+        return read.scenes(slice(len(indices)))
 
 
 def _bucket(group: Sequence[int], batch_size: int, particles: Callable[[int], int]) -> list[tuple[int, ...]]:
