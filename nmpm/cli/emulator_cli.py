@@ -24,6 +24,7 @@ from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
+from nmpm.training.callbacks.forecast import Forecast
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.report import ReportWriter
@@ -34,6 +35,7 @@ from nmpm.training.compatibility import check_same_recipe
 from nmpm.training.module import OVERALL, EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.precision import fitting_precision
+from nmpm.training.preflight import Preflight, check_disk
 from nmpm.training.run_folder import RunFolder
 from nmpm.zoo.registry import load_model
 
@@ -121,6 +123,7 @@ class EmulatorCLI(LightningCLI):
         for saver in ("checkpoint", "resume"):
             folder = Path(trainer["default_root_dir"]) / "checkpoints"
             config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
+            check_folder(f"--{saver}.dirpath", Path(config[saver]["dirpath"]))
         optimizer = config["model"].get("optimizer")
         if isinstance(optimizer, dict) or hasattr(optimizer, "get"):
             check_learning_rate((optimizer.get("init_args") or {}).get("lr"))
@@ -142,11 +145,12 @@ class EmulatorCLI(LightningCLI):
             table = CSVLogger(config["default_root_dir"], name="logs")
             kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
             callbacks.append(LearningRateMonitor("step"))
+        callbacks += [Preflight(), Forecast()]  # whose lines come before the bar's
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(Progress())
-        self.stop_on_signal = StopOnSignal(self._checkpoint_file("resume"))
+        self.stop_on_signal, self.report = StopOnSignal(self._checkpoint_file("resume")), ReportWriter()
         self.threads = Threads(stated_threads(self.config_init[self.subcommand]["threads"]))
-        guards = [self.threads, DivergenceGuard(), ReportWriter(), PredictionWriter(), self.stop_on_signal]
+        guards = [self.threads, DivergenceGuard(), self.report, PredictionWriter(), self.stop_on_signal]
         kwargs["callbacks"] = [*callbacks, *guards]
         return super().instantiate_trainer(**kwargs)
 
@@ -175,6 +179,7 @@ class EmulatorCLI(LightningCLI):
             DataError: if the checkpoint cannot be read.
         """
         check_endless_batches(self.trainer)
+        check_disk(self.trainer, self.model)
         resumed = self._load_checkpoint()
         if resumed is not None:
             self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated
@@ -255,7 +260,7 @@ class EmulatorCLI(LightningCLI):
     def after_fit(self) -> None:
         """Validate the last weights too, if no validation has, and test the best ones, once.
 
-        Where validations are turned off, the last weights are tested.
+        Where validations are turned off, the last weights are tested; where there is no test split, the report says so.
         """
         checkpoint = self.trainer.checkpoint_callback
         if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor and self.trainer.limit_val_batches:
@@ -264,7 +269,11 @@ class EmulatorCLI(LightningCLI):
             # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
             if checkpoint.best_model_path:
                 self.model.load_state_dict(read_checkpoint(Path(checkpoint.best_model_path))["state_dict"])
-        self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+        if not self.datamodule.has_test:
+            reason = f"{self.datamodule.data_source.folder} has no test.h5."
+            self.report.report_untested(self.trainer, self.model, reason)
+        else:
+            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
 
     def _validate_last_weights(self, checkpoint: ModelCheckpoint) -> None:
         self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)

@@ -9,13 +9,15 @@ from typing import Any, Literal, get_args
 
 import torch
 from lightning.pytorch import LightningDataModule
+from lightning.pytorch.trainer.states import TrainerFn
 
+from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.pinning import pin_for
 from nmpm.data.loading.sources import DataSource, FolderSource, HubSource, StatedFacts
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
 
@@ -70,6 +72,10 @@ class TrajectoryDataModule(LightningDataModule):
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
 
+    Attributes:
+        validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
+            does not say it; None before that is decided, and for all. Kept in checkpoints.
+
     Raises:
         ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.
     """
@@ -110,6 +116,7 @@ class TrajectoryDataModule(LightningDataModule):
         self.limit_eval, self.eval_batch_size = limit_eval, eval_batch_size
         self._provider: RecordingProvider | None = None
         self._history: _BatchHistory | None = None
+        self.validated: int | None = None
 
     def __str__(self) -> str:
         # Lightning's default iterates over the endless training batches.
@@ -135,17 +142,46 @@ class TrajectoryDataModule(LightningDataModule):
         _ = self.data_source.folder
 
     def setup(self, stage: str) -> None:
-        """Resets the position in the plan, unless a checkpoint is resumed."""
-        if stage == "fit" and not self.batches_seen:
+        """Resets the position in the plan, unless a checkpoint is resumed, and looks at all that a training reads.
+
+        Raises:
+            DataError: if a split cannot be evaluated or, at the first or last frame of a trajectory, be read; or if
+                there is none to validate on.
+        """
+        if stage != "fit":
+            return
+        if not self.batches_seen:
             self._history = None
+        self._check_splits()
+
+    def _check_splits(self) -> None:
+        present = split_paths(self.data_source.folder)
+        if "valid" not in present and self.trainer is not None and self.trainer.enable_validation:
+            raise DataError(
+                f"{self.data_source.folder}: no valid.h5 there, by which the best weights are chosen (found:"
+                f" {', '.join(present) or 'no split'}). Put some of the trajectories there, or train without"
+                " validations, which keeps the last weights: --trainer.limit_val_batches 0."
+            )
+        for name in present:
+            recordings = self.data_source.recordings(name)
+            recordings.check_ends()
+            if name != "train":
+                recordings.require_frames(3, "an evaluation")
+
+    @property
+    def has_test(self) -> bool:
+        """Whether there is a test split."""
+        return "test" in split_paths(self.data_source.folder)
 
     def state_dict(self) -> dict[str, Any]:
         """Start and size of the current batches; how many were used is in the Trainer's own progress."""
-        return asdict(self._history) if self._history is not None else {}
+        return asdict(self._history) | {"validated": self.validated} if self._history is not None else {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores start and size of the batches from a checkpoint."""
+        """Restores start and size of the batches from a checkpoint, and for a training what it validates on."""
         self._history = _BatchHistory(PlanStart(**state["start"]), state["batch_size"], state["world"])
+        if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING:
+            self.validated = state.get("validated")
 
     def train_dataloader(self) -> TrainingLoader:
         """Endless batches of training windows; after a resumed checkpoint, those that come next."""
@@ -190,8 +226,8 @@ class TrajectoryDataModule(LightningDataModule):
         return device if needed <= _GPU_SHARE * free else torch.device("cpu")
 
     def val_dataloader(self) -> EvaluationLoader:
-        """Whole trajectories of the valid split, or the first `limit_eval` of them."""
-        return self._evaluation("valid", self.limit_eval)
+        """Whole trajectories of the valid split, or the first `limit_eval` or `validated` of them."""
+        return self._evaluation("valid", self.limit_eval or self.validated)
 
     def test_dataloader(self) -> EvaluationLoader:
         """Whole trajectories of the test split."""

@@ -43,6 +43,11 @@ class Comparison(nn.Module):
         """The squared errors of each of `PREDICTORS`."""
         return {kind: next(metric for metric in own if isinstance(metric, MSE)) for kind, own in self._by_predictor()}
 
+    @property
+    def of_model(self) -> list[RolloutMetric]:
+        """The metrics of the model."""
+        return dict(self._by_predictor())["model"]
+
     def update(self, window: Window, predicted: Tensor, fields: Mapping[str, Tensor] | None = None) -> None:
         """Add whole trajectories and the model's rollouts of them.
 

@@ -23,5 +23,17 @@ def table_row(figures: Mapping[str, float], kind: str) -> list[str]:
     return [f"{1e3 * figures[prefix + n]:.4g}" if prefix + n in figures else "" for n in figure_names(figures)]
 
 
+def no_better_than_trivial(figures: Mapping[str, float]) -> str:
+    """Says so in words where a model's full rollouts are not better than a trivial predictor's; else empty."""
+    trivial = {kind: figures[f"{kind}/mse"] for kind in PREDICTORS if f"{kind}/mse" in figures}
+    best = min(trivial, key=trivial.__getitem__, default=None)
+    if best is None or figures["mse"] < trivial[best]:  # NaN is not
+        return ""
+    return (
+        f"The model is no better than a trivial predictor: its error is {1e3 * figures['mse']:.3g}e-3, that of"
+        f" '{PREDICTORS[best]}' {1e3 * trivial[best]:.3g}e-3. Train it longer, or on more data, before using it."
+    )
+
+
 def _horizon(name: str) -> int:
     return int(name.partition("@")[2] or 0)

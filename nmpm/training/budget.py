@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
@@ -79,27 +80,63 @@ def check_endless_batches(trainer: Trainer) -> None:
         raise ConfigError(ENDLESS)
 
 
-def time_left(trainer: Trainer, first_step: int, elapsed: float) -> tuple[float, float | None]:
-    """Share of the training that is over, and seconds left; by steps or by time, whichever ends first.
+class TimeLeft(NamedTuple):
+    """How far a training is.
+
+    Attributes:
+        share: That is over, of steps or time, whichever is further; in [0, 1].
+        seconds: Until it ends; None before the first step where only steps are limited.
+        ends_by: "max_time" or "the last step", whichever comes first; empty where only one of them is limited.
+    """
+
+    share: float
+    seconds: float | None
+    ends_by: str
+
+
+def time_left(trainer: Trainer, first_step: int, elapsed: float) -> TimeLeft:
+    """How far a training is, by steps or by time, whichever ends first.
 
     Args:
         trainer: Training.
         first_step: Step at which this process began.
         elapsed: Seconds since then.
-
-    Returns:
-        The share, in [0, 1], and the seconds, None before the first step where only steps are limited.
     """
-    total, taken = total_steps(trainer), trainer.global_step - first_step
-    share, left = trainer.global_step / max(total, 1), None
+    total, taken, remaining = total_steps(trainer), trainer.global_step - first_step, seconds_left(trainer)
+    share, left = trainer.global_step / max(total, 1), math.inf
     if taken and math.isfinite(total):
         left = elapsed / taken * (total - trainer.global_step)
     for timer in _timers(trainer):
-        duration = timer._duration or 1.0
-        share = max(share, timer.time_elapsed() / duration)
-        remaining = max(duration - timer.time_elapsed(), 0.0)
-        left = remaining if left is None else min(left, remaining)
-    return min(share, 1.0), left
+        share = max(share, timer.time_elapsed() / (timer._duration or 1.0))
+    ends_by = ""
+    if math.isfinite(remaining) and math.isfinite(total):
+        ends_by = "max_time" if remaining < left else "the last step"
+    seconds = min(left, remaining)
+    return TimeLeft(min(share, 1.0), seconds if math.isfinite(seconds) else None, ends_by)
+
+
+def seconds_left(trainer: Trainer) -> float:
+    """Seconds until time ends a training; infinite where its time is not limited."""
+    left = [(timer._duration or 0.0) - timer.time_elapsed() for timer in _timers(trainer)]
+    return max(min(left, default=math.inf), 0.0)
+
+
+def reserve_time(trainer: Trainer, seconds: float) -> None:
+    """End a training so many seconds earlier, at most half of what is left, for what follows its last step."""
+    for timer in _timers(trainer):
+        duration = timer._duration or 0.0
+        timer._duration = duration - min(seconds, max(duration - timer.time_elapsed(), 0.0) / 2)
+
+
+def validation_interval(trainer: Trainer, pace: float) -> float:
+    """Steps between validations at a pace in seconds per step; infinite where only the end is validated, or nothing."""
+    if not trainer.enable_validation:
+        return math.inf
+    seconds = trainer._val_check_time_interval  # type: ignore[attr-defined]  # (Lightning sets it)
+    if seconds is not None:
+        return float(seconds / pace)
+    epochs, batches = trainer.check_val_every_n_epoch or 1, trainer.val_check_batch or math.inf
+    return float(max(epochs * batches / trainer.accumulate_grad_batches, 1.0))
 
 
 def _timers(trainer: Trainer) -> list[Timer]:

@@ -34,7 +34,8 @@ TINY = UNet(width=4, depth=1, perceptron=(4,))
 def module_of(data: TrajectoryDataModule, **changes) -> EmulatorModule:
     torch.manual_seed(0)
     options = {"cells": 8, "frames": 2, "unroll": 2, "processor": TINY, "position_noise": 1e-4}
-    return EmulatorModule(data.scene, metrics=[MSE((1, 4))], **(options | {"grid_noise": 0.01} | changes))
+    options |= {"grid_noise": 0.01, "metrics": [MSE((1, 4))]}
+    return EmulatorModule(data.scene, **(options | changes))
 
 
 def data_of(folder: Path) -> TrajectoryDataModule:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.data.fields import read_fields
+from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import own_gravity
 from nmpm.data.loading.background import raise_if_abandoned
@@ -65,13 +65,8 @@ class RecordingReader:
                 moves, or a field that the metadata declare is missing or not finite.
         """
         types = trajectory.particle_type
-        self.metadata.check_types(types, where)
-        moving = np.isin(types, self.metadata.moving_types)
-        static = np.isin(types, list(self.metadata.static_types))
-        self._check_inside(trajectory, moving | static, where)
+        moving, static = self.check(trajectory, where)
         self._check_static(trajectory, static, where)
-        if not moving.any():
-            raise DataError(f"{where}: no particle has a moving type; check static_types in the metadata.")
         return Recording(
             frames=torch.from_numpy(np.ascontiguousarray(trajectory.position[:, moving])),
             material=torch.from_numpy(self._materials(types[moving], where)),
@@ -79,6 +74,30 @@ class RecordingReader:
             gravity=self._gravity(trajectory, where),
             fields=dict(self._fields(trajectory.fields, moving, where)),
         )
+
+    def check(self, trajectory: Trajectory, where: str, first_frame: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Checks the types of a trajectory's particles, and where they are.
+
+        Args:
+            trajectory: Some frames of it suffice.
+            where: File and trajectory, for error messages.
+            first_frame: Of those.
+
+        Returns:
+            (N,) whether each particle moves, and whether it is static.
+
+        Raises:
+            DataError: as `recording`.
+        """
+        types = trajectory.particle_type
+        self.metadata.check_types(types, where)
+        moving = np.isin(types, self.metadata.moving_types)
+        static = np.isin(types, list(self.metadata.static_types))
+        self._check_inside(trajectory, moving | static, where, first_frame)
+        if not moving.any():
+            raise DataError(f"{where}: no particle has a moving type; check static_types in the metadata.")
+        self._materials(types[moving], where)
+        return moving, static
 
     def _fields(self, fields: Mapping[str, np.ndarray], moving: np.ndarray, where: str) -> Iterator[tuple[str, Tensor]]:
         """The fields of the moving particles by name."""
@@ -108,7 +127,7 @@ class RecordingReader:
             index[types == type_id] = self.scene.material_index(name)
         return index
 
-    def _check_inside(self, trajectory: Trajectory, present: np.ndarray, where: str) -> None:
+    def _check_inside(self, trajectory: Trajectory, present: np.ndarray, where: str, first_frame: int) -> None:
         lower, upper = np.asarray(self.scene.domain, dtype=np.float32).T
         walls = ~np.asarray(self.scene.periodic)  # on a periodic axis no position is outside
         position = trajectory.position
@@ -116,7 +135,8 @@ class RecordingReader:
         if outside.any():
             frame, particle = map(int, np.argwhere(outside)[0])
             raise DataError(
-                f"{where}: particle {particle} in frame {frame} is at {position[frame, particle].tolist()}, outside"
+                f"{where}: particle {particle} in frame {first_frame + frame} is at"
+                f" {position[frame, particle].tolist()}, outside"
                 f" the domain {list(map(list, self.scene.domain))} ({int(outside.any(axis=0).sum())} particles leave"
                 " it). Set a `domain` in the metadata that contains all positions, or remove the trajectory."
             )
@@ -186,6 +206,17 @@ class SplitRecordings(Sequence[Recording]):
             raise_if_abandoned()
             recordings.append(self[index])
         return recordings
+
+    def check_ends(self) -> None:
+        """Checks the first and the last frame of each trajectory, as reading all of them would: a quick look.
+
+        Raises:
+            DataError: as for a single one; or if a trajectory lacks a field.
+        """
+        require_fields(self.split, self.reader.metadata.fields)
+        for index in range(len(self)):
+            for frame in sorted({0, self.split.frames(index) - 1}):
+                self.reader.check(self.split.read(index, frame, frame + 1), self.split.where(index), frame)
 
     def require_frames(self, frames: int, purpose: str) -> None:
         """Raises an error if a trajectory is too short.

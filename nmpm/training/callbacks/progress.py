@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 from lightning.pytorch.trainer.states import TrainerFn
 
-from nmpm.training.budget import time_left, total_steps
+from nmpm.training.budget import TimeLeft, time_left, total_steps
 
 SCALE = 1000
 """Of the bar's length: it shows the share that is over, of steps or time, whichever is further."""
@@ -25,8 +25,8 @@ LOG_FILE_SECONDS = 60.0
 class Progress(ProgressBar):
     """Shows progress without asking the device for anything but the loss, every `log_every_n_steps` steps.
 
-    While training: steps taken and to take, time left, loss, and the last validation's full-rollout MSE ×10⁻³. While
-    evaluating: batches. Nothing is shown by ranks other than 0.
+    While training: steps taken and to take, time left and which limit ends it, loss, and the last validation's
+    full-rollout MSE ×10⁻³. While evaluating: batches. Nothing is shown by ranks other than 0.
     """
 
     def __init__(self) -> None:
@@ -111,16 +111,20 @@ class Progress(ProgressBar):
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:  # noqa: ARG002
         self._close()
 
-    def text(self, trainer: Trainer, left: float | None) -> str:
-        """What is shown beside the bar.
+    def print(self, *words: Any, **options: Any) -> None:
+        """Print a line above the bar."""
+        if self._bar is None:
+            super().print(*words, **options)
+        else:
+            Tqdm.write(" ".join(map(str, words)), file=sys.stdout)
 
-        Args:
-            trainer: Training.
-            left: Seconds left; None where not known yet.
-        """
+    def text(self, trainer: Trainer, left: TimeLeft) -> str:
+        """What is shown beside the bar."""
         total = total_steps(trainer)
         of = f"/{int(total)}" if math.isfinite(total) else ""
-        eta = "" if left is None else f"{timedelta(seconds=round(left))} left"
+        eta = "" if left.seconds is None else f"{timedelta(seconds=round(left.seconds))} left"
+        if eta and left.ends_by:
+            eta += f" to {left.ends_by}"
         parts = (f"{self._doing}: step {trainer.global_step}{of}", eta, self._loss, self._valid)
         return ", ".join(part for part in parts if part)
 
@@ -128,9 +132,9 @@ class Progress(ProgressBar):
         bar = self._bar
         if bar is None or bar.disable:
             return
-        share, left = time_left(trainer, self._first_step, bar.format_dict["elapsed"])
+        left = time_left(trainer, self._first_step, bar.format_dict["elapsed"])
         bar.set_description_str(self.text(trainer, left), refresh=False)
-        bar.update(max(0, min(SCALE, round(SCALE * share)) - bar.n))
+        bar.update(max(0, min(SCALE, round(SCALE * left.share)) - bar.n))
         bar.update(0)
 
     def _open(self, what: str, total: float, keep: bool = False) -> Tqdm:

@@ -22,7 +22,7 @@ from nmpm._support.devices import device_name, join_hardware
 from nmpm._support.digests import float32_digest
 from nmpm._support.version import __version__
 from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.evaluation.figures import PREDICTORS, figure_names, table_row
+from nmpm.evaluation.figures import PREDICTORS, figure_names, no_better_than_trivial, table_row
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.metrics import MSE
 from nmpm.particles import Window
@@ -33,8 +33,9 @@ from nmpm.viz import write_animation, write_snapshots
 class ReportWriter(Callback):
     """Measures the time that training takes and the errors on the way, prints errors, and reports when a test ends.
 
-    Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions), `errors.csv`
-    (error against frame), `rollout.png` and `rollout.gif` (the first test trajectory beside its prediction).
+    Into the trainer's `default_root_dir` go `report.json` (all figures, with hardware and versions; a remark where the
+    model is no better than a trivial predictor), `errors.csv` (error against frame), `rollout.png` and `rollout.gif`
+    (the first test trajectory beside its prediction).
     """
 
     def __init__(self) -> None:
@@ -117,17 +118,22 @@ class ReportWriter(Callback):
         if not trainer.is_global_zero:
             return
         folder = Path(trainer.default_root_dir)
-        folder.mkdir(parents=True, exist_ok=True)
         figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in errors.items()})
-        with atomic_write(folder / "report.json") as part:
-            part.write_text(json.dumps(figures, indent=1) + "\n")
+        _write_report(folder, figures)
+        _print_table(f"{figures['dataset']}: test", figures["test"])
         _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()})
         if self._first_rollout is not None:
             trajectories = labelled_trajectories(pl_module.emulator.scene, *self._first_rollout)
             write_snapshots(trajectories, folder / "rollout.png")
             write_animation(trajectories, folder / "rollout.gif")
-        _print_table(f"{figures['dataset']}: test", figures["test"])
         Console().print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")
+
+    def report_untested(self, trainer: Trainer, module: EmulatorModule, reason: str) -> None:
+        """Write and print the report of a training that ends without a test."""
+        if trainer.is_global_zero:
+            folder = Path(trainer.default_root_dir)
+            _write_report(folder, self._figures(trainer, module, {}) | {"not_tested": reason})
+            Console().print(f"Not tested: {reason} Written to {folder}: report.json", soft_wrap=True)
 
     def _elapsed(self) -> float:
         return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
@@ -136,10 +142,13 @@ class ReportWriter(Callback):
         self, trainer: Trainer, module: EmulatorModule, per_trajectory: Mapping[str, list[dict[str, float]]]
     ) -> dict[str, Any]:
         datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
+        errors = _logged(trainer, "test/")
+        remark = no_better_than_trivial(errors)
         return {
             "dataset": datamodule.description,
             "weights": float32_digest(module.state_dict()),
-            "test": _logged(trainer, "test/"),
+            **({"test": errors} if errors else {}),
+            **({"remark": remark} if remark else {}),
             "per_trajectory": dict(per_trajectory),
             "training": {
                 "steps": self.trained_steps,
@@ -179,6 +188,11 @@ def _gather_ranks(metric: MSE, order: Sequence[int]) -> tuple[list[dict[str, flo
     return [rows[place] for place in places], [curves[place] for place in places]
 
 
+def _write_report(folder: Path, figures: Mapping[str, Any]) -> None:
+    with atomic_write(folder / "report.json") as part:
+        part.write_text(json.dumps(figures, indent=1) + "\n")
+
+
 def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
     """Mean over trajectories of the squared error at each frame that all of them reach, a column per predictor."""
     frames = min(len(curve) for rows in curves.values() for curve in rows)
@@ -204,3 +218,5 @@ def _print_table(what: str, errors: Mapping[str, float]) -> None:
     for kind, label in PREDICTORS.items():
         table.add_row(label, *table_row(errors, kind))
     Console().print(table)
+    if remark := no_better_than_trivial(errors):
+        Console().print(remark, soft_wrap=True)
