@@ -95,6 +95,19 @@ def test_without_validations_the_last_weights_are_tested(make_dataset):
     assert json.loads(Path("run/report.json").read_text())["test"] == ended
 
 
+def test_without_a_test_split_the_report_says_that_nothing_was_tested(make_dataset, capsys):
+    folder = make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=())
+    words = ["--config", "waterdrop.yaml", *TINY, "--data.path", str(folder), "--trainer.default_root_dir", "run"]
+    assert main(["fit", *words]) == 0
+    assert f"Not tested: {folder} has no test.h5." in capsys.readouterr().out
+    report = json.loads(Path("run/report.json").read_text())
+    assert report["not_tested"] == f"{folder} has no test.h5."
+    assert "test" not in report
+    assert report["curve"]
+    assert main(["test", *words, "--ckpt_path", "best"]) == 1
+    assert "no test.h5 there" in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_the_test_that_ends_a_training_is_of_the_averaged_weights_of_the_best_checkpoint(make_dataset):
     """Loaded by Lightning into the trainer that has just trained, it would be of the raw ones."""
     data = [*TINY_GOOP, "--trainer.default_root_dir", "run"]
@@ -261,6 +274,7 @@ def test_configurations_are_laid_over_one_another_and_refer_to_other_values(make
         (["fit", "--config", "goop.yaml", "--model.optimizer.lr", "-1"], r"lr = -1.0 must be a positive number"),
         (["fit", "--config", "goop.yaml", "--trainer.max_steps", "-1", "--trainer.max_time", "null"], "has no end"),
         (["fit", "--config", "goop.yaml", "--trainer.limit_train_batches", "0.5"], "0.5 is a share"),
+        (["fit", "--config", "goop.yaml", "--checkpoint.dirpath", __file__], r"--checkpoint.dirpath .*it is a file"),
         (["fit", "--config", "goop.yaml", "--ckpt_path", "last"], r"no runs/goop/checkpoints/last\.ckpt"),
         (
             ["fit", "--config", "goop.yaml", "--ckpt_path", "nowhere.ckpt"],

@@ -89,6 +89,17 @@ def test_with_time_alone_it_says_the_time_left(make_dataset, tmp_path, capsys):
     assert f"training: step {trainer.global_step}, 0:00:00 left" in last
 
 
+@pytest.mark.parametrize(
+    ("limits", "end"),
+    [({"max_steps": 4, "max_time": "01:00:00:00"}, "the last step"), ({"max_steps": 10**9}, "max_time")],
+    ids=["steps", "time"],
+)
+def test_with_both_it_says_which_ends_the_training(make_dataset, tmp_path, capsys, limits, end):
+    data = data_of(make_dataset())
+    trainer_with(tmp_path, Progress(), **({"max_time": "00:00:00:02"} | limits)).fit(module_of(data), data)
+    assert f"0:00:00 left to {end}, " in shown(capsys)[-1] + ", "
+
+
 def read_until(controller: int, words: str) -> str:
     """What a terminal shows, until the words or nothing for 10 seconds: it may arrive in pieces, after the flush."""
     shown = b""

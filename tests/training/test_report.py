@@ -4,7 +4,19 @@ import pytest
 import torch
 
 from nmpm._support.devices import device_name
+from nmpm.evaluation.figures import no_better_than_trivial
 from nmpm.training.callbacks.report import ReportWriter
+
+TRIVIAL = {"still/mse": 0.02, "free_fall/mse": 0.01}
+
+
+@pytest.mark.parametrize("error", [0.01, 0.5, float("nan")])
+def test_a_model_that_is_no_better_than_a_trivial_predictor_is_said_to_be_so(error):
+    said = no_better_than_trivial({"mse": error, "mse@8": 0.0} | TRIVIAL)
+    assert said.startswith("The model is no better than a trivial predictor")
+    assert "'free fall, stopped at walls' 10e-3" in said
+    assert no_better_than_trivial({"mse": 0.009} | TRIVIAL) == no_better_than_trivial({"mse": error}) == ""
+
 
 EMULATOR = SimpleNamespace(frames=8, parameters=lambda: iter(()))
 MODULE = SimpleNamespace(emulator=EMULATOR, unroll=2, state_dict=dict, threads=None)

@@ -41,11 +41,16 @@ class EvaluationLoader:
         device: torch.device | None = None,
     ) -> None:
         self.recordings, self.device = recordings, device or torch.device("cpu")
+        self._batch_size, self._rank, self._world = batch_size, rank, world
         recordings.require_frames(3, "an evaluation")
-        frames = recordings.split.frames
-        order = sorted(range(len(recordings))[:limit], key=frames)
-        groups = (list(group) for _, group in itertools.groupby(order[rank::world], key=frames))
-        batches = (batch for group in groups for batch in _bucket(group, batch_size, recordings.split.particles))
+        self.restrict(limit)
+
+    def restrict(self, limit: int | None) -> None:
+        """Use only the first `limit` trajectories from now on; all when None."""
+        split = self.recordings.split
+        order = sorted(range(len(split))[:limit], key=split.frames)[self._rank :: self._world]
+        groups = (list(group) for _, group in itertools.groupby(order, key=split.frames))
+        batches = (batch for group in groups for batch in _bucket(group, self._batch_size, split.particles))
         self.batches: tuple[tuple[int, ...], ...] = tuple(batches) or ((),)
 
     def __len__(self) -> int:

@@ -122,11 +122,12 @@ class Forecast(Callback):
         training = min(seconds_left(trainer), (total_steps(trainer) - trainer.global_step) * pace)
         share = seconds * math.ceil(training / pace / interval or 1) / training if training > 0 else 0.0
         by_user = data.limit_eval or trainer.limit_val_batches != 1.0
-        decided = by_user or data.validated or trainer.val_dataloaders is not None
         few = max(int(len(frames) * VALIDATION_SHARE / share), data.eval_batch_size) if share else len(frames)
-        if decided or few >= len(frames):
+        loader = trainer.val_dataloaders
+        if by_user or data.validated or few >= len(frames) or not isinstance(loader, EvaluationLoader):
             return seconds
         data.validated = few
+        loader.restrict(few)
         module.print(
             f"Validations on all {len(frames)} trajectories, {_clock(seconds)} each, would take"
             f" {share:.0%} of the training's time: they use the first {few} (--data.limit_eval sets another number)."

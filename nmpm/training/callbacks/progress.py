@@ -36,6 +36,11 @@ class Progress(ProgressBar):
         self._doing = self._loss = self._valid = ""
         self._first_step = 0
 
+    @property
+    def is_enabled(self) -> bool:
+        """Whether a bar is shown, above which `LightningModule.print` prints by `print`."""
+        return self._enabled
+
     def disable(self) -> None:
         self._enabled = False
 

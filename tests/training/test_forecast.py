@@ -1,0 +1,118 @@
+"""A training says early how far its time reaches, and its validations take a bounded share of it."""
+
+import re
+
+import lightning
+import pytest
+from test_training import module_of
+
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.training.callbacks import forecast
+from nmpm.training.callbacks.forecast import MEASURED, SKIPPED, Forecast
+
+DECIDED = SKIPPED + MEASURED + 1
+
+
+@pytest.fixture
+def set_pace(monkeypatch):
+    """Makes all trainings run at so many seconds per step, as far as `Forecast` sees."""
+    return lambda seconds: monkeypatch.setattr(forecast.statistics, "median", lambda _: seconds)
+
+
+class StopAfter(lightning.Callback):
+    def __init__(self, steps: int):
+        self.steps = steps
+
+    def on_train_batch_end(self, trainer, *_):
+        trainer.should_stop = trainer.global_step >= self.steps
+
+
+def fit(folder, last: int, ckpt_path=None, data=None, **limits) -> lightning.Trainer:
+    """Train up to a step."""
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    quiet |= {"check_val_every_n_epoch": None, "enable_checkpointing": False, "val_check_interval": 10**6}
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        default_root_dir=folder.parent / "run",
+        callbacks=[Forecast(), StopAfter(last)],
+        **(quiet | limits),
+    )
+    module = TrajectoryDataModule(path=str(folder), horizon=4, batch_size=2, eval_batch_size=2, **(data or {}))
+    trainer.fit(module_of(module), module, ckpt_path=ckpt_path, weights_only=True)
+    return trainer
+
+
+LONG = {"max_steps": 10**6, "max_time": "00:01:00:00", "limit_val_batches": 0}
+
+
+def test_a_training_that_time_ends_early_says_so_once(make_dataset, set_pace, capsys):
+    set_pace(10.0)
+    fit(make_dataset(), DECIDED + 3, **LONG)
+    said = capsys.readouterr().out
+    (line,) = re.findall(r"At 10 s a step, max_time ends this training after about (\d+) of 1000000 steps.*\n", said)
+    assert DECIDED + 360 - 10 <= int(line) <= DECIDED + 360
+    assert "a larger error" in said
+    assert re.search(r"--trainer\.max_time 115:\d\d:\d\d:00; for more: ", said)
+
+
+@pytest.mark.parametrize(("pace", "steps"), [(0.001, 10**6), (10.0, 500)], ids=["fast", "few steps"])
+def test_one_whose_time_reaches_far_enough_says_nothing(make_dataset, set_pace, capsys, pace, steps):
+    set_pace(pace)
+    fit(make_dataset(), DECIDED + 3, **(LONG | {"max_steps": steps}))
+    assert capsys.readouterr().out == ""
+
+
+VALID = {"valid": ((12, 5),) * 12}
+BOUNDED = {"max_steps": 30, "val_check_interval": 25}
+
+
+def test_validations_take_a_fifth_of_the_time_of_steps_also_when_it_goes_on(make_dataset, set_pace, tmp_path, capsys):
+    """12 trajectories of 10 frames cost 5 of the 9 steps that are left: a step has 24 frames, those with gradients."""
+    folder = make_dataset(**VALID)
+    set_pace(1.0)
+    begun = fit(folder, 28, **BOUNDED)
+    begun.save_checkpoint(tmp_path / "last.ckpt")
+    (count,) = re.findall(r"Validations on all 12 .* the first (\d+) \(--data\.limit_eval", capsys.readouterr().out)
+    assert int(count) == 4
+    counted = [index for batch in begun.val_dataloaders.batches for index in batch]
+    assert counted == [0, 1, 2, 3]
+    begun.validate(begun.lightning_module, datamodule=begun.datamodule, verbose=False)
+    assert sum(begun.num_val_batches) == 2  # the last weights are compared with those before
+    resumed = fit(folder, 30, tmp_path / "last.ckpt", **BOUNDED)
+    assert resumed.datamodule.validated == 4
+
+
+@pytest.mark.parametrize(
+    "unbounded",
+    [
+        {"data": {"limit_eval": 12}},
+        {"limit_val_batches": 6},
+        {"val_check_interval": 10},  # the first validation came before there was a pace
+        {"max_steps": 10**4, "val_check_interval": 10**3},
+    ],
+    ids=str,
+)
+def test_validations_that_the_user_bounds_or_that_cost_little_are_left_alone(
+    make_dataset, set_pace, capsys, unbounded
+):
+    set_pace(1.0)
+    trainer = fit(make_dataset(**VALID), 26, **(BOUNDED | unbounded))
+    assert capsys.readouterr().out == ""
+    assert trainer.datamodule.validated == 12
+
+
+def test_the_last_validation_is_within_max_time(make_dataset, set_pace):
+    set_pace(10.0)
+    trainer = fit(make_dataset(**VALID), DECIDED + 1, **(LONG | {"limit_val_batches": 1.0}))
+    (timer,) = (one for one in trainer.callbacks if isinstance(one, lightning.pytorch.callbacks.Timer))
+    assert 3540 < timer._duration < 3560  # a validation takes 50 s
+
+
+def test_the_closing_test_is_announced(make_dataset, set_pace, capsys):
+    set_pace(10.0)
+    trainer = fit(make_dataset(), DECIDED + 1, **LONG)
+    capsys.readouterr()
+    trainer.test(trainer.lightning_module, datamodule=trainer.datamodule, verbose=False)
+    said = capsys.readouterr().out
+    # 33 frames of rollouts, and 24 in 10 s
+    assert said.startswith("The closing test takes about 0:00:14 (--trainer.limit_test_batches N shortens it).")
