@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.utilities import rank_zero_info
 
 from nmpm._support.devices import processor_name
 from nmpm._support.parallel import usable_cores
@@ -79,7 +78,7 @@ class Threads(Callback):
         if self.choice.medians and not self._said:
             self._said = True
             times = "; ".join(f"{1e3 * seconds:.0f} ms by {n}" for n, seconds in self.choice.medians.items())
-            rank_zero_info(f"Threads: {self.choice.threads} (a step takes {times}).")
+            self._module.print(f"Threads: {self.choice.threads} (a step takes {times}).")
 
     def _apply(self, threads: int) -> None:
         """Let so many threads compute the parts of a batch; where it is in one part, its operations."""
