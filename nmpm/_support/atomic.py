@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import platform
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
@@ -15,18 +17,23 @@ from pathlib import Path
 STEM = 40
 """Characters of a file's name that its temporary name begins with."""
 
-NEW, FORMER = "new", "former"
-"""Within the temporary folder beside one that is written: what is to appear, and what it takes the place of."""
+NEW, FORMER, LOCK = "new", "former", "lock"
+"""Within the temporary folder beside one that is written: what is to appear, what it takes the place of, and the file
+that its process holds a lock on, which ends with the process."""
 
 
 def temporary_path(path: Path) -> Path:
-    """The hidden file beside `path` that this process writes first; a long name is cut, so that the whole fits."""
-    return path.with_name(f".{path.stem[:STEM]}.{os.getpid()}.part{path.suffix}")
+    """A hidden file beside `path` to write first; a long name is cut, so that the whole fits.
+
+    The number of the process lets its files be found when it was killed. The random number tells apart processes of
+    containers that share the folder and number their processes alike.
+    """
+    return path.with_name(f".{path.stem[:STEM]}.{os.getpid()}.{secrets.token_hex(4)}.part{path.suffix}")
 
 
 def temporary_files(folder: Path, process: int | str = "*") -> Iterator[Path]:
     """Files of a folder that a process, of this number or any, was writing when it was killed, or is writing."""
-    return folder.glob(f".*.{process}.part*")
+    return folder.glob(f".*.{process}.*.part*")
 
 
 @contextmanager
@@ -84,23 +91,20 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def _workplace(path: Path) -> Iterator[Path]:
     """A hidden folder beside `path` with an empty folder `NEW`, after leftovers of killed processes are cleared."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A name that is cut may be that of several paths; their digests differ.
+    # A name that is cut may be that of several paths; their digests differ. Some file systems, such as sshfs, lock
+    # within one machine only, so that each machine clears what it has left itself.
     stem = f".{path.name[:STEM]}.{sha256(path.name.encode()).hexdigest()[:8]}.{platform.node()}."
     for left in path.parent.glob(f"{escape(stem)}*"):
-        if not _is_running(left.name.removeprefix(stem).split(".")[0]):
+        with suppress(OSError), (left / LOCK).open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the folder's process lives
             if (left / FORMER).exists() and not path.exists():
                 os.replace(left / FORMER, path)
             shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=f"{stem}{os.getpid()}.", dir=path.parent) as place:
-        (Path(place) / NEW).mkdir()
-        yield Path(place)
-
-
-def _is_running(process: str) -> bool:
-    try:
-        os.kill(int(process), 0)
-    except PermissionError:  # another user's
-        return True
-    except (ProcessLookupError, ValueError):
-        return False
-    return True
+    with tempfile.TemporaryDirectory(prefix=stem, dir=path.parent, ignore_cleanup_errors=True) as name:
+        place = Path(name)
+        (place / NEW).mkdir()
+        with (place / "unlocked").open("w") as file:
+            with suppress(OSError):  # a file system without locks, on which nothing is cleared
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.replace(place / "unlocked", place / LOCK)
+            yield place

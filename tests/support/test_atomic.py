@@ -87,7 +87,7 @@ def test_what_a_killed_process_left_is_cleared_by_the_next_one(tmp_path, writer,
     with atomic_folder(tmp_path / name) as new, new_folder(tmp_path / f"{name}s") as other:
         (new / "file").write_text("whole")
         (other / "file").write_text("another")
-    left = {path: text for path, text in files_of(tmp_path).items() if text != "of the killed"}
+    left = {path: text for path, text in files_of(tmp_path).items() if text not in ("of the killed", "")}
     assert left == {f"{name}/file": "whole", f"{name}s/file": "another"}
     assert len(list(tmp_path.iterdir())) == 3  # what was left for another path stays
 
@@ -101,11 +101,21 @@ def test_a_former_folder_comes_back_after_a_kill_between_two_renames(tmp_path):
     assert files_of(tmp_path) == {"one/inner/file": "first"}
 
 
-def test_a_folder_of_a_running_process_is_left_alone(tmp_path):
+def test_a_folder_of_a_running_process_is_left_alone(tmp_path, monkeypatch):
     with atomic_folder(tmp_path / "one") as first:
         (first / "file").write_text("first")
+        # In a container of the same host name, another process has this number, or none has.
+        monkeypatch.setattr(os, "kill", lambda *_: (_ for _ in ()).throw(ProcessLookupError))
         write(tmp_path / "one", "second")
     assert files_of(tmp_path) == {"one/file": "first"}
+
+
+def test_processes_of_the_same_number_write_a_file_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "getpid", lambda: 7)
+    with atomic_write(tmp_path / "one") as first, atomic_write(tmp_path / "one") as second:
+        first.write_text("first")
+        second.write_text("second")
+    assert files_of(tmp_path) == {"one": "first"}
 
 
 def test_a_new_folder_replaces_none_that_holds_files(tmp_path):
