@@ -53,7 +53,7 @@ def check_command(words: Sequence[str]) -> None:
         ConfigError: if dataset or checkpoint do not exist.
         DataError: if there is no such embedded dataset.
     """
-    configs = [_read(Path(path)) for path in _config_paths(words)]
+    configs = [read_config(Path(path)) for path in _config_paths(words)]
     _check_options(words, configs)
     _check_classes(words)
     options = dict(pairwise(words)) | dict(word.split("=", 1) for word in words if "=" in word)
@@ -62,6 +62,19 @@ def check_command(words: Sequence[str]) -> None:
     _check_exists("--ckpt_path", _value(options, configs, "ckpt_path"), "checkpoint")
     if path in NOT_FILES and _value(options, configs, "data.source") in (None, "disk", "simulate"):
         _check_dataset(_value(options, configs, "data.name"))
+
+
+def read_config(path: Path) -> Mapping[str, Any]:
+    """Read a configuration file; an empty mapping where it holds something else.
+
+    Raises:
+        UsageError: if it is not YAML.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"--config {path}: it is not YAML ({one_line(error)}).") from error
+    return content if isinstance(content, Mapping) else {}
 
 
 def argument_names(group: str) -> set[str]:
@@ -99,14 +112,6 @@ def _config_paths(words: Sequence[str]) -> Iterator[str]:
             yield following
         elif word.startswith("--config="):
             yield word.removeprefix("--config=")
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"--config {path}: it is not YAML ({one_line(error)}).") from error
-    return content if isinstance(content, Mapping) else {}
 
 
 def _check_options(words: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> None:

@@ -6,31 +6,35 @@ import operator
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from jsonargparse.typing import PositiveInt
-from lightning.pytorch import Trainer
+from lightning.fabric.plugins.io import TorchCheckpointIO
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.options import check_folder
+from nmpm.cli.runs import CONFIG
 from nmpm.cli.typos import BriefParser
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
+from nmpm.training.callbacks.best_checkpoint import BestCheckpoint
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.forecast import Forecast
+from nmpm.training.callbacks.last_checkpoint import LastCheckpoint
 from nmpm.training.callbacks.prediction_writer import PredictionWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.report import ReportWriter
-from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 from nmpm.training.callbacks.threads import Threads
-from nmpm.training.checkpoints import read_checkpoint
+from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.compatibility import check_same_recipe
 from nmpm.training.module import OVERALL, EmulatorModule
 from nmpm.training.optimization import check_learning_rate
@@ -48,6 +52,9 @@ THREADS = (
     "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
     " used, as measured). Another number changes results by rounding."
 )
+CHECKPOINTS = "checkpoints"
+T = TypeVar("T")
+
 START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
@@ -55,20 +62,21 @@ class EmulatorCLI(LightningCLI):
     """Links what the model needs from the data and the other way round, and ends a fit with a test.
 
     Args:
-        words: The command line as the user gave it.
+        command: fit, validate, test or predict.
+        note: A line to print when it starts; may be empty.
         locks: A list that the descriptor of the run folder's lock is appended to. (Callbacks that copy the module copy
             this object too, so it must not hold what cannot be copied.)
         options: Of LightningCLI.
     """
 
-    def __init__(self, words: list[str], locks: list[int], **options: Any) -> None:
-        self.words, self.locks = words, locks
+    def __init__(self, command: str, note: str, locks: list[int], **options: Any) -> None:
+        self.command, self.note, self.locks = command, note, locks
         self.replaced_precision = ""
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # (static there)
         """The one that is run: parsers of the others would cost seconds."""
-        return {self.words[0]: LightningCLI.subcommands()[self.words[0]]}
+        return {self.command: LightningCLI.subcommands()[self.command]}
 
     def init_parser(self, **options: Any) -> LightningArgumentParser:
         """A parser whose errors are one line."""
@@ -77,12 +85,12 @@ class EmulatorCLI(LightningCLI):
         return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.add_lightning_class_args(BestCheckpoint, "checkpoint")
         parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
-        parser.add_lightning_class_args(ModelCheckpoint, "resume")
+        parser.add_lightning_class_args(LastCheckpoint, "resume")
         parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
         parser.add_argument("--threads", type=PositiveInt | None, default=None, help=THREADS)
-        if self.words[0] == "fit":
+        if self.command == "fit":
             parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate", compute_fn=self._model_scene)
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
@@ -114,14 +122,15 @@ class EmulatorCLI(LightningCLI):
             if not config["ckpt_path"]:
                 raise ConfigError(
                     "--ckpt_path is missing, so the model would be an untrained one: give best or last, of"
-                    f" {trainer['default_root_dir']}, or a checkpoint's file."
+                    f" {trainer['default_root_dir']}, or a checkpoint's file; or call nmpm {self.subcommand} RUN, with"
+                    " the folder of a run."
                 )
             if config.get("verbose"):
                 config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
         self._choose_precision(trainer)
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
         for saver in ("checkpoint", "resume"):
-            folder = Path(trainer["default_root_dir"]) / "checkpoints"
+            folder = Path(trainer["default_root_dir"]) / CHECKPOINTS
             config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
             check_folder(f"--{saver}.dirpath", Path(config[saver]["dirpath"]))
         optimizer = config["model"].get("optimizer")
@@ -148,11 +157,13 @@ class EmulatorCLI(LightningCLI):
         callbacks += [Preflight(), Forecast()]  # whose lines come before the bar's
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(Progress())
-        self.stop_on_signal, self.report = StopOnSignal(self._checkpoint_file("resume")), ReportWriter()
+        self.report = ReportWriter()
         self.threads = Threads(stated_threads(self.config_init[self.subcommand]["threads"]))
-        guards = [self.threads, DivergenceGuard(), self.report, PredictionWriter(), self.stop_on_signal]
-        kwargs["callbacks"] = [*callbacks, *guards]
-        return super().instantiate_trainer(**kwargs)
+        kwargs["callbacks"] = [*callbacks, self.threads, DivergenceGuard(), self.report, PredictionWriter()]
+        trainer = super().instantiate_trainer(**kwargs)
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+        return trainer
 
     def _parse_ckpt_path(self) -> None:
         """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""
@@ -188,7 +199,8 @@ class EmulatorCLI(LightningCLI):
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         self.locks.append(self.run_folder.lock())
-        if resumed is None:
+        self.run_folder.remove_unfinished()
+        if resumed is None or not self.run_folder.holds(Path(self.config_init[self.subcommand]["ckpt_path"])):
             self.run_folder.check_new()
         self._print_start()
         sys.stdout.write(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
@@ -199,9 +211,10 @@ class EmulatorCLI(LightningCLI):
             return
         device = self.trainer.strategy.root_device
         hardware = self.threads.describe(self.trainer) if device.type == "cpu" else device_name(device)
-        weights = sum(parameter.numel() for parameter in self.model.emulator.parameters())
+        emulator = self.model.emulator
+        weights = sum(parameter.numel() for parameter in emulator.parameters())
         sys.stdout.write(
-            f"Data: {self.datamodule.description}. Model: {type(self.model.emulator.recipe.processor).__name__},"
+            f"{self.note}Data: {self.datamodule.description}. Model: {type(emulator.recipe.processor).__name__},"
             f" {weights:,} parameters, on {hardware}.\n"
         )
         if self.replaced_precision:
@@ -240,9 +253,10 @@ class EmulatorCLI(LightningCLI):
         return content
 
     def fit(self, **options: Any) -> None:
-        """Train; an interruption says how to go on."""
+        """Train, then test the best weights; an interruption says how to go on."""
         try:
             self.trainer.fit(**options)
+            self._test_best_weights()
         except SystemExit as ended:
             if not isinstance(ended.__context__, KeyboardInterrupt):
                 raise
@@ -251,43 +265,49 @@ class EmulatorCLI(LightningCLI):
             raise SystemExit(130) from None
 
     def _how_to_go_on(self) -> str:
-        step = self.stop_on_signal.saved_step
-        if step is None and not self.run_folder.checkpoints["last"].is_file():
+        last = self.run_folder.checkpoints["last"]
+        if not last.is_file():
             return "interrupted before the first step. The same command starts again; simulated trajectories are kept."
-        where = f"stopped at step {step}" if step is not None else "interrupted"
-        return f"{where}. Go on with: {resuming_command(self.words)}"
+        step = self._saver(LastCheckpoint).saved_step
+        where = f"stopped at step {step}" if step else "interrupted"
+        return f"{where}. Go on with: {shlex.join(['nmpm', 'fit', '--resume', str(self.run_folder.root)])}"
 
-    def after_fit(self) -> None:
+    def _test_best_weights(self) -> None:
         """Validate the last weights too, if no validation has, and test the best ones, once.
 
         Where validations are turned off, the last weights are tested; where there is no test split, the report says so.
         """
-        checkpoint = self.trainer.checkpoint_callback
-        if isinstance(checkpoint, ModelCheckpoint) and checkpoint.monitor and self.trainer.limit_val_batches:
-            if self.model.validated_step < self.trainer.global_step:
-                self._validate_last_weights(checkpoint)
-            # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
-            if checkpoint.best_model_path:
-                self.model.load_state_dict(read_checkpoint(Path(checkpoint.best_model_path))["state_dict"])
-        if not self.datamodule.has_test:
+        best = self._saver(BestCheckpoint)
+        if best.monitor and self.trainer.limit_val_batches and best.scored_step < self.trainer.global_step:
+            self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
+            best.score(self.trainer)
+        # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
+        path = Path(best.best_model_path or self.run_folder.checkpoints["last"])
+        if path.is_file():
+            self.model.load_state_dict(read_checkpoint(path)["state_dict"])
+        if self.datamodule.has_test:
+            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+        else:
             reason = f"{self.datamodule.data_source.folder} has no test.h5."
             self.report.report_untested(self.trainer, self.model, reason)
-        else:
-            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
 
-    def _validate_last_weights(self, checkpoint: ModelCheckpoint) -> None:
-        self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
-        score = self.trainer.callback_metrics[str(checkpoint.monitor)]
-        if checkpoint.check_monitor_top_k(self.trainer, score):
-            path = self._checkpoint_file("checkpoint")
-            self.trainer.save_checkpoint(path, weights_only=False)
-            checkpoint.best_model_path, checkpoint.best_model_score = str(path), score
+    def _saver(self, kind: type[T]) -> T:
+        return next(callback for callback in self.trainer.checkpoint_callbacks if isinstance(callback, kind))
 
 
-def resuming_command(words: list[str]) -> str:
-    """The command that goes on from the last checkpoint of one that was interrupted."""
-    kept = [word for word in words if not word.startswith("--ckpt_path=")]
-    if "--ckpt_path" in kept:
-        at = kept.index("--ckpt_path")
-        del kept[at : at + 2]
-    return shlex.join(["nmpm", *kept, "--ckpt_path", "last"])
+class RunConfig(SaveConfigCallback):
+    """Writes a training's configuration into the run's folder, such that `nmpm test RUN` works from anywhere."""
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: ARG002
+        if stage != "fit":
+            return
+        config, root = self.config.clone(), Path(self.config["trainer"]["default_root_dir"])
+        config["ckpt_path"] = None
+        config.pop("start_from", None)  # unknown to other commands, and of the start alone
+        for saver in ("checkpoint", "resume"):
+            folder = Path(config[saver]["dirpath"])
+            config[saver]["dirpath"] = None if folder == root / CHECKPOINTS else str(folder.absolute())
+        if config["data"]["path"]:
+            config["data"]["path"] = str(Path(config["data"]["path"]).absolute())
+        with atomic_write(root / CONFIG) as part:
+            part.write_text(self.parser.dump(config, skip_none=False), encoding="utf-8")

@@ -14,16 +14,16 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
-from nmpm.cli.emulator_cli import EmulatorCLI
+from nmpm.cli.emulator_cli import EmulatorCLI, RunConfig
 from nmpm.errors import ConfigError
 
 
-def run_command(words: list[str], found: list[str]) -> int:
+def run_command(words: list[str], note: str = "") -> int:
     """Run a training command.
 
     Args:
-        words: As the user gave it.
-        found: The same with the configuration files' paths.
+        words: The command and its options, with the configuration files' paths.
+        note: A line to print when it starts.
 
     Returns:
         The exit status.
@@ -36,16 +36,18 @@ def run_command(words: list[str], found: list[str]) -> int:
     load_plugins()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
-    sys.argv = [sys.argv[0], *found]
+    sys.argv = [sys.argv[0], *words]
     locks: list[int] = []
     try:
         with quiet_lightning(), _treat_sigterm_like_sigint():
             EmulatorCLI(
-                words,
+                words[0],
+                note,
                 locks,
                 seed_everything_default=0,
                 parser_kwargs={"parser_mode": "omegaconf+"},
-                save_config_kwargs={"overwrite": True},
+                save_config_callback=RunConfig,
+                save_config_kwargs={"save_to_log_dir": False},
             )
     except MisconfigurationException as error:
         raise ConfigError(" ".join(str(error).split())) from error

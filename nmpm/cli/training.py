@@ -7,28 +7,30 @@ import sys
 from nmpm._support.shipped import find_config
 from nmpm.cli import COMMANDS
 from nmpm.cli.early_checks import UsageError, check_command
+from nmpm.cli.runs import expand_run
 
 
 def run(words: list[str]) -> int:
-    """Run a training command, e.g. ["fit", "--config", "goop.yaml"].
+    """Run a training command, e.g. ["fit", "--config", "goop.yaml"] or ["test", "runs/goop"].
 
     Returns:
         The exit status: 2 for an option or key that cannot be.
 
     Raises:
-        ConfigError: if a file that an option names does not exist.
+        ConfigError: if a file or run that is named does not exist.
     """
     if "--help" in words or "-h" in words:
         from nmpm.cli.training_help import training_help
 
         sys.stdout.write(training_help(words[0], COMMANDS[words[0]][1]))
         return 0
-    found = with_shipped_configs(["--help" if word == "--help_all" else word for word in words])
     try:
-        check_command(found)
+        expanded, note = expand_run(["--help" if word == "--help_all" else word for word in words])
+        expanded = with_shipped_configs(expanded)
+        check_command(expanded)
         from nmpm.cli.run_training import run_command
 
-        return run_command(words, found)
+        return run_command(expanded, note)
     except UsageError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
         return 2

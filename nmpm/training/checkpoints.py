@@ -1,4 +1,4 @@
-"""Read checkpoints as tensors and plain data, without executing anything in them."""
+"""Read checkpoints as tensors and plain data, without executing anything in them; write them atomically."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.fabric.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
+from nmpm._support.atomic import atomic_write
 from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, NmpmError
@@ -15,6 +17,20 @@ from nmpm.training.module import EmulatorModule
 
 FORMER_ARGUMENTS = frozenset({"horizons", "emd"})
 """Hyperparameters of version 0.1.0 that the model no longer has: metrics are now chosen for each evaluation."""
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint beside its place, then renames it.
+
+    Lightning writes into the system's temporary folder, from where, on another file system, a kill leaves half a file.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:  # noqa: ARG002
+        if "://" in str(path):
+            super().save_checkpoint(checkpoint, path)
+            return
+        with atomic_write(Path(path)) as part:
+            torch.save(checkpoint, part)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

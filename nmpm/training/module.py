@@ -145,7 +145,6 @@ class EmulatorModule(LightningModule):
         chosen = [MSE()] if metrics is None else list(metrics)
         self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
         self.test_errors = Comparison(scene, chosen)
-        self.validated_step = -1
         self._clock = Clock()
 
     @classmethod
@@ -318,7 +317,6 @@ class EmulatorModule(LightningModule):
         errors = self.valid_errors.compute()
         overall = overall_error(errors, self.emulator.frames * self.unroll)
         self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
-        self.validated_step = self.global_step
 
     def on_test_epoch_end(self) -> None:
         self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})

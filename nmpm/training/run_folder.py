@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from nmpm._support.atomic import temporary_files
 from nmpm.errors import ConfigError
 
 
@@ -49,6 +50,16 @@ class RunFolder:
         os.write(descriptor, str(os.getpid()).encode())
         return descriptor
 
+    def remove_unfinished(self) -> None:
+        """Delete files that a process was writing when it was killed. Needs the folder's lock."""
+        folders = {path.parent for path in self.checkpoints.values() if path.is_relative_to(self.root)}
+        for left in [file for folder in {self.root, *folders} for file in temporary_files(folder)]:
+            left.unlink(missing_ok=True)
+
+    def holds(self, checkpoint: Path) -> bool:
+        """Whether a checkpoint is one of this run, whatever path leads to it."""
+        return checkpoint.resolve().parent in {path.resolve().parent for path in self.checkpoints.values()}
+
     def check_new(self) -> None:
         """Make sure that no run is written over.
 
@@ -61,9 +72,9 @@ class RunFolder:
         old = [path for folder in folders for path in folder.glob("*.ckpt")]
         old += [path for path in [self.root / "report.json"] if path.is_file()]
         if old:
-            resume = "Go on with it by adding --ckpt_path last, or choose" if last.is_file() else "Remove it, or choose"
+            resume = f"Go on with it by nmpm fit --resume {self.root}" if last.is_file() else "Remove it"
             raise ConfigError(
-                f"{self.root} already holds a run ({old[0].name}). {resume} another folder with"
+                f"{self.root} already holds a run ({old[0].name}). {resume}, or choose another folder with"
                 " --trainer.default_root_dir."
             )
 

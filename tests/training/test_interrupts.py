@@ -26,17 +26,22 @@ FIT = [
 
 
 class Kill(Callback):
-    """Sends this process a signal after a step or in the middle of the validation after it."""
+    """Sends this process, once, a signal after a step or in the middle of the validation after it."""
+
+    armed = False
 
     def __init__(self, kind: int, step: int, validating: bool = False):
         self.kind, self.step, self.validating = kind, step, validating
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        if trainer.global_step == self.step and not self.validating:
-            os.kill(os.getpid(), self.kind)
+        self._kill(trainer.global_step == self.step and not self.validating)
 
     def on_validation_batch_start(self, trainer, *_):
-        if trainer.global_step == self.step and self.validating:
+        self._kill(trainer.global_step == self.step and self.validating)
+
+    def _kill(self, due):
+        if due and Kill.armed:
+            Kill.armed = False
             os.kill(os.getpid(), self.kind)
 
 
@@ -49,6 +54,7 @@ def fit(make_dataset, tmp_path, monkeypatch):
 
     def fit(folder: str, *words: str, kill: dict | None = None) -> int:
         averaging = {"class_path": "lightning.pytorch.callbacks.EMAWeightAveraging", "init_args": {"decay": 0.5}}
+        Kill.armed = bool(kill)
         killer = [{"class_path": f"{__name__}.Kill", "init_args": kill}] if kill else []
         Path("mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [averaging, *killer]}}))
         steps = ["--trainer.max_steps", "8", "--trainer.val_check_interval", "4"]
@@ -75,7 +81,7 @@ def test_an_interrupted_training_goes_on_where_it_was_by_the_command_that_it_pri
     assert fit("run", kill=kill) == 130
     said = capfd.readouterr().err
     step = kill["step"] + (not kill.get("validating", False))
-    found = re.search(rf"^nmpm fit: stopped at step {step}\. Go on with: (nmpm fit .* --ckpt_path last)$", said, re.M)
+    found = re.search(rf"^nmpm fit: stopped at step {step}\. Go on with: (nmpm fit --resume run)$", said, re.M)
     assert found
     assert "Traceback" not in said
     assert torch.load("run/checkpoints/last.ckpt", weights_only=True)["global_step"] == step
@@ -136,7 +142,7 @@ def test_what_a_run_left_is_not_written_over(tmp_path, left):
     (tmp_path / left).touch()
     with pytest.raises(ConfigError, match="already holds a run") as refusal:
         folder.check_new()
-    assert ("--ckpt_path last" in str(refusal.value)) == ("last" in left)
+    assert ("nmpm fit --resume" in str(refusal.value)) == ("last" in left)
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ def test_a_full_disk_is_refused_and_a_nearly_full_one_is_warned_of(make_dataset,
     trainer = lightning.Trainer(accelerator="cpu", default_root_dir=tmp_path / "run", logger=False, max_steps=1)
 
     def leave(megabytes: int) -> None:
-        usage = namedtuple("usage", "free")(megabytes << 20)  # noqa: PYI024
+        usage = namedtuple("usage", "free")(megabytes << 20)
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
 
     leave(10)

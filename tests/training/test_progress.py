@@ -15,9 +15,9 @@ from test_training import Questions, data_of, module_of
 
 from nmpm.optimizers import SOAP
 from nmpm.training.callbacks.divergence import DivergenceGuard
+from nmpm.training.callbacks.last_checkpoint import LastCheckpoint
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.report import ReportWriter
-from nmpm.training.callbacks.stop_on_signal import StopOnSignal
 
 
 def trainer_with(root, *callbacks: Callback, **limits) -> Trainer:
@@ -58,7 +58,7 @@ def test_values_are_read_back_at_the_start_at_logged_steps_and_at_the_end_alone(
         Progress(),
         DivergenceGuard(),
         ReportWriter(),
-        StopOnSignal(tmp_path / "last.ckpt"),
+        LastCheckpoint(tmp_path, "last", every_n_train_steps=1000),
     ]
     trainer = trainer_with(tmp_path, *guards, max_steps=25, precision="bf16-mixed")
     with Readings(trainer) as readings:

@@ -70,8 +70,11 @@ class ReportWriter(Callback):
         self.trained_hardware = str(state_dict.get("trained_hardware", ""))
         self.curve = list(state_dict.get("curve", []))
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+        self._trained = True  # also where no step is left to take
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._since, self._trained = time.monotonic(), True
+        self._since = time.monotonic()
         self.trained_precision = str(trainer.precision)
         hardware = device_name(trainer.strategy.root_device, getattr(pl_module, "threads", None))
         self.trained_hardware = join_hardware(self.trained_hardware, hardware)

@@ -1,0 +1,106 @@
+"""A run's folder on the command line: `nmpm test RUN`, `nmpm fit --resume RUN`. Imports neither torch nor Lightning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nmpm.cli.early_checks import UsageError, read_config
+from nmpm.errors import ConfigError
+
+CONFIG = "config.yaml"
+"""The file of a run's folder that holds its configuration."""
+ROOT, CHECKPOINT = "--trainer.default_root_dir", "--ckpt_path"
+
+
+def expand_run(words: Sequence[str]) -> tuple[list[str], str]:
+    """Replace the folder of a run by the options that it stands for.
+
+    Args:
+        words: Such as ["test", "runs/goop"] or ["fit", "--resume", "runs/goop", "--trainer.max_steps", "9000"].
+
+    Returns:
+        The words with the run's configuration, folder and checkpoint, and a line that names what further options
+        change; the words as they are, and no line, where they name no run.
+
+    Raises:
+        UsageError: if `--resume` lacks the folder, or `nmpm fit` gets one without `--resume`.
+        ConfigError: if the folder, its configuration or its checkpoint does not exist.
+    """
+    command, *options = (
+        part for word in words for part in (word.split("=", 1) if word.startswith("--resume=") else [word])
+    )
+    if command == "fit":
+        if options and not options[0].startswith("-"):
+            raise UsageError(f"to go on with a run, call nmpm fit --resume {options[0]}.")
+        if "--resume" not in options:
+            return list(words), ""
+        at = options.index("--resume")
+        if at + 1 == len(options) or options[at + 1].startswith("-"):
+            raise UsageError("--resume lacks the folder of a run, such as --resume runs/goop.")
+        run, checkpoints = Path(options[at + 1]), ("resume",)
+        del options[at : at + 2]
+    elif options and not options[0].startswith("-"):
+        run, checkpoints = Path(options.pop(0)), ("checkpoint", "resume")
+    else:
+        return list(words), ""
+    config = _run_config(run)
+    given = {word.partition("=")[0] for word in options}
+    implied = [] if ROOT in given else [ROOT, str(run)]
+    if CHECKPOINT not in given:
+        implied += [CHECKPOINT, str(_find_checkpoint(run, config, checkpoints))]
+    changes = "; ".join(_changes(options, config))
+    note = f"Run: {run}{f', changed: {changes}' if changes else ''}.\n"
+    return [command, "--config", str(run / CONFIG), *options, *implied], note
+
+
+def _run_config(run: Path) -> Mapping[str, Any]:
+    if run.is_file():
+        raise ConfigError(f"{run} is a file: name the folder of a run, or give --config FILE {CHECKPOINT} {run}.")
+    if not run.is_dir():
+        raise ConfigError(f"{run}: there is no such folder.")
+    if not (run / CONFIG).is_file():
+        raise ConfigError(f"{run} is not the folder of a run: there is no {CONFIG} in it.")
+    return read_config(run / CONFIG)
+
+
+def _find_checkpoint(run: Path, config: Mapping[str, Any], savers: Sequence[str]) -> Path:
+    """The checkpoint of the first of the savers that has written one."""
+    paths = []
+    for saver in savers:
+        section = _value(config, saver) or {}
+        name = section.get("filename") or {"checkpoint": "best", "resume": "last"}[saver]
+        paths.append(Path(section.get("dirpath") or run / "checkpoints") / f"{name}.ckpt")
+    existing = [path for path in paths if path.is_file()]
+    if not existing:
+        others = ", ".join(path.name for path in sorted(paths[0].parent.glob("[!.]*.ckpt"))) or "none"
+        raise ConfigError(f"{run}: there is no {' or '.join(map(str, paths))}; checkpoints there: {others}.")
+    return existing[0]
+
+
+def _changes(options: Sequence[str], config: Mapping[str, Any]) -> Iterator[str]:
+    """What options change of a configuration, such as "trainer.max_steps = 8 (was 4)"."""
+    for word, following in pairwise([*options, ""]):
+        name, mark, value = word.partition("=")
+        if name.startswith("-"):
+            new, old = value if mark else following, _value(config, name.removeprefix("--"))
+            if isinstance(old, Mapping) and "class_path" in old:
+                old = old["class_path"]
+            if name in ("--config", "-c", ROOT, CHECKPOINT):
+                yield f"{name} {new}"
+            elif yaml.safe_load(new) != old:
+                yield f"{name.removeprefix('--')} = {new} (was {'null' if old is None else old})"
+
+
+def _value(config: Mapping[str, Any], key: str) -> Any:
+    """The value of a dotted key, in which "init_args" may be left out; None if it is not stated."""
+    value: Any = config
+    for part in key.split("."):
+        if isinstance(value, Mapping) and part not in value:
+            value = value.get("init_args")
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value

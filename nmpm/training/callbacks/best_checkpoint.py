@@ -1,0 +1,92 @@
+"""Keep the checkpoints of the best validations, whatever happens to the process or to the folder's path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
+from torch import Tensor
+
+from nmpm.errors import DataError
+from nmpm.training.checkpoints import read_checkpoint
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """A ModelCheckpoint that takes the best scores so far from the files in its folder.
+
+    What Lightning resumes from names files by their former absolute paths, and was written before the process was
+    killed: a moved or copied folder would lose its best weights to worse ones, and so would one killed after a
+    validation. A validation that was due at the step that a training goes on from, and has no score, is made up for.
+
+    Attributes:
+        scored_step: Step of the last weights that have a score; -1 before the first, or where no best weights are left.
+    """
+
+    scored_step = -1
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"scored_step": self.scored_step}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.scored_step = int(state_dict["scored_step"]) if self.best_k_models else -1
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:  # noqa: ARG002
+        if trainer.state.fn != TrainerFn.FITTING or not self.save_top_k or self.monitor is None:
+            return
+        step = int(checkpoint["global_step"])
+        self._take(trainer.strategy.broadcast(self._stored_scores() if trainer.is_global_zero else None))
+        state = checkpoint["callbacks"].get(self.state_key, {})
+        if self.best_model_score is not None:
+            file, score = Path(self.best_model_path).name, float(self.best_model_score)
+            rank_zero_info(f"Going on from step {step}; best so far: {self.monitor} = {score:.4g} ({file}).")
+        elif state.get("best_model_path"):
+            rank_zero_warn(
+                f"Going on from step {step} without the best weights so far: {Path(state['best_model_path']).name} is"
+                f" not in {self.dirpath}. The best are those of the validations from here on."
+            )
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        super().on_train_start(trainer, pl_module)
+        loop = trainer.fit_loop.epoch_loop
+        due = trainer.global_step > 0 and loop._should_check_val_fx(trainer.fit_loop._data_fetcher)  # type: ignore[arg-type]  # (set by now)
+        if due and self.scored_step < trainer.global_step:
+            first, trainer.validating = trainer._logger_connector._first_loop_iter, True
+            loop.val_loop.restarting = False
+            loop.val_loop.run()
+            trainer.training, trainer._logger_connector._first_loop_iter = True, first
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.state.fn == TrainerFn.FITTING and not trainer.sanity_checking:
+            self.scored_step = trainer.global_step
+        super().on_validation_end(trainer, pl_module)
+
+    def score(self, trainer: Trainer) -> None:
+        """Take the scores of a validation after the training, and save the weights if they are among the best."""
+        self.scored_step = trainer.global_step
+        self._save_topk_checkpoint(trainer, self._monitor_candidates(trainer))
+
+    def _stored_scores(self) -> dict[str, Tensor]:
+        """Paths of the best checkpoints in the folder, and the scores that they state of themselves."""
+        scores = {}
+        for path in sorted(Path(str(self.dirpath)).glob(f"[!.]*{self.FILE_EXTENSION}")):
+            try:
+                state = read_checkpoint(path).get("callbacks", {}).get(self.state_key, {})
+            except DataError as error:
+                rank_zero_warn(f"Not one of the best weights: {error}")
+                continue
+            # Of other checkpoints, such as last.ckpt, it names the best ones of their time, but not themselves.
+            scores |= {str(path): score for name, score in state.get("best_k_models", {}).items()
+                       if Path(name).name == path.name}  # fmt: skip
+        return scores
+
+    def _take(self, scores: dict[str, Tensor]) -> None:
+        ranked = sorted(scores, key=lambda path: float(scores[path]), reverse=self.mode == "max")
+        kept = ranked[: self.save_top_k] if self.save_top_k > 0 else ranked
+        self.best_k_models = {path: scores[path] for path in kept}
+        if kept:
+            self.best_model_path, self.kth_best_model_path = kept[0], kept[-1]
+            self.best_model_score, self.kth_value = scores[kept[0]], scores[kept[-1]]

@@ -1,0 +1,125 @@
+"""Killed by -9 at any moment and resumed, a training leaves what an uninterrupted one leaves."""
+
+import functools
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from nmpm.cli import main
+from tests.conftest import make_dataset
+
+FIT = [
+    *("fit", "--config", "waterdrop.yaml", "--config", "mine.yaml", "--model.unroll", "1", "--data.batch_size", "2"),
+    *("--model.cells", "8", "--model.processor.width", "2", "--model.processor.depth", "1"),
+    *("--model.processor.perceptron", "[2]", "--model.optimizer.lr", "0.3", "--model.schedule.warmup", "0"),
+    *("--trainer.accelerator", "cpu", "--trainer.precision", "32-true", "--trainer.enable_progress_bar", "false"),
+    *("--trainer.max_steps", "5", "--trainer.val_check_interval", "2", "--resume.every_n_train_steps", "3"),
+]
+AVERAGING = {"class_path": "lightning.pytorch.callbacks.EMAWeightAveraging", "init_args": {"decay": 0.5}}
+SAVING = "nmpm.training.checkpoints:torch.save"
+BEST = "nmpm.training.callbacks.best_checkpoint:BestCheckpoint"
+LAST = "nmpm.training.callbacks.last_checkpoint:LastCheckpoint"
+MODULE = "nmpm.training.module:EmulatorModule"
+# Saved are last.ckpt before the first validation, best.ckpt and last.ckpt after it, last.ckpt at step 3, …
+MOMENTS = {
+    "when a step is over": (f"{LAST}.on_train_batch_end", 2),
+    "before a validation": (f"{LAST}.on_validation_start", 1),
+    "in the first validation": (f"{MODULE}.validation_step", 1),
+    "in the second validation": (f"{MODULE}.validation_step", 2),
+    "after a validation": (f"{BEST}.on_validation_end", 1),
+    "after one that is not the best": (f"{BEST}.on_validation_end", 2),
+    "within last.ckpt before a validation": (SAVING, 1),
+    "within best.ckpt": (SAVING, 2),
+    "between best.ckpt and last.ckpt": (f"{LAST}.on_validation_end", 1),
+    "within last.ckpt after a validation": (SAVING, 3),
+    "when the last step is over": (f"{LAST}.on_train_batch_end", 5),
+    "in the closing validation": (f"{MODULE}.validation_step", 3),
+    "in the closing test": (f"{MODULE}.test_step", 1),
+    "within the report": ("nmpm.training.callbacks.report:json.dumps", 1),
+}
+
+
+def kill_at(name: str, call: int) -> None:
+    """Have this process killed within a call of a function; one that writes a file has written half of it."""
+    module, _, attributes = name.partition(":")
+    *parents, attribute = attributes.split(".")
+    owner = functools.reduce(getattr, parents, import_module(module))
+    original, calls = getattr(owner, attribute), iter(range(1, 1000))
+
+    @functools.wraps(original)
+    def killed(*args, **options):
+        if next(calls) == call:
+            if name == SAVING:
+                original(*args, **options)
+                os.truncate(args[1], Path(args[1]).stat().st_size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(*args, **options)
+
+    setattr(owner, attribute, killed)
+
+
+def run(folder: str, words: list[str], moment: tuple[str, int] | None = None) -> None:
+    os.chdir(folder)
+    for name in ("write_animation", "write_snapshots"):  # which take most of the time
+        setattr(import_module("nmpm.training.callbacks.report"), name, lambda *_: None)
+    if moment:
+        kill_at(*moment)
+    raise SystemExit(main(words))
+
+
+def start(folder: Path, words: list[str], *moment: tuple[str, int]) -> int:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["nmpm.cli.run_training"])
+    process = context.Process(target=run, args=(str(folder), words, *moment))
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def plain(value):
+    """Tensors as lists, which can be compared."""
+    if isinstance(value, dict):
+        return {key: plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return value.tolist() if isinstance(value, torch.Tensor) else value
+
+
+def outcome(run: Path) -> dict:
+    """All that a run leaves, apart from times."""
+    files = {name: torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True) for name in ("best", "last")}
+    report = json.loads((run / "report.json").read_text())
+    del report["training"]["seconds"]
+    report["curve"] = [point[1:] for point in report["curve"]]
+    parts = ("state_dict", "current_model_state", "optimizer_states", "lr_schedulers", "global_step")
+    states = {name: plain({part: content[part] for part in parts}) for name, content in files.items()}
+    return {"report": report, "names": sorted(path.name for path in (run / "checkpoints").iterdir()), **states}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of an uninterrupted run, with its data."""
+    folder = tmp_path_factory.mktemp("whole")
+    sizes = ((40, 9),) * 2
+    data = make_dataset.__wrapped__(folder)(train=sizes, valid=sizes, test=sizes)
+    (folder / "mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [AVERAGING]}}))
+    assert start(folder, [*FIT, "--data.path", str(data), "--trainer.default_root_dir", "run"]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("moment", MOMENTS.values(), ids=MOMENTS)
+def test_a_killed_training_goes_on_to_the_same_end(whole, tmp_path, moment):
+    shutil.copy(whole / "mine.yaml", tmp_path)
+    words = [*FIT, "--data.path", str(whole / "dataset"), "--trainer.default_root_dir", "run"]
+    assert start(tmp_path, words, moment) == -signal.SIGKILL
+    more = ["fit", "--resume", "run"] if (tmp_path / "run/checkpoints/last.ckpt").is_file() else words
+    assert start(tmp_path, more) == 0
+    assert outcome(tmp_path / "run") == outcome(whole / "run")
