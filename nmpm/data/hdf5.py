@@ -26,13 +26,16 @@ from nmpm.errors import DataError, NmpmError
 _ERRORS = (OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError, MemoryError)
 """What h5py raises on damaged files."""
 
+_LOCK_SIGNS = ("unable to lock file", "file locking")
+"""In HDF5's messages on files that another program, or another part of this one, has locked."""
+
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
     """Opens an HDF5 file for reading.
 
     Raises:
-        DataError: if it is not a regular file, or HDF5 cannot read it; names the file.
+        DataError: if it is not a regular file, is locked, or HDF5 cannot read it; names the file.
     """
     check_regular(path)
     try:
@@ -41,10 +44,20 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     except NmpmError:
         raise
     except _ERRORS as error:
-        reason = " ".join(str(error).split())[:200]
-        raise DataError(
-            f"{path}: cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again."
-        ) from error
+        raise _read_error(path, error) from error
+
+
+def _read_error(path: Path, error: Exception) -> DataError:
+    reason = " ".join(str(error).split())[:200]
+    if any(sign in reason for sign in _LOCK_SIGNS):
+        cause = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else reason
+        return DataError(
+            f"{path}: is locked ({cause}). Close the program that has it open, e.g. a notebook that writes it; if there"
+            " is none, as on some network or read-only disks, set HDF5_USE_FILE_LOCKING=FALSE."
+        )
+    if isinstance(error, PermissionError):
+        return DataError(f"{path}: cannot be read (permission denied). Correct its permissions.")
+    return DataError(f"{path}: cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again.")
 
 
 def check_self_contained(file: Any, path: Path) -> None:

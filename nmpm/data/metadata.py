@@ -197,7 +197,7 @@ def load_json(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise DataError(f"{path}: no such file. A dataset needs this file, with bounds, dt, dim and sequence_length.")
     try:
-        plain = json.loads(read_bounded(path, METADATA_BYTES).decode("utf-8"))
+        plain = json.loads(read_bounded(path, METADATA_BYTES).decode("utf-8-sig"))
     except NmpmError:
         raise
     except (ValueError, RecursionError, MemoryError) as error:

@@ -68,6 +68,6 @@ def _read_errors(path: Path) -> dict[str, list[float]]:
     """The columns of a run's `errors.csv`; empty where there is none."""
     if not path.is_file():
         return {}
-    with path.open(encoding="utf-8") as file:
+    with path.open(encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
     return {name: [float(row[name]) for row in rows] for name in rows[0]} if rows else {}

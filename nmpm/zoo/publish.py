@@ -208,7 +208,7 @@ def _card(name: str, about: str, figures: Mapping[str, Any], emulator: Emulator)
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         raise ZooError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, dict):

@@ -1,3 +1,4 @@
+import fcntl
 import os
 import subprocess
 import sys
@@ -83,6 +84,22 @@ class TestSelfContained:
             file["particles"] = h5py.ExternalLink("/etc/passwd", "/")
         with pytest.raises(DataError, match=r"sim_0.h5: 'particles' is an external link"):
             next(kind for kind in FORMATS if kind.name == "neuralmpm").open(tmp_path, Options(dt=0.1))
+
+
+class TestLocks:
+    def refused(self, path: Path) -> None:
+        with pytest.raises(DataError, match=r"train.h5: is locked .*HDF5_USE_FILE_LOCKING=FALSE") as caught:
+            Split(path)
+        assert "complete" not in str(caught.value)
+
+    def test_a_file_that_this_program_has_open_with_other_locks(self, split):
+        with h5py.File(split, "a", locking=False):
+            self.refused(split)
+
+    def test_a_file_that_another_program_locks(self, split):
+        with split.open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            self.refused(split)
 
 
 class TestRegularFiles:

@@ -43,6 +43,11 @@ class TestMetadata:
         assert metadata.gravity == (0.0, -9.81)
         assert metadata.extra == {"default_connectivity_radius": 0.015, "vel_std": [1.0, 2.0]}
 
+    def test_a_byte_order_mark_is_skipped(self, write_keys):
+        path = write_keys() / METADATA_FILE
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+        assert read_metadata(path.parent).dim == 2
+
     @given(
         dim=st.integers(1, 3),
         low=st.floats(-5, 5),

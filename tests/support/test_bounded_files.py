@@ -58,6 +58,11 @@ def test_text_keeps_its_lines_and_characters(tmp_path):
     assert read_yaml(tmp_path / "a.yaml") == {"a": "line\nline\t×10⁻³ \U0001f4a1"}
 
 
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    (tmp_path / "a.yaml").write_text("\ufeffa: 1\n", encoding="utf-8")
+    assert read_yaml(tmp_path / "a.yaml") == {"a": 1}
+
+
 def test_large_files_are_not_read(tmp_path):
     path = tmp_path / "a.yaml"
     with path.open("wb") as file:
