@@ -46,8 +46,8 @@ class TrajectoryDataModule(LightningDataModule):
 
     Args:
         path: A dataset: a folder in the native layout, or anything that `nmpm convert` reads, converted on first use.
-        name: Embedded dataset, simulated on first use. Ignored where `path` is given, so that `--data.path` on the
-            command line replaces the `name` of a configuration.
+        name: Embedded dataset, simulated on first use. Ignored where `path` is given, as is `generate`, so that
+            `--data.path` on the command line replaces both of a configuration.
         source: "disk"; or "simulate" to train on new trajectories of `name` from the simulator, which are not written
             and used in one buffer only; or "hub" for the dataset `name` of the Hugging Face hub's `iSach/NeuralMPM`.
         horizon: Frames to predict in a training window: frames per bundle times bundles unrolled.
@@ -311,10 +311,14 @@ def _check_source(
     if source not in get_args(SourceName):
         raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")
     if path is not None and source != "disk":
-        raise ConfigError(f"source = {source} needs the `name` of a dataset, not the path {path}.")
-    recorded = path is not None or source == "hub"
-    given = {"generate": generate} if recorded else stated
+        raise ConfigError(
+            f"source = {source} needs the `name` of a dataset, not the path {path}; for the path, --data.source disk."
+        )
+    if path is not None:
+        return
+    given = {"generate": generate} if source == "hub" else stated
     wrong = [key for key, value in given.items() if value is not None]
     if wrong:
-        kind = f"recorded data ({path or name})" if recorded else f"the simulated dataset {name}"
-        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {kind}; leave it out.")
+        kind = f"the published dataset {name}" if source == "hub" else f"the simulated dataset {name}"
+        mend = " ".join(f"--data.{key} null" for key in wrong)
+        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {kind}; leave it out: {mend}.")

@@ -16,6 +16,7 @@ from PIL import Image
 from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
 from nmpm.cli.early_checks import argument_names
+from nmpm.cli.emulator_cli import EmulatorCLI
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
@@ -71,6 +72,18 @@ def test_every_shipped_configuration_runs_to_its_report(config, make_dataset, ca
     assert list(run.glob("logs/version_0/metrics.csv"))
     assert list(run.glob("logs/version_0/events.out.tfevents.*"))
     assert "free fall" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("config", config_names())
+def test_a_path_replaces_the_data_of_every_shipped_configuration(config, make_dataset, monkeypatch):
+    built = []
+    monkeypatch.setattr(EmulatorCLI, "_run_subcommand", lambda cli, _: built.append((cli.datamodule, cli.model)))
+    fields = tuple(yaml.safe_load(find_config(config).read_text())["data"].get("fields", ()))
+    folder = make_dataset(statics=2, fields=fields, dim=3 if "3d" in config else 2)
+    assert main(["fit", "--config", config, "--data.path", str(folder), "--trainer.accelerator", "cpu"]) == 0
+    ((data, model),) = built
+    assert data.description == folder.name
+    assert model.emulator.scene == data.scene
 
 
 def test_the_last_weights_are_validated_too(make_dataset):

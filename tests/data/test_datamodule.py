@@ -313,8 +313,15 @@ class TestModule:
             ({"path": "???"}, "data.path is not set.*give --data.path FOLDER"),
             ({"path": "a", "horizon": 0}, "horizon = 0"),
             ({"path": "a", "limit_eval": 0}, "limit_eval = 0"),
-            ({"path": "a", "generate": {"frames": 3}}, "generate cannot be combined with recorded data"),
-            ({"name": "goop", "family": "deepmind"}, "family cannot be combined with the simulated dataset goop"),
+            ({"path": "a", "source": "simulate"}, "needs the `name` .*--data.source disk"),
+            (
+                {"name": "WaterRamps", "source": "hub", "generate": {"frames": 3}},
+                "generate cannot be combined with the published dataset WaterRamps",
+            ),
+            (
+                {"name": "goop", "family": "deepmind"},
+                "family cannot be combined with the simulated dataset goop; leave it out: --data.family null",
+            ),
         ],
     )
     def test_contradictory_options_are_refused(self, options, named):
@@ -322,7 +329,7 @@ class TestModule:
             TrajectoryDataModule(**options)
 
     def test_a_path_replaces_a_name(self, make_dataset):
-        module = module_of(make_dataset(), name="waterramps")
+        module = module_of(make_dataset(), name="waterramps", generate={"frames": 3})
         assert module.description == "dataset"
         assert module.scene.materials == ("goop",)
         assert TrajectoryDataModule(path="???", name="goop").description == "goop, simulated by nmpm"
