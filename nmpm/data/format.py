@@ -26,6 +26,11 @@ from nmpm.data.metadata import write_metadata as write_metadata
 from nmpm.errors import DataError
 
 SPLITS = ("train", "valid", "test")
+_OTHER_NAMES = {
+    "train": ("training", "trn"),
+    "valid": ("val", "validation", "eval", "dev"),
+    "test": ("testing", "tst"),
+}
 _CORE = ("position", "particle_type")
 _CHUNK_BYTES = 2**20
 _LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"
@@ -113,7 +118,7 @@ class Split:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         if not self.path.exists():
-            raise DataError(f"{self.path}: no such file{_other_files(self.path)}.")
+            raise DataError(f"{self.path}: no such file{_other_files(self.path.parent)}.")
         if not self._entries:
             raise DataError(f"{self.path}: the file has no trajectory; {_LAYOUT}.")
 
@@ -257,8 +262,8 @@ def _check_finite(position: np.ndarray, where: str, first_frame: int) -> None:
         )
 
 
-def _other_files(path: Path) -> str:
-    found = sorted(file.name for file in path.parent.glob("*.h5"))
+def _other_files(folder: Path) -> str:
+    found = sorted(file.name for file in folder.glob("*.h5"))
     return f" (beside it: {', '.join(found)})" if found else ""
 
 
@@ -266,3 +271,29 @@ def split_paths(folder: Path) -> Mapping[str, Path]:
     """The split files in a dataset's folder, by name, in the order train, valid, test."""
     paths = {name: Path(folder) / f"{name}.h5" for name in SPLITS}
     return {name: path for name, path in paths.items() if path.exists()}
+
+
+def find_split(folder: Path, *names: str) -> Path:
+    """The file of the first of the named splits that a dataset's folder has.
+
+    Raises:
+        DataError: if it has none of them; names those there are, and files to rename.
+    """
+    paths = split_paths(folder)
+    for name in names:
+        if name in paths:
+            return paths[name]
+    missing = " or ".join(f"{name}.h5" for name in names)
+    renames = "".join(f" {rename}" for rename in split_renames(folder, names))
+    raise DataError(f"{folder}: no {missing} there{_other_files(Path(folder))}.{renames}")
+
+
+def split_renames(folder: Path, names: Iterable[str] = SPLITS) -> list[str]:
+    """Advice to rename files such as `val.h5`, a sentence for each, where the named split is missing."""
+    paths = split_paths(folder)
+    return [
+        f"Rename {other}.h5 to {name}.h5."
+        for name in names
+        for other in _OTHER_NAMES[name]
+        if name not in paths and (Path(folder) / f"{other}.h5").is_file()
+    ]

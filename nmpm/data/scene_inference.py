@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nmpm.data.fields import Kind, require_fields, survey_fields
-from nmpm.data.format import METADATA_FILE, Metadata, Split, read_metadata, split_paths
+from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene, check_field_names
 
@@ -58,7 +58,7 @@ def infer_scene(
     metadata = _override(stated, gravity, boundary, bounds)
     if gravity is not None:
         check_gravity(metadata.gravity, stated.gravity, folder / METADATA_FILE)
-    split = _reference_split(folder)
+    split = Split(find_split(folder, *SPLITS))
     if split.dim != metadata.dim:
         raise DataError(
             f"{split.path}: positions have {split.dim} dimensions, {METADATA_FILE} has dim = {metadata.dim}."
@@ -129,13 +129,6 @@ def check_gravity(given: tuple[float, ...] | None, stated: tuple[float, ...] | N
             " out to use the file's; if the file is wrong, write a corrected copy with nmpm convert FOLDER NEW"
             f" --gravity={','.join(f'{value:g}' for value in given or ())}."
         )
-
-
-def _reference_split(folder: Path) -> Split:
-    paths = split_paths(folder)
-    if not paths:
-        raise DataError(f"{folder}: no train.h5, valid.h5 or test.h5 there.")
-    return Split(next(iter(paths.values())))
 
 
 def _types(split: Split, metadata: Metadata) -> frozenset[int]:

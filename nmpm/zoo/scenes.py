@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nmpm._support.messages import one_line
-from nmpm.data.format import Split, Trajectory, read_metadata, split_paths
+from nmpm.data.format import Split, Trajectory, find_split, read_metadata
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
@@ -33,11 +33,9 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
         DataError: if the data cannot be read.
     """
     if data is not None:
-        paths, metadata = split_paths(data), read_metadata(data, "deepmind")
-        if "test" not in paths:
-            raise ConfigError(f"{data} has no test.h5.")
+        split, metadata = Split(find_split(data, "test")), read_metadata(data, "deepmind")
         _check_same_scenes(model, metadata.extra.get("simulation"), data)
-        for window in EvaluationLoader(SplitRecordings(Split(paths["test"]), metadata, model.scene), 1):
+        for window in EvaluationLoader(SplitRecordings(split, metadata, model.scene), 1):
             yield window if frames is None else dataclasses.replace(window, frames=window.frames[:, : frames + 2])
         return
     preset, request = simulation_of(model)

@@ -8,6 +8,8 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
 
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.inspection import inspect
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 
@@ -336,8 +338,16 @@ class TestModule:
 
     def test_missing_split(self, make_dataset):
         module = module_of(make_dataset(valid=()))
-        with pytest.raises(DataError, match=r"no valid.h5 there \(found: train, test\)"):
+        with pytest.raises(DataError, match=r"no valid.h5 there \(beside it: test.h5, train.h5\)"):
             module.val_dataloader()
+
+    @pytest.mark.parametrize("name", ["val", "validation", "eval", "dev"])
+    def test_a_split_of_another_name(self, make_dataset, name):
+        folder = make_dataset()
+        (folder / "valid.h5").rename(folder / f"{name}.h5")
+        with pytest.raises(DataError, match=f"no valid.h5 there.*Rename {name}.h5 to valid.h5"):
+            module_of(folder).val_dataloader()
+        assert any(f"Rename {name}.h5" in finding for finding in inspect(FolderSource(folder)).findings)
 
     def test_missing_folder(self, tmp_path):
         with pytest.raises(DataError, match="nowhere: no such folder"):

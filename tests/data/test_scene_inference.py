@@ -142,7 +142,7 @@ class TestParticles:
 
     def test_no_split(self, make_dataset):
         folder = make_dataset(train=(), valid=(), test=())
-        with pytest.raises(DataError, match=r"no train.h5, valid.h5 or test.h5"):
+        with pytest.raises(DataError, match=r"no train.h5 or valid.h5 or test.h5"):
             infer_scene(folder)
 
     def test_another_split_where_train_is_missing(self, scene_of):

@@ -11,7 +11,18 @@ import numpy as np
 
 from nmpm.data.convert import Options, open_dataset
 from nmpm.data.families import FAMILIES
-from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, split_paths, write_metadata, write_split
+from nmpm.data.format import (
+    METADATA_FILE,
+    SPLITS,
+    Metadata,
+    Split,
+    Trajectory,
+    find_split,
+    split_paths,
+    split_renames,
+    write_metadata,
+    write_split,
+)
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import load_json, metadata_from_dict
 from nmpm.errors import DataError
@@ -33,9 +44,10 @@ def open_splits(folder: Path) -> tuple[dict[str, Split], list[str]]:
             splits[name] = Split(path)
         except DataError as error:
             findings.append(str(error))
-    if not splits:
-        raise DataError(findings[0] if findings else f"{folder}: no train.h5, valid.h5 or test.h5 there.")
-    return splits, findings
+    if not splits and findings:
+        raise DataError(findings[0])
+    find_split(folder, *SPLITS)
+    return splits, findings + [f"{folder}: {rename}" for rename in split_renames(folder)]
 
 
 def guess_family(ids: Iterable[int], plain: Mapping[str, Any]) -> str:

@@ -11,13 +11,12 @@ from typing import Any
 
 from nmpm.data.convert import Options
 from nmpm.data.convert.cache import native_folder
-from nmpm.data.format import Metadata, Split, read_metadata, split_paths
+from nmpm.data.format import Metadata, Split, find_split, read_metadata, split_paths
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
-from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval, Scene
 
 
@@ -72,10 +71,7 @@ class DataSource(abc.ABC):
         Raises:
             DataError: if the split is missing or its file is damaged.
         """
-        paths = split_paths(self.folder)
-        if name not in paths:
-            raise DataError(f"{self.folder}: no {name}.h5 there (found: {', '.join(paths) or 'no split'}).")
-        return SplitRecordings(Split(paths[name]), self.metadata, self.scene)
+        return SplitRecordings(Split(find_split(self.folder, name)), self.metadata, self.scene)
 
     def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
         """The trajectories to train on, and which of their windows make up which batch.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from nmpm.data.format import Split, read_metadata
+from nmpm.data.format import Split, find_split, read_metadata
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
@@ -86,7 +86,7 @@ def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = Non
     if preset is None and isinstance(simulation, dict) and "preset" in simulation:
         preset = preset_from_dict(simulation["preset"])
     scene = infer_scene(folder) if preset is None else preset.scene
-    split = Split(folder / "test.h5")
+    split = Split(find_split(folder, "test"))
     recordings = SplitRecordings(split, metadata, scene)
     recordings.require_frames(3, "an evaluation")
     chosen = range(min(count, len(recordings)))
