@@ -115,9 +115,11 @@ def _list(chosen: argparse.Namespace) -> None:
 
 
 def _summary(card: Mapping[str, Any]) -> str:
+    from nmpm.evaluation.figures import with_unit
+
     test = card.get("test")
     mse = test.get("mse") if isinstance(test, Mapping) else None
-    error = f"{1e3 * mse:.3g} ×10⁻³" if isinstance(mse, int | float) else "not measured"
+    error = with_unit(mse) if isinstance(mse, int | float) else "not measured"
     return f"full-rollout MSE {error}   {one_line(card.get('dataset', 'data not stated'))}"
 
 

@@ -2,13 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
+from statistics import median
 from types import MappingProxyType
+from typing import NamedTuple
+
+from rich.table import Table
 
 PREDICTORS: Mapping[str, str] = MappingProxyType(
     {"model": "model", "still": "nothing moves", "free_fall": "free fall, stopped at walls"}
 )
 """What is compared, and its name in tables. Figures of all but the model have the key and a slash before their name."""
+
+
+_LONGEST = 10**7
+"""Figures of at least so many units are printed with an exponent."""
+
+
+class Unit(NamedTuple):
+    """A power of ten, of which all errors of a table or line are multiples."""
+
+    exponent: int
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Unit:
+        """10⁻³, as in the paper, unless the median is at least 1 or under 10⁻⁶, as for data in millimetres."""
+        sizes = [abs(value) for value in values if value and math.isfinite(value)]
+        middle = median(sizes) if sizes else 1e-3
+        return cls(-3 if 1e-6 <= middle < 1 else 3 * math.floor(math.log10(middle) / 3))
+
+    def show(self, value: float, digits: int = 4) -> str:
+        """The number of units, to so many significant digits."""
+        count = value / 10.0**self.exponent
+        whole = 10**digits - 0.5 <= abs(count) < _LONGEST
+        return f"{count:.0f}" if whole else f"{count:.{digits}g}"
+
+    def __str__(self) -> str:
+        """With a space before it, such as " ×10⁻³"; empty for 1."""
+        power = str(self.exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        return f" ×10{power}" if self.exponent else ""
+
+
+def with_unit(value: float) -> str:
+    """An error of a line of its own, to three digits, such as "0.164 ×10⁻³"."""
+    unit = Unit.of([value])
+    return f"{unit.show(value, 3)}{unit}"
 
 
 def figure_names(figures: Mapping[str, float]) -> list[str]:
@@ -17,10 +56,24 @@ def figure_names(figures: Mapping[str, float]) -> list[str]:
     return sorted(names, key=lambda name: (not name.startswith("mse"), "@" not in name, _horizon(name)))
 
 
-def table_row(figures: Mapping[str, float], kind: str) -> list[str]:
-    """A predictor's figures ×10⁻³, in the order of `figure_names`; empty where it has none."""
+def predictor_figures(figures: Mapping[str, float], kind: str) -> list[float | None]:
+    """A predictor's figures in the order of `figure_names`; None where it has none."""
     prefix = "" if kind == "model" else f"{kind}/"
-    return [f"{1e3 * figures[prefix + n]:.4g}" if prefix + n in figures else "" for n in figure_names(figures)]
+    return [figures.get(prefix + name) for name in figure_names(figures)]
+
+
+def error_table(what: str, figures: Mapping[str, float]) -> Table:
+    """The errors of a model beside those of the trivial predictors, in one unit, which the title names."""
+    names, unit = figure_names(figures), Unit.of(figures.values())
+    lengths = "MSE in length², EMD in length" if any(name.startswith("emd") for name in names) else "MSE in length²"
+    table = Table(title=f"{what} error{unit} ({lengths})")
+    table.add_column("predictor")
+    for name in names:
+        table.add_column(name, justify="right")
+    for kind, label in PREDICTORS.items():
+        row = predictor_figures(figures, kind)
+        table.add_row(label, *("" if value is None else unit.show(value) for value in row))
+    return table
 
 
 def no_better_than_trivial(figures: Mapping[str, float]) -> str:
@@ -30,8 +83,8 @@ def no_better_than_trivial(figures: Mapping[str, float]) -> str:
     if best is None or figures["mse"] < trivial[best]:  # NaN is not
         return ""
     return (
-        f"The model is no better than a trivial predictor: its error is {1e3 * figures['mse']:.3g}e-3, that of"
-        f" '{PREDICTORS[best]}' {1e3 * trivial[best]:.3g}e-3. Train it longer, or on more data, before using it."
+        f"The model is no better than a trivial predictor: its error is {with_unit(figures['mse'])}, that of"
+        f" '{PREDICTORS[best]}' {with_unit(trivial[best])}. Train it longer, or on more data, before using it."
     )
 
 

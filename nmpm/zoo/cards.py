@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from nmpm.evaluation.bootstrap import interval
-from nmpm.evaluation.figures import PREDICTORS, figure_names
+from nmpm.evaluation.figures import PREDICTORS, Unit, figure_names, predictor_figures
 from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {
@@ -60,7 +60,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | Non
         load: What `Zoo.load` takes; the model's name when left out.
     """
     training, test = card["training"], card["test"]
-    names = figure_names(test)
+    names, unit = figure_names(test), Unit.of(test.values())
     emd = ", exact earth mover's distance (`emd`) in domain length" if "emd" in names else ""
     lines = [
         f"# {card['name']}",
@@ -68,13 +68,13 @@ def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | Non
         f"An emulator of {card['dataset']}. {card.get('about', '')}".rstrip(),
         "",
         *_lifecycle_lines(card),
-        f"Test error ×10⁻³ of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
+        f"Test error{unit} of one run, over {_trajectories(card)}, from full rollouts: MSE over frames 1 … h in domain"
         f" length² (`mse`: over all frames){emd}.",
         "",
         f"| predictor | {' | '.join(names)} |",
         f"|---|{'---:|' * len(names)}",
-        *(f"| {label} | {' | '.join(_errors(test, kind))} |" for kind, label in PREDICTORS.items()),
-        *_interval_row(card, names),
+        *(f"| {label} | {' | '.join(_errors(test, kind, unit))} |" for kind, label in PREDICTORS.items()),
+        *_interval_row(card, names, unit),
         "",
         *_goal_lines(card),
         *_twin_lines(card),
@@ -227,18 +227,16 @@ def _licence_lines(card: Mapping[str, Any]) -> list[str]:
     return [f"{licence}To cite it: `nmpm`'s model `{card['name']}`{weights}; the method: {SOURCE}."]
 
 
-def _interval_row(card: Mapping[str, Any], names: list[str]) -> list[str]:
+def _interval_row(card: Mapping[str, Any], names: list[str], unit: Unit) -> list[str]:
     found = intervals(card)
-    cells = [f"{1e3 * found[name][0]:.3g} – {1e3 * found[name][1]:.3g}" if name in found else "" for name in names]
+    cells = [" – ".join(unit.show(end, 3) for end in found.get(name, ())) for name in names]
     return [f"| model, 95% over scenes | {' | '.join(cells)} |"] if found else []
 
 
-def _errors(test: Mapping[str, float], kind: str) -> Iterator[str]:
-    """A predictor's errors ×10⁻³ to 3 significant digits, in the order of `figure_names`."""
-    prefix = "" if kind == "model" else f"{kind}/"
-    for name in figure_names(test):
-        value = test.get(prefix + name)
-        yield "" if value is None else f"{1e3 * value:.3g}"
+def _errors(test: Mapping[str, float], kind: str, unit: Unit) -> Iterator[str]:
+    """A predictor's errors to 3 significant digits, in the order of `figure_names`."""
+    for value in predictor_figures(test, kind):
+        yield "" if value is None else unit.show(value, 3)
 
 
 def _trajectories(card: Mapping[str, Any]) -> str:

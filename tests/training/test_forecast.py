@@ -92,9 +92,7 @@ def test_validations_take_a_fifth_of_the_time_of_steps_also_when_it_goes_on(make
     ],
     ids=str,
 )
-def test_validations_that_the_user_bounds_or_that_cost_little_are_left_alone(
-    make_dataset, set_pace, capsys, unbounded
-):
+def test_validations_that_the_user_bounds_or_that_cost_little_are_left_alone(make_dataset, set_pace, capsys, unbounded):
     set_pace(1.0)
     trainer = fit(make_dataset(**VALID), 26, **(BOUNDED | unbounded))
     assert capsys.readouterr().out == ""

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import CSVLogger
 from test_training import Questions, data_of, module_of
 
+from nmpm.evaluation.figures import with_unit
 from nmpm.optimizers import SOAP
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.last_checkpoint import LastCheckpoint
@@ -77,7 +78,7 @@ def test_the_line_says_steps_time_left_loss_and_the_validation_error(make_datase
     last = shown(capsys)[-1]
     loss, error = (float(trainer.callback_metrics[name]) for name in ("train/loss", "valid/mse"))
     assert last.startswith("100% |")
-    assert last.endswith(f"training: step 20/20, 0:00:00 left, loss {loss:.3g}, validation error {1e3 * error:.3g}e-3")
+    assert last.endswith(f"training: step 20/20, 0:00:00 left, loss {loss:.3g}, validation error {with_unit(error)}")
 
 
 def test_with_time_alone_it_says_the_time_left(make_dataset, tmp_path, capsys):

@@ -10,27 +10,29 @@ from rich.table import Table
 
 from nmpm.evaluation.compare.measure import HORIZONS
 from nmpm.evaluation.compare.outcome import Outcome
+from nmpm.evaluation.figures import Unit
 from nmpm.evaluation.trade.scenes import Scenes
 
 
 def outcome_table(outcomes: Sequence[Outcome], scenes: Scenes) -> Table:
-    """One row for each predictor; squared errors × 10⁻³ in length², the full rollout's with its interval."""
+    """One row for each predictor; squared errors in length², in one unit, the full rollout's with its interval."""
     frames = max(scenes.frames(index) for index in range(len(scenes)))
     horizons = [h for h in HORIZONS if h < frames]
+    unit = Unit.of([one.mean(n) for one in outcomes for n in (*(f"mse@{h}" for h in horizons), "mse", "emd")])
     table = Table(
-        title=_title(scenes), caption=_CAPTION, title_justify="left", caption_justify="left", box=SIMPLE_HEAD,
-        padding=0, collapse_padding=True,
+        title=_title(scenes), caption=_CAPTION.format(unit=unit), title_justify="left", caption_justify="left",
+        box=SIMPLE_HEAD, padding=0, collapse_padding=True,
     )  # fmt: skip
     table.add_column("predictor", overflow="fold")
     for heading in (*(f"MSE@{h}" for h in horizons), f"MSE@{frames} (95%)", "EMD", "height", "ms/frame"):
         table.add_column(heading, justify="right", no_wrap=True)
     for outcome in outcomes:
-        table.add_row(outcome.name, *_figures(outcome, horizons))
+        table.add_row(outcome.name, *_figures(outcome, horizons, unit))
     return table
 
 
 _CAPTION = (
-    "MSE × 10⁻³ of frames 1 to h. EMD × 10⁻³: exact earth mover's distance in the last frame. Height: deviation of the"
+    "MSE{unit} of frames 1 to h. EMD{unit}: exact earth mover's distance in the last frame. Height: deviation of the"
     " particles' mean height in the last frame. ms/frame: median, one scene at a time."
 )
 
@@ -60,25 +62,25 @@ def _title(scenes: Scenes) -> str:
     return f"{scenes.name}: {len(scenes)} test scenes of {particles} particles"
 
 
-def _figures(outcome: Outcome, horizons: Sequence[int]) -> list[str]:
+def _figures(outcome: Outcome, horizons: Sequence[int], unit: Unit) -> list[str]:
     time = outcome.milliseconds[1]
     timed = f"{time:.3g}" if math.isfinite(time) else ""
     if outcome.candidate.reproduces:
         return [*("" for _ in horizons), "made the scenes", "", "", timed]
     low, high = outcome.interval("mse")
-    full = _thousandth(outcome.mean("mse"))
-    spread = f" ({_thousandth(low)}–{_thousandth(high)})" if math.isfinite(low) and low < high else ""
+    full = _show(outcome.mean("mse"), unit)
+    spread = f" ({_show(low, unit)}–{_show(high, unit)})" if math.isfinite(low) and low < high else ""
     height = outcome.mean("height")
     return [
-        *(_thousandth(outcome.mean(f"mse@{h}")) for h in horizons),
+        *(_show(outcome.mean(f"mse@{h}"), unit) for h in horizons),
         full + spread,
-        _thousandth(outcome.mean("emd")),
+        _show(outcome.mean("emd"), unit),
         f"{height:.0%}" if math.isfinite(height) else "",
         timed,
     ]
 
 
-def _thousandth(value: float) -> str:
+def _show(value: float, unit: Unit) -> str:
     if not math.isfinite(value):
         return ""
-    return f"{1e3 * value:.3g}" if value == 0 or value >= 1e-6 else f"{1e3 * value:.0e}"
+    return unit.show(value, 3 if value == 0 or value >= 1e-3 * 10.0**unit.exponent else 1)

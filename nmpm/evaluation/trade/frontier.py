@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from nmpm.evaluation.bootstrap import intervals
+from nmpm.evaluation.figures import Unit
 from nmpm.evaluation.trade.choice import Kind
 from nmpm.evaluation.trade.pareto import pareto_members, pareto_probabilities
 from nmpm.evaluation.trade.points import Point
@@ -113,14 +114,21 @@ def advise(points: Sequence[Point], measure: str, pool: str = "everything", seed
     return steps
 
 
+def error_unit(where: Mapping[str, Standing]) -> Unit:
+    """The unit in which errors are printed."""
+    return Unit.of(one.mean for one in where.values())
+
+
 def _advice(point: Point, usable: Sequence[Point], where: Mapping[str, Standing], measure: str) -> Advice:
-    rival = _rival(point, usable, where)
-    instead = "" if rival is None else f"; {_VERB[rival.kind]} there, {rival.name}, has {_error(where[rival.name])}"
+    rival, unit = _rival(point, usable, where), error_unit(where)
+    instead = (
+        "" if rival is None else f"; {_VERB[rival.kind]} there, {rival.name}, has {_error(where[rival.name], unit)}"
+    )
     if point.exact:
         sentence = f"Run the simulator as it is ({point.milliseconds:.3g} ms per frame): it made these data."
     else:
         sentence = (
-            f"{_DO[point.kind]} {point.name}: {describe_measure(measure)} {_error(where[point.name])}, "
+            f"{_DO[point.kind]} {point.name}: {describe_measure(measure)} {_error(where[point.name], unit)}, "
             f"{point.milliseconds:.3g} ms per frame{instead}."
         )
     return Advice(point.milliseconds, point.name, sentence)
@@ -147,8 +155,8 @@ def _rival(point: Point, usable: Sequence[Point], where: Mapping[str, Standing])
     return min(others, key=lambda other: where[other.name].mean, default=None)
 
 
-def _error(standing: Standing) -> str:
-    return f"{1e3 * standing.mean:.3g} ({1e3 * standing.low:.3g} to {1e3 * standing.high:.3g}) × 10⁻³"
+def _error(standing: Standing, unit: Unit) -> str:
+    return f"{unit.show(standing.mean, 3)} ({unit.show(standing.low, 3)} to {unit.show(standing.high, 3)}){unit}"
 
 
 @dataclass(frozen=True)

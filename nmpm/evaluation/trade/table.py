@@ -11,7 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from nmpm.evaluation.trade.choice import Kind
-from nmpm.evaluation.trade.frontier import describe_measure, standings
+from nmpm.evaluation.trade.frontier import describe_measure, error_unit, standings
 from nmpm.evaluation.trade.points import Point, measure_names
 from nmpm.evaluation.trade.scenes import Scenes
 
@@ -88,17 +88,19 @@ def _plain(value: object) -> object:
 
 
 def pareto_table(points: Sequence[Point], scenes: Scenes, measure: str = "mse") -> Table:
-    """The points in the Pareto set, or likely to be, and the floors; errors ×10⁻³ with their interval."""
+    """The points in the Pareto set, or likely to be, and the floors; errors with their interval."""
     where = standings(points, measure)
     shown = [p for p in points if p.name in where and (p.kind is Kind.FLOOR or where[p.name].probability >= 0.05)]
+    unit = error_unit(where)
     table = Table(title=f"{scenes.name}: the Pareto set in time and {describe_measure(measure)}", title_justify="left")
-    for heading in ("choice", "ms/frame", "quartiles", "error × 10³", "95%", "in the set"):
+    for heading in ("choice", "ms/frame", "quartiles", f"error{unit}", "95%", "in the set"):
         table.add_column(heading, justify="left" if heading == "choice" else "right")
     for point in sorted(shown, key=lambda point: (point.kind is Kind.FLOOR, point.milliseconds)):
         one, (low, middle, high) = where[point.name], point.quartiles
         chance = "floor" if point.kind is Kind.FLOOR else f"{one.probability:.0%}"
-        interval = f"{1e3 * one.low:.3g} – {1e3 * one.high:.3g}"
-        table.add_row(point.name, f"{middle:.3g}", f"{low:.3g} – {high:.3g}", f"{1e3 * one.mean:.3g}", interval, chance)
+        interval = f"{unit.show(one.low, 3)} – {unit.show(one.high, 3)}"
+        times = (f"{middle:.3g}", f"{low:.3g} – {high:.3g}")
+        table.add_row(point.name, *times, unit.show(one.mean, 3), interval, chance)
     return table
 
 

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 from lightning.pytorch.trainer.states import TrainerFn
 
+from nmpm.evaluation.figures import with_unit
 from nmpm.training.budget import TimeLeft, time_left, total_steps
 
 SCALE = 1000
@@ -26,7 +27,7 @@ class Progress(ProgressBar):
     """Shows progress without asking the device for anything but the loss, every `log_every_n_steps` steps.
 
     While training: steps taken and to take, time left and which limit ends it, loss, and the last validation's
-    full-rollout MSE ×10⁻³. While evaluating: batches. Nothing is shown by ranks other than 0.
+    full-rollout MSE. While evaluating: batches. Nothing is shown by ranks other than 0.
     """
 
     def __init__(self) -> None:
@@ -84,7 +85,7 @@ class Progress(ProgressBar):
         if trainer.sanity_checking:
             return
         error = trainer.callback_metrics.get("valid/mse")
-        self._valid = "" if error is None else f"validation error {1e3 * float(error):.3g}e-3"
+        self._valid = "" if error is None else f"validation error {with_unit(float(error))}"
         if trainer.state.fn != TrainerFn.FITTING:
             self._close()
         else:

@@ -13,7 +13,6 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
@@ -22,7 +21,7 @@ from nmpm._support.devices import device_name, join_hardware
 from nmpm._support.digests import float32_digest
 from nmpm._support.version import __version__
 from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.evaluation.figures import PREDICTORS, figure_names, no_better_than_trivial, table_row
+from nmpm.evaluation.figures import error_table, no_better_than_trivial
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.metrics import MSE
 from nmpm.particles import Window
@@ -96,7 +95,7 @@ class ReportWriter(Callback):
             self.curve.append([round(self._elapsed(), 1), self.trained_steps, *errors])
         if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
             dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
-            _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))
+            Console().print(error_table(f"{dataset}: validation", _logged(trainer, "valid/")))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self.trained_seconds, self._since = self._elapsed(), None
@@ -212,14 +211,6 @@ def _logged(trainer: Trainer, prefix: str) -> dict[str, float]:
 
 
 def _print_table(what: str, errors: Mapping[str, float]) -> None:
-    names = figure_names(errors)
-    units = "MSE in length², EMD in length" if any(name.startswith("emd") for name in names) else "MSE in length²"
-    table = Table(title=f"{what} error ×10⁻³ ({units})")
-    table.add_column("predictor")
-    for name in names:
-        table.add_column(name, justify="right")
-    for kind, label in PREDICTORS.items():
-        table.add_row(label, *table_row(errors, kind))
-    Console().print(table)
+    Console().print(error_table(what, errors))
     if remark := no_better_than_trivial(errors):
         Console().print(remark, soft_wrap=True)
