@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from settled_shape import held_to, ratio
 from timing import add_device_option, make_parser, write_json
 
+from nmpm._support.progress import progress_bar
 from nmpm.data.format import Split, read_metadata, split_paths
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.recording import SplitRecordings
-from nmpm.data.progress import progress_bar
 from nmpm.emulator import Emulator, rollout
 from nmpm.evaluation.bootstrap import interval
 from nmpm.particles import Window

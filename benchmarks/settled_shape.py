@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from recipes import SHAPE_MEASURES, Run
 from timing import make_parser, write_json
 
-from nmpm.data.progress import progress_bar
+from nmpm._support.progress import progress_bar
 from nmpm.emulator import Emulator
 from nmpm.evaluation.bootstrap import ratio_interval
 from nmpm.evaluation.stress.settling import Shapes, predicted_shapes, recorded_shapes

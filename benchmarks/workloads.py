@@ -22,12 +22,12 @@ from timing import make_timing_parser
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from nmpm._support.progress import progress_bar
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader
-from nmpm.data.progress import progress_bar
 from nmpm.data.seeds import derive_seed
 from nmpm.decoders import Absolute, Decoder, Residual
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext

@@ -171,6 +171,11 @@ class Window(_Batched):
             obstacle_share=self.obstacle_share,
         )
 
+    def first(self, frames: int) -> Self:
+        """The first frames, two or more."""
+        fields = {name: values[:, :frames] for name, values in self.fields.items()}
+        return dataclasses.replace(self, frames=self.frames[:, :frames], fields=fields)
+
     @property
     def target(self) -> Tensor:
         """The frames to predict, (B, T - 2, N, D)."""

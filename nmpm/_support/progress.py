@@ -1,24 +1,47 @@
-"""What every progress bar on the console shows."""
+"""Progress of long work, on standard error: a bar on terminals and in notebooks, a line now and then elsewhere."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
 from importlib.util import find_spec
+from typing import Protocol
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+LINE_SECONDS = 30.0
+"""Least time between two lines, where standard error is a file or a pipe."""
 
 
-def progress_columns() -> tuple[ProgressColumn, ...]:
-    """What is done, a bar, steps of all, time taken, and the estimate of what remains."""
-    return (
+class Step(Protocol):
+    """Takes in that steps are done, and what is done now, if that has changed."""
+
+    def __call__(self, what: str = "", by: int = 1) -> object: ...
+
+
+@contextmanager
+def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
+    """Shows how much is done and the time left; on terminals it vanishes at the end.
+
+    Args:
+        what: Description of the work.
+        total: Number of steps; None where it is unknown.
+        done: Steps that are done already.
+
+    Yields:
+        What to call after each step.
+    """
+    console = Console(stderr=True)
+    # Without ipywidgets rich would warn at every bar of a notebook.
+    if not (console.is_terminal or (console.is_jupyter and find_spec("ipywidgets"))):
+        lines = _Lines(console, what, total, done)
+        yield lines.step
+        lines.end()
+        return
+    columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -26,16 +49,38 @@ def progress_columns() -> tuple[ProgressColumn, ...]:
         TextColumn("ETA"),
         TimeRemainingColumn(),
     )
-
-
-def terminal_progress(console: Console) -> Progress:
-    """Progress that vanishes from the terminal when it ends; nothing at all where the console is a file or a pipe."""
     # Drawn once a second, as times are measured beside it.
-    return Progress(
-        *progress_columns(), console=console, transient=True, disable=not console.is_terminal, refresh_per_second=1
-    )
+    with Progress(*columns, console=console, transient=True, refresh_per_second=1) as progress:
+        task = progress.add_task(what, total=total, completed=done)
+        yield lambda what="", by=1: progress.update(task, advance=by, **({"description": what} if what else {}))
 
 
-def lacks_widgets(console: Console) -> bool:
-    """Whether a notebook cannot show progress, as ipywidgets is not installed; rich would warn at every bar."""
-    return console.is_jupyter and find_spec("ipywidgets") is None
+class _Lines:
+    """Progress as lines of text, none of them within the first `LINE_SECONDS`."""
+
+    def __init__(self, console: Console, what: str, total: int | None, done: int) -> None:
+        self._console, self._what, self._total, self._done = console, what, total, done
+        self._first, self._start = done, time.monotonic()
+        self._printed = self._start
+
+    def step(self, what: str = "", by: int = 1) -> None:
+        self._what, self._done, now = what or self._what, self._done + by, time.monotonic()
+        if by and self._done != self._total and now - self._printed >= LINE_SECONDS:
+            self._printed = now
+            self._print(self._remaining(now - self._start))
+
+    def end(self) -> None:
+        """Say how long all took, if that was long."""
+        seconds = time.monotonic() - self._start
+        if seconds >= LINE_SECONDS:
+            self._print(f", {timedelta(seconds=round(seconds))} in all")
+
+    def _remaining(self, seconds: float) -> str:
+        if self._total is None:
+            return ""
+        left = seconds / (self._done - self._first) * (self._total - self._done)
+        return f" ({self._done / self._total:.0%}), {timedelta(seconds=round(left))} left"
+
+    def _print(self, rest: str) -> None:
+        of = "" if self._total is None else f" of {self._total}"
+        self._console.print(f"{self._what}: {self._done}{of}{rest}", markup=False, highlight=False, soft_wrap=True)

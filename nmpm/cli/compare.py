@@ -86,15 +86,12 @@ def _models(names: list[str]) -> dict[str, Emulator]:
 
 
 def _measure(candidates: list[Candidate], scenes: Scenes, out: Path) -> list[Outcome]:
-    from rich.console import Console
-
-    from nmpm._support.progress import terminal_progress
+    from nmpm._support.progress import progress_bar
     from nmpm.evaluation.compare import compare, count_steps
     from nmpm.evaluation.trade import Store
 
-    with terminal_progress(Console(stderr=True)) as progress:
-        task = progress.add_task("compare", total=count_steps(candidates, scenes))
-        return compare(candidates, scenes, Store(out), lambda what: progress.update(task, advance=1, description=what))
+    with progress_bar("compare", count_steps(candidates, scenes)) as step:
+        return compare(candidates, scenes, Store(out), step)
 
 
 def _report(outcomes: list[Outcome], scenes: Scenes, out: Path) -> None:

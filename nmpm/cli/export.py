@@ -77,10 +77,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _export(chosen: argparse.Namespace, out: Path) -> None:
-    from rich.console import Console
-
     from nmpm._support.devices import find_device
-    from nmpm._support.progress import terminal_progress
+    from nmpm._support.progress import progress_bar
     from nmpm.zoo import export, load_model
 
     model = load_model(chosen.model, root=chosen.root)
@@ -88,10 +86,9 @@ def _export(chosen: argparse.Namespace, out: Path) -> None:
     kinds: Mapping[str, type[Part]] = {kind.__name__: kind for kind in (export.Step, export.Network, export.Solid)}
     part = kinds[chosen.part](emulator).to(find_device(chosen.device))
     form = export.FORMATS[chosen.format]
-    with terminal_progress(Console(stderr=True)) as progress:
-        task = progress.add_task(f"Writing {out.name}", total=2)
+    with progress_bar(f"Writing {out.name}", 2) as step:
         form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
-        progress.update(task, completed=1, description=f"Comparing {out.name} with the model")
+        step(f"Comparing {out.name} with the model")
         difference = form.difference(part, out, batch=1, count=300)
     if not difference <= TOLERANCE:
         out.unlink()

@@ -23,8 +23,12 @@ from nmpm.cli.options import (
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from nmpm.particles import Particles
+    from nmpm.emulator import Rollout
+    from nmpm.particles import Particles, Window
     from nmpm.zoo import Pretrained
+
+FRAMES = 400
+"""Predicted of thrown blocks, unless an option says otherwise."""
 
 _EXAMPLES = """\
 examples:
@@ -43,12 +47,13 @@ def run(words: list[str]) -> None:
 
     model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime, chosen.precision)
     choose_threads(model, chosen.threads)
-    given = chosen.data is not None
-    state = _recorded_state(model, chosen.data, chosen.trajectory) if given else _thrown_state(model, chosen)
-    _write(model, state, chosen)
-    particles = state.position.shape[1]
-    frames = f"2 frames of the start and {chosen.frames} predicted"
-    sys.stdout.write(f"wrote {frames}, of {particles} particles, to {chosen.out}\n")
+    window = None if chosen.data is None else _recorded(model, chosen.data, chosen.trajectory)
+    recorded = 0 if window is None else window.target.shape[1]
+    state = _thrown_state(model, chosen) if window is None else window.initial
+    rollout = _predict(model, state, chosen.frames or recorded or FRAMES, chosen)
+    _write(model, state, rollout, window if recorded else None, chosen)
+    if window is not None and recorded:
+        _print_errors(model, window, rollout, chosen)
     sys.stdout.write(f"to look at them: nmpm view {chosen.out}\n")
 
 
@@ -62,9 +67,11 @@ def _parser() -> argparse.ArgumentParser:
     add_model_options(parser)
     add_device_option(parser)
     add_threads_option(parser)
-    parser.add_argument("--frames", type=int, default=400, help="frames to predict (default: 400)")
+    parser.add_argument("--frames", type=int, help="frames to predict (default: 400; with --data, the recording's)")
     parser.add_argument("--out", type=Path, default=Path("out.h5"), help="file to write (default: out.h5)")
-    parser.add_argument("--data", type=Path, help="start from a trajectory of this HDF5 file (native layout)")
+    parser.add_argument(
+        "--data", type=Path, help="start from a trajectory of this HDF5 file (native layout), and print the error"
+    )
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
@@ -112,8 +119,8 @@ def _thrown_state(model: Pretrained, chosen: argparse.Namespace) -> Particles:
         raise ConfigError(f"--particles {chosen.particles}{blocks}: {error}") from error
 
 
-def _recorded_state(model: Pretrained, path: Path, index: int) -> Particles:
-    """The state at the second frame of a recorded trajectory."""
+def _recorded(model: Pretrained, path: Path, index: int) -> Window:
+    """A recorded trajectory."""
     from nmpm.data.format import Split, read_metadata
     from nmpm.data.loading.padded_batch import collate
     from nmpm.data.loading.recording import SplitRecordings
@@ -124,7 +131,9 @@ def _recorded_state(model: Pretrained, path: Path, index: int) -> Particles:
     recordings = SplitRecordings(Split(path), metadata, model.scene)
     if index >= len(recordings):
         raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(recordings) - 1}.")
-    return collate([recordings[index]], model.scene, 2).initial
+    if recordings.split.frames(index) < 2:
+        raise ConfigError(f"--trajectory {index}: it has one frame in {path}; a rollout starts from two.")
+    return collate([recordings[index]], model.scene)
 
 
 def _family(model: Pretrained) -> str | None:
@@ -134,23 +143,48 @@ def _family(model: Pretrained) -> str | None:
     return "deepmind" if set(model.scene.materials) <= known else None
 
 
-def _write(model: Pretrained, state: Particles, chosen: argparse.Namespace) -> None:
-    """Predict, and write the two frames of the start and the prediction, with what is needed to draw them."""
-    from rich.console import Console
-
-    from nmpm._support.progress import terminal_progress
-    from nmpm.data.format import write_split
-    from nmpm.data.predictions import predicted_trajectory
+def _predict(model: Pretrained, state: Particles, frames: int, chosen: argparse.Namespace) -> Rollout:
+    from nmpm._support.progress import progress_bar
     from nmpm.emulator import Rollout, stream_rollout
     from nmpm.emulator.monitor import Monitor, Policy
 
-    count, monitor = -(-chosen.frames // model.emulator.frames), Monitor(Policy(chosen.watch))
-    bundles = stream_rollout(model.emulator, state.to(model.emulator.device), chosen.frames, monitor)
-    # On the CPU, as a device may have less memory than a long rollout needs.
-    with terminal_progress(Console(stderr=True)) as progress:
-        rollout = Rollout.join([bundle.cpu() for bundle in progress.track(bundles, count, description="rollout")])
-    origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
-    start = state.to("cpu")
-    predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields)
-    write_split(chosen.out, [predicted])
+    monitor, parts = Monitor(Policy(chosen.watch)), []
+    with progress_bar("rollout", -(-frames // model.emulator.frames)) as step:
+        for bundle in stream_rollout(model.emulator, state.to(model.emulator.device), frames, monitor):
+            parts.append(bundle.cpu())  # as a device may have less memory than a long rollout needs
+            step()
     sys.stdout.write(monitor.report() + "\n")
+    return Rollout.join(parts)
+
+
+def _write(
+    model: Pretrained, state: Particles, rollout: Rollout, window: Window | None, chosen: argparse.Namespace
+) -> None:
+    """Write the start and the prediction, beside what was recorded, with what is needed to draw them."""
+    from nmpm.data.format import write_split
+    from nmpm.data.predictions import predicted_trajectory
+
+    origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
+    truth = None if window is None else window.frames[:, : rollout.position.shape[1] + 2]
+    start = state.to("cpu")
+    predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields, truth=truth)
+    write_split(chosen.out, [predicted])
+    frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
+    sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {chosen.out}\n")
+
+
+def _print_errors(model: Pretrained, window: Window, rollout: Rollout, chosen: argparse.Namespace) -> None:
+    """Print the errors against a recording beside those of the trivial predictors, over the frames that both have."""
+    from rich.console import Console
+
+    from nmpm.evaluation.comparison import Comparison
+    from nmpm.evaluation.figures import error_table
+    from nmpm.metrics import MSE
+
+    frames = min(window.target.shape[1], rollout.position.shape[1])
+    comparison = Comparison(model.scene, [MSE()])
+    fields = {name: values[:, :frames] for name, values in rollout.fields.items()}
+    comparison.update(window.first(frames + 2), rollout.position[:, :frames], fields)
+    figures = {name: float(value) for name, value in comparison.compute().items()}
+    what = f"{chosen.data}, trajectory {chosen.trajectory}, {frames} frames:"
+    Console().print(error_table(what, figures))

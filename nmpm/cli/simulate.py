@@ -149,16 +149,13 @@ def _show(name: str) -> None:
 
 
 def _preview(preset: Preset, seed: int, path: Path) -> None:
-    from rich.console import Console
-
-    from nmpm._support.progress import terminal_progress
+    from nmpm._support.progress import progress_bar
     from nmpm.data.gravity import own_gravity
     from nmpm.sim.preset import BOUNDARY
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
-    with terminal_progress(Console(stderr=True)) as progress:
-        task = progress.add_task(f"Simulating {preset.name}", total=preset.frames)
-        trajectory = preset.simulate(seed, lambda frame: progress.update(task, completed=frame))
+    with progress_bar(f"Simulating {preset.name}", preset.frames) as step:
+        trajectory = preset.simulate(seed, lambda _: step())
     moving, scene = trajectory.particle_type != BOUNDARY, preset.scene
     pictured = LabelledTrajectories(
         positions={"simulated": trajectory.position[:, moving]},

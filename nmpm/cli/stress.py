@@ -52,7 +52,7 @@ def run(words: list[str]) -> None:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
     subject = _subject(chosen)
     start = time.monotonic()
-    lines = _run_groups(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS), quiet=chosen.json)
+    lines = _run_groups(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS))
     _print_report(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)
     if any(line.passed is False for line in lines):
         raise SystemExit(1)
@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
         " (default: all)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the scenes (default: 0)")
-    parser.add_argument("--json", action="store_true", help="print JSON, nothing else")
+    parser.add_argument("--json", action="store_true", help="print JSON, and no table")
     parser.add_argument(
         "--report",
         type=Path,
@@ -102,19 +102,16 @@ def _subject(chosen: argparse.Namespace) -> Subject:
     return Subject(chosen.model, emulator, model.horizon, load_preset(preset) if preset else None, chosen.seed)
 
 
-def _run_groups(subject: Subject, size: Size, groups: list[str], quiet: bool) -> list[Line]:
-    from rich.console import Console
-
-    from nmpm._support.progress import terminal_progress
+def _run_groups(subject: Subject, size: Size, groups: list[str]) -> list[Line]:
+    from nmpm._support.progress import progress_bar
     from nmpm.evaluation.stress import GROUPS, battery
 
     lines: list[Line] = []
-    with terminal_progress(Console(stderr=True, quiet=quiet)) as progress:
-        task = progress.add_task("stress", total=len(groups))
+    with progress_bar("stress", len(groups)) as step:
         for name in groups:
-            progress.update(task, description=name)
+            step(f"stress, {name}", by=0)
             lines += battery(subject, size, {name: GROUPS[name]})
-            progress.advance(task)
+            step()
     return lines
 
 

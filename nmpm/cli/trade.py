@@ -145,17 +145,11 @@ def _graph_folders(names: list[str]) -> dict[str, TrainedGraph]:
 
 
 def _measure(choices: list[Choice], scenes: Scenes, sweep: Sweep, out: Path, keep: bool) -> list[Point]:
-    from rich.console import Console
-
-    from nmpm._support.progress import terminal_progress
+    from nmpm._support.progress import progress_bar
     from nmpm.evaluation.trade import Store, count_steps, measure
 
-    with terminal_progress(Console(stderr=True)) as progress:
-        task = progress.add_task("trade", total=count_steps(choices, scenes, sweep))
-        return measure(
-            choices, scenes, sweep, Store(out, keep),
-            lambda what: progress.update(task, advance=1, description=what),
-        )  # fmt: skip
+    with progress_bar("trade", count_steps(choices, scenes, sweep)) as step:
+        return measure(choices, scenes, sweep, Store(out, keep), step)
 
 
 def _report(points: list[Point], scenes: Scenes, out: Path) -> None:

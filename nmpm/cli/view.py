@@ -11,8 +11,8 @@ from nmpm.cli.options import check_at_least, check_input
 
 _EXAMPLES = """\
 examples:
-  nmpm view out.h5                                     a rollout of nmpm rollout: writes out.html
-  nmpm view out.h5 data/test.h5 --truth-trajectory 3   beside what it started from, with its error
+  nmpm view out.h5                                     a rollout, beside the recording of its --data
+  nmpm view out.h5 data/test.h5 --truth-trajectory 3   beside another one with the same start
   nmpm view data/test.h5 --trajectory 7 --every 2      a recorded trajectory, every second frame
 
 The page needs no network and no nmpm: send it to anybody. Space plays, ? shows the keys.

@@ -31,6 +31,8 @@ _OTHER_NAMES = {
     "valid": ("val", "validation", "eval", "dev"),
     "test": ("testing", "tst"),
 }
+TRUTH = "truth"
+"""Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
 _CORE = ("position", "particle_type")
 _CHUNK_BYTES = 2**20
 _LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"

@@ -21,6 +21,7 @@ from queue import SimpleQueue
 
 from nmpm._support.atomic import atomic_write, temporary_files
 from nmpm._support.parallel import usable_cores
+from nmpm._support.progress import progress_bar
 from nmpm._support.version import __version__
 from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
@@ -33,7 +34,6 @@ from nmpm.data.format import (
     write_split,
 )
 from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, request_path, write_part
-from nmpm.data.progress import progress_bar
 from nmpm.data.seeds import DRAWS, seed_of_draw
 from nmpm.data.shard import Shard
 from nmpm.data.simulation_request import SimulationRequest

@@ -40,7 +40,7 @@ def remove_unfinished_parts(folder: Path, process: int) -> None:
         left.unlink(missing_ok=True)
 
 
-def read_parts(paths: Iterable[Path], advance: Callable[[], None]) -> Iterator[Trajectory]:
+def read_parts(paths: Iterable[Path], advance: Callable[[], object]) -> Iterator[Trajectory]:
     """Yields the trajectories one after the other; calls `advance` after each.
 
     Raises:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nmpm._support.version import __version__
 from nmpm.data.families import FAMILIES
-from nmpm.data.format import Trajectory
+from nmpm.data.format import TRUTH, Trajectory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -27,6 +27,7 @@ def predicted_trajectory(
     model: str,
     index: int = 0,
     fields: Mapping[str, Tensor] | None = None,
+    truth: Tensor | None = None,
 ) -> Trajectory:
     """One scene of a batch: the two frames that the rollout started from, then the prediction.
 
@@ -38,6 +39,8 @@ def predicted_trajectory(
         index: Which scene of the batch.
         fields: (B, T, N) predicted fields by name; stored as further datasets (T + 2, N), NaN for obstacles. The first
             two frames have the state's values, the first predicted ones where the state lacks them.
+        truth: (B, T', N, D) recorded positions from the first of these two frames on, in domain length; stored as the
+            dataset `truth`, which `nmpm view` and `nmpm render` show beside the prediction.
 
     Raises:
         DataError: if the state has bodies, which no file can hold as such.
@@ -49,9 +52,8 @@ def predicted_trajectory(
         )
     real = state.mask[index]
     start = torch.stack([state.position[index] - state.velocity[index], state.position[index]])
-    position = torch.cat([start, predicted[index]])[:, real].cpu().numpy()
     obstacle = state.obstacle[index, state.obstacle_mask[index]].cpu().numpy()
-    resting = np.broadcast_to(obstacle, (len(position), *obstacle.shape))
+    position = _with_obstacle(torch.cat([start, predicted[index]])[:, real], obstacle)
     types = _type_ids(scene)
     moving = np.array(list(types), dtype=np.int64)[state.material[index, real].cpu().numpy()]
     attributes: dict[str, Any] = {
@@ -67,7 +69,15 @@ def predicted_trajectory(
         name: _field_frames(state.fields.get(name, values[:, 0])[index], values[index], real, len(obstacle))
         for name, values in (fields or {}).items()
     }
-    return Trajectory(np.concatenate([position, resting], axis=1), ids, attributes, stored)
+    if truth is not None:
+        stored[TRUTH] = _with_obstacle(truth[index][:, real], obstacle)
+    return Trajectory(position, ids, attributes, stored)
+
+
+def _with_obstacle(moving: Tensor, obstacle: np.ndarray) -> np.ndarray:
+    """(T, N + M, D) positions: those of the particles that move, then those of the obstacle (M, D)."""
+    resting = np.broadcast_to(obstacle, (len(moving), *obstacle.shape))
+    return np.concatenate([moving.cpu().numpy(), resting], axis=1)
 
 
 def _field_frames(start: Tensor, predicted: Tensor, real: Tensor, obstacles: int) -> np.ndarray:

@@ -97,14 +97,16 @@ class Monitor:
     at_walls: int = 0
     rest_share: float = 0.0
     _frames: int = 0
+    _last_frame: float = math.inf
     _bundles: int = 0
     _judged: int = 0
     _padded: bool = False
     _reference: _Reference | None = None
     _unread: list[tuple[int, dict[str, Tensor]]] = field(default_factory=list)
 
-    def start(self, emulator: Emulator, particles: Particles) -> None:
-        """Reset, and take a state as the one that a rollout starts from."""
+    def start(self, emulator: Emulator, particles: Particles, frames: int | None = None) -> None:
+        """Reset, and take a state as the one that a rollout of so many frames starts from; of whole bundles if None."""
+        self._last_frame = math.inf if frames is None else frames
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
         self.rest_share, self._judged = 0.0, 0
         self._unread = []
@@ -128,7 +130,7 @@ class Monitor:
         Raises:
             RolloutStoppedError: under the policy "stop", if a limit is passed.
         """
-        self._frames += bundle.position.shape[1]
+        self._frames = int(min(self._frames + bundle.position.shape[1], self._last_frame))
         self._bundles += 1
         if not particles.position.shape[1]:
             return

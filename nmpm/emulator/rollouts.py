@@ -21,7 +21,9 @@ from nmpm.scene import Scene
 from nmpm.transfer.chunks import can_branch
 
 
-def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None) -> Iterator[Bundle]:
+def unroll(
+    emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None, frames: int | None = None
+) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
     Once a scene's bundle ends in exactly the state that it started from, as at rest, all further ones would be the
@@ -32,9 +34,10 @@ def unroll(emulator: Emulator, particles: Particles, bundles: int, monitor: Moni
         particles: The state to start from.
         bundles: How many calls to make.
         monitor: Measures each bundle before it is yielded.
+        frames: Number of frames that are used, if not all: the monitor names none beyond.
     """
     if monitor is not None:
-        monitor.start(emulator, particles)
+        monitor.start(emulator, particles, frames)
     periods = Periods(emulator)
     particles = periods.wrap(particles)
     calls = _Calls(emulator, particles)
@@ -266,7 +269,7 @@ def stream_rollout(
         raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
     warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
-    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor)
+    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames)
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode

@@ -27,10 +27,10 @@ class Unit(NamedTuple):
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Unit:
-        """10⁻³, as in the paper, unless the median is at least 1 or under 10⁻⁶, as for data in millimetres."""
+        """10⁻³, as in the paper, unless the median is at least 10 or under 10⁻⁶, as for data in millimetres."""
         sizes = [abs(value) for value in values if value and math.isfinite(value)]
         middle = median(sizes) if sizes else 1e-3
-        return cls(-3 if 1e-6 <= middle < 1 else 3 * math.floor(math.log10(middle) / 3))
+        return cls(-3 if 1e-6 <= middle < 10 else 3 * math.floor(math.log10(middle) / 3))
 
     def show(self, value: float, digits: int = 4) -> str:
         """The number of units, to so many significant digits."""
@@ -62,9 +62,16 @@ def predictor_figures(figures: Mapping[str, float], kind: str) -> list[float | N
     return [figures.get(prefix + name) for name in figure_names(figures)]
 
 
+def figures_unit(figures: Mapping[str, float]) -> Unit:
+    """The unit of the figures of a model and of the trivial predictors."""
+    # By how far things move, if that is known: a model may be nearly perfect, or diverge.
+    scale = figures.get("still/mse")
+    return Unit.of(figures.values() if scale is None else [scale])
+
+
 def error_table(what: str, figures: Mapping[str, float]) -> Table:
     """The errors of a model beside those of the trivial predictors, in one unit, which the title names."""
-    names, unit = figure_names(figures), Unit.of(figures.values())
+    names, unit = figure_names(figures), figures_unit(figures)
     lengths = "MSE in length², EMD in length" if any(name.startswith("emd") for name in names) else "MSE in length²"
     table = Table(title=f"{what} error{unit} ({lengths})")
     table.add_column("predictor")

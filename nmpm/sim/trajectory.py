@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Progress = Callable[[int], None]
+Progress = Callable[[int], object]
 """Called after each frame with the number of frames done."""
 
 

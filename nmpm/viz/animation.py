@@ -11,11 +11,11 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError
 from nmpm.viz.frame_renderer import FrameRenderer
 from nmpm.viz.gif_palette import TRANSPARENT, GifPalette
 from nmpm.viz.output import check_output, check_suffix, replace_picture
-from nmpm.viz.progress import with_progress_bar
 from nmpm.viz.trajectories import LabelledTrajectories
 
 PALETTE_SAMPLES = 5
@@ -31,8 +31,11 @@ class _Animation(NamedTuple):
     name: str
 
     def draw_frames(self) -> Iterator[NDArray[np.uint8]]:
-        """Draws the frames in order, with a progress bar if this takes long."""
-        return with_progress_bar(map(self.renderer.draw, self.frames), len(self.frames), f"Drawing {self.name}")
+        """Draws the frames in order, with a progress bar."""
+        with progress_bar(f"Drawing {self.name}", len(self.frames)) as step:
+            for frame in self.frames:
+                yield self.renderer.draw(frame)
+                step()
 
 
 def write_animation(

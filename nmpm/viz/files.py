@@ -8,7 +8,7 @@ import json
 import numpy as np
 
 from nmpm.data.fields import read_fields
-from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
 from nmpm.data.gravity import own_gravity
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
@@ -22,6 +22,7 @@ TOLERANCE = 1e-3
 def read_labelled(split: Split, index: int = 0, family: str | None = None) -> LabelledTrajectories:
     """Reads a trajectory, labelled "prediction" or "recorded" (or "simulated", where nmpm's simulators made it).
 
+    A prediction that has its truth beside it comes after that, over the frames that both have.
     With the fields of particles that the file's scene or metadata declare, see `nmpm.data.fields`.
 
     Args:
@@ -38,8 +39,10 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
     scene, names, static, label = _describe(split, trajectory, family)
     moving = ~np.isin(trajectory.particle_type, sorted(static))
     fields = read_fields(split, index, scene.particle_fields)
+    positions = _beside_truth(split, index, trajectory, label)
+    frames = len(positions[label])
     return LabelledTrajectories(
-        positions={label: trajectory.position[:, moving]},
+        positions={name: position[:, moving] for name, position in positions.items()},
         material=material_names(trajectory.particle_type[moving], names),
         bounds=scene.bounds,
         dt=scene.dt,
@@ -48,8 +51,23 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         periodic=scene.periodic,
         gravity=own_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
         title=f"{split.path.name}, trajectory {index}",
-        fields={name: {label: values[:, moving]} for name, values in fields.items() if values.shape[1] > 1},
+        fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
     )
+
+
+def _beside_truth(split: Split, index: int, trajectory: Trajectory, label: str) -> dict[str, np.ndarray]:
+    """The positions of a prediction, after those of its truth where the file has it."""
+    position = trajectory.position
+    truth = split.fields(index).get(TRUTH) if label == "prediction" else None
+    if truth is None:
+        return {label: position}
+    if truth.ndim != 3 or truth.shape[1:] != position.shape[1:] or not len(truth):
+        raise DataError(
+            f"{split.where(index)}: truth has the shape {truth.shape}, beside positions of the shape {position.shape}."
+            " Both should be (frames, particles, dimensions), of the same particles."
+        )
+    frames = min(len(truth), len(position))
+    return {TRUTH: truth[:frames], label: position[:frames]}
 
 
 def combine(
@@ -65,7 +83,8 @@ def combine(
     Raises:
         DataError: if their particles differ in number, material or first position.
     """
-    (first_label, first), (second_label, second) = (next(iter(each.positions.items())) for each in (reference, other))
+    # The last of each: a prediction comes after its truth.
+    (first_label, first), (second_label, second) = (list(each.positions.items())[-1] for each in (reference, other))
     both = f"{names[0]} and {names[1]}"
     if first.shape[1:] != second.shape[1:]:
         raise DataError(

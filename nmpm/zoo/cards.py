@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from nmpm.evaluation.bootstrap import interval
-from nmpm.evaluation.figures import PREDICTORS, Unit, figure_names, predictor_figures
+from nmpm.evaluation.figures import PREDICTORS, Unit, figure_names, figures_unit, predictor_figures
 from nmpm.zoo.lifecycle import FACTOR, lifecycle
 
 CONSTRAINTS = {
@@ -60,7 +60,7 @@ def readme(card: Mapping[str, Any], files: Collection[str] = (), load: str | Non
         load: What `Zoo.load` takes; the model's name when left out.
     """
     training, test = card["training"], card["test"]
-    names, unit = figure_names(test), Unit.of(test.values())
+    names, unit = figure_names(test), figures_unit(test)
     emd = ", exact earth mover's distance (`emd`) in domain length" if "emd" in names else ""
     lines = [
         f"# {card['name']}",

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nmpm._support.messages import one_line
+from nmpm._support.progress import progress_bar
 from nmpm.data.format import Split, Trajectory, find_split, read_metadata
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader, SplitRecordings
-from nmpm.data.progress import progress_bar
 from nmpm.data.simulation_request import SimulationRequest, same_test_scenes
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
@@ -36,7 +35,7 @@ def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None
         split, metadata = Split(find_split(data, "test")), read_metadata(data, "deepmind")
         _check_same_scenes(model, metadata.extra.get("simulation"), data)
         for window in EvaluationLoader(SplitRecordings(split, metadata, model.scene), 1):
-            yield window if frames is None else dataclasses.replace(window, frames=window.frames[:, : frames + 2])
+            yield window if frames is None else window.first(frames + 2)
         return
     preset, request = simulation_of(model)
     shorter = preset if frames is None else preset.with_frames(frames + 1)

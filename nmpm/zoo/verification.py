@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nmpm._support.progress import progress_bar
 from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
@@ -75,7 +76,11 @@ def verify(model: Pretrained, full: bool = False, data: Path | None = None) -> I
     rows = stated_rows(model)
     yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
-    errors = [_errors(model, window) for window in islice(iterate_test_scenes(model, frames, data), count)]
+    errors = []
+    with progress_bar(f"Verifying {model.name}", count) as step:
+        for window in islice(iterate_test_scenes(model, frames, data), count):
+            errors.append(_errors(model, window))
+            step()
     checks = list(_means(rows, errors) if full else _scenes(rows, errors))
     if not checks:
         more = "" if full else "; --full measures the whole scenes"

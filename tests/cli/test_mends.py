@@ -1,16 +1,10 @@
 """Mistakes of a first hour: a message of one line that names what is wrong, and how to mend it."""
 
-import io
-import sys
-
 import numpy as np
 import pytest
-from rich.console import Console
 
-from nmpm._support.progress import terminal_progress
 from nmpm.cli import main
 from nmpm.data.format import Trajectory, write_split
-from nmpm.data.progress import progress_bar
 
 
 @pytest.fixture
@@ -51,24 +45,6 @@ def test_inspect_refuses_a_rollout_and_says_how_to_look_at_it(folder, capsys):
     said = capsys.readouterr().err
     assert said.startswith("nmpm inspect: out.h5: ")
     assert "nmpm view out.h5" in said
-
-
-def test_progress_shows_on_a_terminal_and_leaves_a_file_alone():
-    for terminal in (False, True):
-        file = io.StringIO()
-        with terminal_progress(Console(file=file, force_terminal=terminal, width=100)) as progress:
-            progress.advance(progress.add_task("work", total=2), 1)
-        assert ("1/2" in file.getvalue()) == ("ETA" in file.getvalue()) == terminal
-        assert bool(file.getvalue()) == terminal
-
-
-def test_notebooks_without_widgets_show_no_progress_rather_than_a_warning(monkeypatch, recwarn):
-    monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    monkeypatch.setattr("nmpm._support.progress.find_spec", lambda name: None)
-    monkeypatch.setattr("nmpm.data.progress.Console", lambda **_: Console(file=io.StringIO(), force_jupyter=True))
-    with progress_bar("work", 1) as advance:
-        advance()
-    assert not recwarn.list
 
 
 def test_inspect_names_a_file_that_is_not_hdf5(folder, capsys):

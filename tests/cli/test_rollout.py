@@ -1,8 +1,10 @@
 import errno
+import json
 import os
 import re
 import tempfile
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +13,14 @@ from nmpm._support.atomic import atomic_write
 from nmpm._support.shipped import shipped_folder
 from nmpm._support.writable import file_obstacle
 from nmpm.cli import main
-from nmpm.data.format import Split
+from nmpm.data.format import Split, Trajectory, write_split
+from nmpm.errors import DataError
+from nmpm.scene import Scene
 from nmpm.viz.files import read_labelled
+from tests.made_up import made_up_trajectory
+
+BOX = ((0.1, 0.9),) * 2
+SCENE = json.dumps(Scene(BOX, BOX, dt=0.0025, materials=("goop",), particle_volume=1e-4).to_dict())
 
 
 @pytest.fixture(autouse=True)
@@ -90,6 +98,41 @@ def test_the_gravity_of_a_rollout_is_written_beside_it(folder, capsys):
     assert read_labelled(Split(folder / "out.h5")).gravity == pytest.approx((6, 7.5))
     assert main([*few, "--gravity", "6,7.5", "--data", "out.h5"]) == 1
     assert "--gravity is of thrown blocks" in capsys.readouterr().err
+
+
+def test_as_many_frames_are_written_and_named_as_were_asked_for(folder, capsys):
+    assert main(["rollout", "goop", "--frames", "20", "--particles", "50"]) == 0
+    assert Split(folder / "out.h5").frames(0) == 22
+    said = capsys.readouterr().out
+    assert "20 frames; most" in said
+    assert "24" not in said.partition("wrote")[0].partition("most")[0]
+
+
+@pytest.mark.parametrize(("asked", "predicted", "compared"), [(None, 30, 30), (12, 12, 12), (40, 40, 30)])
+def test_a_recording_is_predicted_to_its_end_and_stored_beside(asked, predicted, compared, make_dataset, capsys):
+    file = make_dataset(test=((32, 5), (32, 9)), statics=0) / "test.h5"
+    frames = [] if asked is None else ["--frames", str(asked)]
+    assert main(["rollout", "goop", "--data", str(file), "--trajectory", "1", *frames]) == 0
+    said = capsys.readouterr().out
+    assert f"2 frames of the start and {predicted} predicted, of 9 particles" in said
+    assert f"trajectory 1, {compared} frames: error ×10⁻³" in " ".join(said.split())
+    assert "nothing moves" in said
+    shown = read_labelled(Split(Path("out.h5")))
+    assert list(shown.positions) == ["truth", "prediction"]
+    recorded = Split(file).read(1).position
+    np.testing.assert_array_equal(shown.positions["truth"], recorded[: compared + 2])
+    np.testing.assert_allclose(shown.positions["prediction"][:2], recorded[:2], atol=1e-7)
+    assert Split(Path("out.h5")).frames(0) == predicted + 2
+    assert main(["view", "out.h5", str(file), "--truth-trajectory", "1"]) == 0
+
+
+def test_a_truth_of_other_particles_is_refused(folder):
+    trajectory = made_up_trajectory(6, 5)
+    attributes = {"scene": SCENE, "particle_types": '{"7": "goop"}', "static_types": np.array([3])}
+    written = Trajectory(trajectory.position, trajectory.particle_type, attributes, {"truth": np.zeros((6, 4, 2))})
+    write_split(folder / "out.h5", [written])
+    with pytest.raises(DataError, match=r"out.h5, trajectory 00000: truth has the shape \(6, 4, 2\)"):
+        read_labelled(Split(folder / "out.h5"))
 
 
 WRITERS = [

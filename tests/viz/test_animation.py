@@ -12,7 +12,6 @@ from nmpm.viz import write_animation
 from nmpm.viz.colours import BACKGROUND, INTERIOR, WALL, material_colour
 from nmpm.viz.frame_renderer import FrameRenderer
 from nmpm.viz.gif_palette import FIXED_COLOURS, SIZE, GifPalette, _table_index
-from nmpm.viz.progress import with_progress_bar
 
 
 def frames_of(path):
@@ -138,10 +137,3 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         fail()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_the_progress_bar_yields_every_item_and_is_silent_without_a_terminal(capsys):
-    assert list(with_progress_bar(iter("abc"), 3, "Drawing")) == ["a", "b", "c"]
-    captured = capsys.readouterr()
-    assert not captured.out
-    assert not captured.err

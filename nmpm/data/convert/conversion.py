@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from nmpm._support.atomic import new_folder
+from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset
 from nmpm.data.convert.conversion_log import ConversionLog
 from nmpm.data.format import SPLITS, Trajectory, write_metadata, write_split
-from nmpm.data.progress import progress_bar
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import ConfigError, DataError
 
@@ -86,7 +86,7 @@ def _write(source: ForeignDataset, folder: Path) -> tuple[str, ...]:
 
 
 def _log_and_yield(
-    trajectories: Iterable[Trajectory], log: ConversionLog, where: str, advance: Callable[[], None]
+    trajectories: Iterable[Trajectory], log: ConversionLog, where: str, advance: Callable[[], object]
 ) -> Iterator[Trajectory]:
     for index, trajectory in enumerate(trajectories):
         log.add(trajectory, f"{where}, trajectory {index}")

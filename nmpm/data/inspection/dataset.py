@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from nmpm._support.progress import progress_bar
 from nmpm.data.format import Metadata, Split
 from nmpm.data.inspection.anomalies import find_anomalies
 from nmpm.data.inspection.facts import Inspection, Range, SplitFacts
@@ -15,7 +16,6 @@ from nmpm.data.inspection.field_survey import FieldSurvey
 from nmpm.data.inspection.survey import Survey
 from nmpm.data.inspection.tolerance import open_splits, tolerant_metadata, with_guessed_family
 from nmpm.data.loading.sources import FolderSource
-from nmpm.data.progress import progress_bar
 from nmpm.data.scene_inference import distinct_gravities, trajectory_gravity
 from nmpm.data.statistics import MotionStatistics, find_disagreements
 from nmpm.errors import DataError, NmpmError

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from threading import Lock
 
 from nmpm._support.parallel import usable_cores
+from nmpm._support.progress import progress_bar
 from nmpm.data.format import SPLITS, Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.background import Task, map_in_threads, raise_if_abandoned, run_in_thread
 from nmpm.data.loading.recording import Recording, RecordingReader
-from nmpm.data.progress import progress_bar
 from nmpm.data.seeds import simulate_first_stable
 from nmpm.errors import ConfigError
 from nmpm.sim import Preset

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from nmpm.data.progress import progress_bar
+from nmpm._support.progress import progress_bar
 from nmpm.evaluation.stress import GROUPS, Line, Subject, battery
 from nmpm.evaluation.stress.lines import QUICK
 from nmpm.evaluation.stress.report import as_json
@@ -39,7 +39,7 @@ def _measure(model: Pretrained, preset: Preset | None, size: str) -> dict[str, A
     return {"stress": _digest(model, lines, size), "stress_free": _digest(model, unheld, size)}
 
 
-def _run_groups(subject: Subject, names: Iterable[str], advance: Callable[[], None]) -> dict[str, list[Line]]:
+def _run_groups(subject: Subject, names: Iterable[str], advance: Callable[[], object]) -> dict[str, list[Line]]:
     found = {}
     for name in names:
         found[name] = list(battery(subject, QUICK, {name: GROUPS[name]}))
