@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
-from nmpm._support.plain_data import to_lists, to_tuples
+from nmpm._support.plain_data import from_plain, to_lists
 from nmpm.errors import ConfigError
 
 Boundary = Literal["wall", "periodic"]
@@ -213,16 +213,9 @@ class Scene:
         """The scene described by `to_dict`.
 
         Raises:
-            ConfigError: if a key is unknown or missing.
+            ConfigError: if a key is unknown, missing, or of the wrong kind.
         """
-        known = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(plain) - known)
-        if unknown:
-            raise ConfigError(f"Scene has no key {', '.join(unknown)}; it has {', '.join(sorted(known))}.")
-        try:
-            return cls(**{key: to_tuples(value) for key, value in plain.items()})
-        except TypeError as error:
-            raise ConfigError(f"Scene cannot be read: {error}.") from error
+        return from_plain(cls, plain, "Scene")
 
 
 def check_field_names(names: Iterable[str]) -> None:

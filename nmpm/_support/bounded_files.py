@@ -15,7 +15,20 @@ from nmpm._support.messages import one_line
 from nmpm._support.regular_files import check_mode
 from nmpm.errors import DataError
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # (its type is not known)
+    """PyYAML's, which reads 1e-3 as a number too, as YAML 1.2 and OmegaConf do."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes texts, such as digests, that `_Loader` would read as numbers."""
+
+
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+    )
+_LOADER = _Loader
 _CONTROL = re.compile(r"[^\n\r\t\x20-\x7e\xa0-\U0010ffff]")
 _NUMBER = re.compile(r"[-+0-9_.:eE]+")
 
@@ -48,24 +61,54 @@ def read_yaml(path: Path) -> dict[str, Any]:
         DataError: if the file cannot be read or is too large, too deep or not YAML, uses anchors, aliases or tags, or
             holds other values, such as dates, or control characters.
     """
-    content = read_bounded(path, TEXT_BYTES)
+    return parse_yaml(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a regular file of at most `TEXT_BYTES`.
+
+    Raises:
+        DataError: as `read_bounded`, or if it is not UTF-8.
+    """
     try:
-        text = content.decode("utf-8")
-        _check_events(text)
+        return read_bounded(path, TEXT_BYTES).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path} cannot be read: {error}") from error
+
+
+def parse_yaml(text: str, where: Path | str) -> dict[str, Any]:
+    """As `read_yaml`, of a file's text; a text without content is an empty mapping.
+
+    Args:
+        text: In YAML.
+        where: Its file, for messages.
+
+    Raises:
+        DataError: as `read_yaml`.
+    """
+    try:
+        check_yaml(text)
         plain = yaml.load(text, _LOADER)  # noqa: S506 (a safe loader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
-        raise DataError(f"{path} cannot be read: {one_line(error)}") from error
+        raise DataError(f"{where} cannot be read: {one_line(error)}") from error
+    plain = {} if plain is None else plain
     if not isinstance(plain, dict):
-        raise DataError(f"{path} should hold keys and values.")
-    _check_plain(plain, path)
+        raise DataError(f"{where} should hold keys and values.")
+    _check_plain(plain, where)
     return plain
 
 
-def _check_events(text: str) -> None:
+def to_yaml(content: Mapping[str, Any]) -> str:
+    """The text that `parse_yaml` reads as this content."""
+    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+
+
+def check_yaml(text: str) -> None:
     """Refuse what makes a short text a large or slow one, before anything is built.
 
     Raises:
         ValueError: naming it and its line.
+        yaml.YAMLError: if it is not YAML.
     """
     depth = 0
     for event in yaml.parse(text, _LOADER):
@@ -82,7 +125,7 @@ def _check_events(text: str) -> None:
             raise ValueError(f"line {line} has a number of more than {DIGITS} digits.")
 
 
-def check_characters(value: object, path: Path) -> None:
+def check_characters(value: object, path: Path | str) -> None:
     """Refuse control characters but line breaks and tabs, which would reach the terminal of whoever prints the text.
 
     Args:
@@ -101,7 +144,7 @@ def check_characters(value: object, path: Path) -> None:
         raise DataError(f"{path}: {one_line(repr(value), 60)} has a control character.")
 
 
-def _check_plain(value: Any, path: Path) -> None:
+def _check_plain(value: Any, path: Path | str) -> None:
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not isinstance(key, str):

@@ -1,5 +1,9 @@
 """Limits on what files may ask for, checked before anything of that size is allocated or built."""
 
+import re
+
+FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""Names in files of others that become names of files: none is hidden or leads to another folder."""
 TEXT_BYTES = 2**20
 """Size of a card, configuration or report."""
 TEXT_DEPTH = 32

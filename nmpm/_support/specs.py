@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 from nmpm._support.messages import one_line, suggestion
-from nmpm._support.plain_data import to_lists, to_tuples
+from nmpm._support.plain_data import from_plain, to_lists
 from nmpm._support.plugins import load_plugins
 from nmpm.errors import ConfigError
 
@@ -82,16 +82,8 @@ def from_spec(spec: object, base: type[T]) -> T:
             " init_args: move arguments into init_args."
         )
     kind = _find_class(str(spec["class_path"]), base)
-    given = spec.get("init_args") or {}
-    if not isinstance(given, Mapping):
-        raise ConfigError(f"init_args of {class_path(kind)} must be a mapping; got {one_line(repr(given), 100)}.")
-    arguments = {str(key): to_tuples(value) for key, value in given.items()}
-    try:
-        return kind(**arguments)
-    except TypeError as error:
-        raise ConfigError(
-            f"{class_path(kind)} does not take the arguments {one_line(arguments)}: {one_line(error)}."
-        ) from error
+    given = {} if spec.get("init_args") is None else spec["init_args"]
+    return from_plain(kind, given, class_path(kind))
 
 
 def class_path(kind: type) -> str:

@@ -13,11 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from nmpm._support.messages import one_line
+from nmpm._support.bounded_files import read_yaml
 from nmpm._support.shipped import PACKAGE
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 
 NOT_FILES = (None, "last", "best", "null", "???")
 """Values of paths that name no file."""
@@ -71,10 +69,9 @@ def read_config(path: Path) -> Mapping[str, Any]:
         UsageError: if it is not YAML.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"--config {path}: it is not YAML ({one_line(error)}).") from error
-    return content if isinstance(content, Mapping) else {}
+        return read_yaml(path)
+    except DataError as error:
+        raise UsageError(f"--config {error}") from error
 
 
 def argument_names(group: str) -> set[str]:

@@ -3,19 +3,45 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from jsonargparse import set_parsing_settings
+from jsonargparse import ArgumentParser, get_loader, set_loader, set_parsing_settings
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from yaml import YAMLError
 
+from nmpm._support.bounded_files import check_yaml
+from nmpm._support.messages import one_line
 from nmpm._support.plugins import load_plugins
 from nmpm.cli.console import quiet_lightning
 from nmpm.cli.emulator_cli import EmulatorCLI, RunConfig
 from nmpm.errors import ConfigError
+
+PARSER_MODE = "omegaconf+"
+ArgumentParser(parser_mode=PARSER_MODE).parse_string("{}")  # makes jsonargparse set the mode's loader
+_load = get_loader(PARSER_MODE)
+
+
+def load_checked(text: str) -> Any:
+    """What LightningCLI reads of a configuration's text, which may refer to its own values, but not to anything else.
+
+    Raises:
+        ValueError: for what `check_yaml` refuses, and resolvers, such as `${oc.env:HOME}`, as runs are shared.
+        YAMLError: if it is not YAML.
+    """
+    check_yaml(text)
+    value = _load(text)
+    rest, count = str(value), 1
+    while count:  # from the inside to the outside
+        rest, count = re.subn(r"\$\{[^${}:]*\}", "", rest)
+    if left := re.search(r"\$\{[^}]*\}?", rest):
+        raise ValueError(f"{one_line(left[0], 60)}: ${{…}} refers to other keys of the configuration, to nothing else.")
+    return value
 
 
 def run_command(words: list[str], note: str = "") -> int:
@@ -35,6 +61,7 @@ def run_command(words: list[str], note: str = "") -> int:
     """
     load_plugins()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
+    set_loader(PARSER_MODE, load_checked, (YAMLError, ValueError))
     # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
     sys.argv = [sys.argv[0], *words]
     locks: list[int] = []
@@ -45,7 +72,7 @@ def run_command(words: list[str], note: str = "") -> int:
                 note,
                 locks,
                 seed_everything_default=0,
-                parser_kwargs={"parser_mode": "omegaconf+"},
+                parser_kwargs={"parser_mode": PARSER_MODE},
                 save_config_callback=RunConfig,
                 save_config_kwargs={"save_to_log_dir": False},
             )

@@ -97,12 +97,13 @@ def _check(chosen: argparse.Namespace) -> None:
 
 
 def _sweep(chosen: argparse.Namespace) -> Sweep:
+    from nmpm._support.bounded_files import read_text
     from nmpm.evaluation.trade import default_sweep_text, read_sweep
 
     if chosen.config is None:
         sweep = read_sweep(default_sweep_text(), "the shipped sweep")
     else:
-        sweep = read_sweep(chosen.config.read_text(encoding="utf-8"), str(chosen.config))
+        sweep = read_sweep(read_text(chosen.config), str(chosen.config))
     if chosen.scenes is None:
         return sweep
     fitting = tuple(batch for batch in sweep.models.batch if batch <= chosen.scenes)

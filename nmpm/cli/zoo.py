@@ -124,6 +124,7 @@ def _summary(card: Mapping[str, Any]) -> str:
 
 
 def _card(chosen: argparse.Namespace) -> None:
+    from nmpm._support.bounded_files import to_yaml
     from nmpm.errors import ZooError
     from nmpm.zoo.cards import MALFORMED, readme
     from nmpm.zoo.entries import read_card
@@ -131,9 +132,7 @@ def _card(chosen: argparse.Namespace) -> None:
 
     card = read_card(find_entry(chosen.name, chosen.root))
     if chosen.yaml:
-        import yaml
-
-        sys.stdout.write(yaml.safe_dump(card, sort_keys=False, allow_unicode=True))
+        sys.stdout.write(to_yaml(card))
         return
     try:
         text = readme(card)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
 from nmpm._support.atomic import new_folder
-from nmpm._support.limits import EXPANSION, expansion_limit
+from nmpm._support.limits import EXPANSION, FILE_NAME, expansion_limit
 from nmpm._support.shipped import user_home
 from nmpm.data.archive_errors import ZIP_ERRORS
 from nmpm.data.folder_lock import lock_folder
@@ -18,7 +17,6 @@ from nmpm.errors import ConfigError, DataError
 REPOSITORY = "iSach/NeuralMPM"
 """Repository of names without an owner: the datasets of the paper's authors."""
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _DATA = (".h5", ".json", ".npz", ".tfrecord", ".zst")
 
 
@@ -48,7 +46,7 @@ def hub_folder(name: str) -> Path:
 
 def _parse_name(name: str) -> tuple[str, str]:
     parts = name.strip("/").split("/")
-    if len(parts) > 3 or not all(_NAME.fullmatch(part) for part in parts):
+    if len(parts) > 3 or not all(FILE_NAME.fullmatch(part) for part in parts):
         raise ConfigError(
             f"{name!r} is not the name of a dataset on the hub: give a folder of {REPOSITORY}, such as WaterRamps, or"
             " owner/repository or owner/repository/folder."
@@ -111,7 +109,7 @@ def _unpack_one(archive: Path, target: Path) -> None:
             path = PurePosixPath(item.filename)
             if item.is_dir() or path.suffix not in _DATA or "__MACOSX" in path.parts:
                 continue
-            if path.is_absolute() or not all(_NAME.fullmatch(part) for part in path.parts):
+            if path.is_absolute() or not all(FILE_NAME.fullmatch(part) for part in path.parts):
                 raise DataError(f"{archive}: does not unpack {item.filename!r}, as the path may leave the folder.")
             place = target.joinpath(*path.parts)
             place.parent.mkdir(parents=True, exist_ok=True)

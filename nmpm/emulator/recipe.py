@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from nmpm._support.plain_data import to_lists
+from nmpm._support.plain_data import from_plain, to_lists
 from nmpm._support.specs import from_spec, to_spec
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator.constraints import Constraints
@@ -53,14 +53,14 @@ class EmulatorRecipe:
 
     def __post_init__(self) -> None:
         scene = self.scene if isinstance(self.scene, Scene) else Scene.from_dict(self.scene)
-        constraints = self.constraints
+        given = self.constraints
         read = {
             "scene": scene,
             "cells": Grid.of(scene, self.cells).shape,
             "transfer": from_spec(self.transfer, Transfer),
             "processor": from_spec(self.processor, Processor),
             "decoder": from_spec(self.decoder, Decoder),
-            "constraints": constraints if isinstance(constraints, Constraints) else _constraints(constraints),
+            "constraints": given if isinstance(given, Constraints) else from_plain(Constraints, given, "constraints"),
         }
         for name, value in read.items():
             object.__setattr__(self, name, value)
@@ -122,17 +122,9 @@ class EmulatorRecipe:
         """
         values = dict(plain)
         check_format(values.pop("format", 0), "This model")
-        known = {field.name for field in dataclasses.fields(cls)}
-        wrong = sorted(set(values) - known) or sorted({"scene", "cells", "frames", "processor"} - set(values))
-        if wrong:
-            raise ConfigError(
-                f"A recipe of an emulator has unknown or missing keys: {', '.join(wrong)}; it has"
-                f" {', '.join(sorted(known))}."
-            )
-        try:
-            return cls(**values)
-        except TypeError as error:
-            raise ConfigError(f"The recipe of an emulator cannot be read: {error}.") from error
+        if missing := sorted({"cells", "frames", "processor"} - set(values)):  # their defaults are for new models
+            raise ConfigError(f"The recipe of an emulator lacks {', '.join(missing)}.")
+        return from_plain(cls, values, "The recipe of an emulator")
 
 
 def check_format(found: object, what: str) -> None:
@@ -143,15 +135,6 @@ def check_format(found: object, what: str) -> None:
     """
     if not isinstance(found, int) or found > FORMAT:
         raise ConfigError(f"{what} has format {found}; this nmpm reads up to {FORMAT}: pip install --upgrade nmpm.")
-
-
-def _constraints(plain: Any) -> Constraints:
-    if not isinstance(plain, Mapping):
-        raise ConfigError(f"constraints must map names to values; got {plain!r}.")
-    try:
-        return Constraints(**plain)
-    except TypeError as error:
-        raise ConfigError(f"constraints: {error}.") from error
 
 
 def _plain(value: Any) -> Any:

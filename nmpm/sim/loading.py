@@ -7,10 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import omegaconf
-import yaml
-from omegaconf import OmegaConf
-
+from nmpm._support.bounded_files import parse_yaml, read_text
 from nmpm._support.messages import one_line, suggestion
 from nmpm.errors import ConfigError
 from nmpm.sim.mpm.preset import MpmPreset
@@ -30,14 +27,13 @@ def load_preset(name_or_path: str | Path) -> Preset:
     """A preset by its shipped name, or from a YAML file.
 
     Raises:
-        ConfigError: if there is no such preset, or it cannot be read.
+        ConfigError: if there is no such preset, or a key is unknown, missing or wrong.
+        DataError: if it cannot be read, or is not plain YAML.
     """
-    text = preset_text(name_or_path)
+    plain = parse_yaml(preset_text(name_or_path), f"Preset {name_or_path}")
     try:
-        return preset_from_dict(OmegaConf.to_container(OmegaConf.create(text), resolve=True))
-    except yaml.YAMLError as error:
-        raise ConfigError(f"Preset {name_or_path}: it is not YAML ({one_line(error)}).") from error
-    except (omegaconf.errors.OmegaConfBaseException, ConfigError) as error:
+        return preset_from_dict(plain)
+    except ConfigError as error:
         raise ConfigError(f"Preset {name_or_path}: {error}") from error
 
 
@@ -45,9 +41,10 @@ def preset_text(name_or_path: str | Path) -> str:
     """The YAML of a preset, with its comments, by its shipped name or from a file.
 
     Raises:
-        ConfigError: if there is no such preset, or it is not text.
+        ConfigError: if there is no such preset.
+        DataError: if it cannot be read.
     """
-    path = resources.files("nmpm.sim") / "presets" / f"{name_or_path}.yaml"
+    path = Path(str(resources.files("nmpm.sim"))) / "presets" / f"{name_or_path}.yaml"
     if str(name_or_path) not in preset_names():
         path = Path(name_or_path)
     if not path.is_file():
@@ -56,22 +53,17 @@ def preset_text(name_or_path: str | Path) -> str:
             f"There is no preset or file {name_or_path}; shipped presets: {', '.join(names)}."
             + suggestion(str(name_or_path), names)
         )
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"Preset {name_or_path}: {error}") from error
+    return read_text(path)
 
 
-def preset_from_dict(plain: Any) -> Preset:
+def preset_from_dict(plain: Mapping[str, Any]) -> Preset:
     """The preset that `Preset.to_dict` described.
 
     Raises:
         ConfigError: if the solver is unknown, or a key is unknown, missing or of the wrong kind.
     """
-    if not isinstance(plain, Mapping):
-        raise ConfigError(f"the preset must map keys to values; it is {plain!r}.")
     entries = dict(plain)
-    solver = entries.pop("solver", None)
+    solver = str(entries.pop("solver", None))
     if solver not in SOLVERS:
-        raise ConfigError(f"solver = {solver} is not one of {', '.join(SOLVERS)}.")
+        raise ConfigError(f"solver = {one_line(solver, 80)} is not one of {', '.join(SOLVERS)}.")
     return SOLVERS[solver].from_dict(entries)

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from nmpm._support.limits import FILE_NAME
+from nmpm._support.messages import one_line
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.config import check, to_plain
@@ -52,6 +54,11 @@ class Preset(abc.ABC):
     domain: tuple[Interval, ...]
 
     def __post_init__(self) -> None:
+        check(
+            FILE_NAME.fullmatch(self.name) is not None,
+            f"name = {one_line(repr(self.name), 80)} names files and folders: give letters, digits, - _ and ., the"
+            " first a letter or digit.",
+        )
         self._check_positive("frames", "frame_dt", "substeps")
         self._check_whole("frames", "substeps")
 

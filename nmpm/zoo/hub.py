@@ -16,10 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-import yaml
-
 from nmpm._support.atomic import atomic_folder
-from nmpm._support.bounded_files import read_bounded, read_yaml
+from nmpm._support.bounded_files import read_bounded, read_yaml, to_yaml
 from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
@@ -144,7 +142,7 @@ def pull(identifier: HubId, target: Path, name: str) -> Path:
         for file in FILES:
             if (folder / file).is_file():
                 shutil.copyfile(folder / file, new / file)
-        (new / CARD).write_text(_yaml(card), encoding="utf-8")
+        (new / CARD).write_text(to_yaml(card), encoding="utf-8")
         (new / "README.md").write_text(_page(card, new, name), encoding="utf-8")
     return target
 
@@ -175,7 +173,7 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
                 shutil.copyfile(entry / name, Path(folder) / name)
         card = read_card(entry)
         page = _page(card, entry, f"{repository}@main")
-        (Path(folder) / "README.md").write_text(f"---\n{_yaml(hub_metadata(card))}---\n\n{page}", encoding="utf-8")
+        (Path(folder) / "README.md").write_text(f"---\n{to_yaml(hub_metadata(card))}---\n\n{page}", encoding="utf-8")
         api = HfApi()
         try:
             if private and _is_public(api, repository):
@@ -213,10 +211,6 @@ def _page(card: Mapping[str, Any], entry: Path, load: str) -> str:
         return readme(card, [path.name for path in entry.iterdir()], load)
     except MALFORMED:
         return ""
-
-
-def _yaml(content: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)
 
 
 def hub_metadata(card: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.bounded_files import check_characters
+from nmpm._support.bounded_files import check_characters, to_yaml
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.cards import MALFORMED, intervals, readme, twin_ratio
@@ -151,7 +150,7 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
             " `nmpm zoo card NAME --yaml` shows what the card has; `nmpm zoo add` writes a new one from the run."
         ) from error
     with atomic_write(folder / CARD) as part:
-        part.write_text(yaml.safe_dump(dict(card), sort_keys=False, allow_unicode=True, width=120), encoding="utf-8")
+        part.write_text(to_yaml(card), encoding="utf-8")
     if chart is not None:
         save_chart(folder, chart)
     with atomic_write(folder / "README.md") as part:

@@ -10,10 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from nmpm._support.atomic import atomic_folder
-from nmpm._support.bounded_files import check_characters
+from nmpm._support.bounded_files import check_characters, to_yaml
 from nmpm._support.digests import float32_digest, weights_digest
 from nmpm._support.messages import one_line
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
@@ -118,11 +116,11 @@ def _publish(run: Path, name: str, target: Path, about: str, keep: Keep | None =
         readme(card, ())
     except (KeyError, TypeError) as error:
         raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
-    recipe = _yaml(emulator.recipe.to_dict())
+    recipe = to_yaml(emulator.recipe.to_dict())
     try:
         with writing(target):
             card, text = _with_kept(card, {} if keep is None else keep(card, recipe), target, files)
-            _write(target, weights, {"config.yaml": recipe, "card.yaml": _yaml(card), "README.md": text}, files)
+            _write(target, weights, {"config.yaml": recipe, "card.yaml": to_yaml(card), "README.md": text}, files)
     except OSError as error:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
 
@@ -214,7 +212,3 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ZooError(f"{path} should hold keys and values.")
     return content
-
-
-def _yaml(content: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)

@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from nmpm.cli import main
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.loading.sources import FolderSource
 from nmpm.sim import preset_names
+from nmpm.sim.loading import preset_text
 
 
 def test_lists_every_scene(capsys):
@@ -50,6 +52,29 @@ def test_a_scene_of_ones_own_starts_from_a_copy(tmp_path, capsys):
     words = ["simulate", str(tmp_path / "thick.yaml"), "--train", "1", "--valid", "0", "--test", "0", "--frames", "1"]
     assert main([*words, "--out", str(tmp_path / "thick")]) == 0
     assert FolderSource(tmp_path / "thick").scene.materials == ("goop",)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("name: ../../../x", "name = '../../../x'"),
+        ("name: ${oc.env:HOME}", "name = '${oc.env:HOME}'"),
+        ("a: &a [x, x]", "line 1 has an anchor or alias"),
+        ("a: " + "[" * 20_000, "nested more than 32 deep"),
+        ("name: \udce9", "'utf-8' codec can't decode"),
+    ],
+    ids=str,
+)
+def test_a_shared_scene_is_plain_data_whose_name_leads_nowhere(change, said, tmp_path, monkeypatch, capsys):
+    (tmp_path / "inner").mkdir()
+    monkeypatch.chdir(tmp_path / "inner")
+    text = change + "\n" + preset_text("goop").replace("name: goop", "" if change.startswith("name") else "name: x")
+    Path("mine.yaml").write_text(text, encoding="utf-8", errors="surrogateescape")
+    assert main(["simulate", "mine.yaml", "--train", "1", "--valid", "0", "--test", "0"]) == 1
+    complaint = capsys.readouterr().err
+    assert said in complaint
+    assert complaint.count("\n") == 1
+    assert [path.name for path in tmp_path.rglob("*")] == ["inner", "mine.yaml"]
 
 
 def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):

@@ -35,14 +35,21 @@ FILES = [
     ("model: {widht: 3}", "unknown key model.widht; did you mean model.processor.width?"),
     ("modle: {cells: 3}", "unknown key modle.cells; did you mean model.cells?"),
     ("model: {processor: {class_path: nmpm.processors.UNet, init_args: {widht: 3}}}", "did you mean"),
-    ("model: {cells: 3\n  a: [", "--config mine.yaml: it is not YAML (while parsing a flow mapping"),
+    ("model: {cells: 3\n  a: [", "--config mine.yaml cannot be read: while parsing a flow mapping"),
+    ("model: " + "[" * 20_000, "--config mine.yaml cannot be read: line 1 is nested more than 32 deep"),
+    ("a: &a [x, x]\nb: &b [*a, *a]\nmodel: {cells: *b}\n", "--config mine.yaml cannot be read: line 1 has an anchor"),
+    ("model: {cells: '\udce9'}", "--config mine.yaml cannot be read: 'utf-8' codec"),
+    ("data: {path: '${oc.env:HOME}'}", "${oc.env:HOME}: ${…} refers to other keys"),
+    ("data: {path: '${oc.${data.name}:HOME}'}", ": ${…} refers to other keys"),
+    ("trainer: inner.yaml", "--trainer: Unable to load config 'inner.yaml' - line 1 has an anchor"),
 ]
 
 
-@pytest.mark.parametrize(("text", "complaint"), FILES, ids=range(4))
+@pytest.mark.parametrize(("text", "complaint"), FILES, ids=range(len(FILES)))
 def test_a_wrong_key_in_a_file_too(text, complaint, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    Path("mine.yaml").write_text(text)
+    Path("mine.yaml").write_text(text, encoding="utf-8", errors="surrogateescape")
+    Path("inner.yaml").write_text("a: &a [x, x]\nb: [*a, *a]\n")
     assert main(["fit", "--config", "mine.yaml"]) == 2
     said = capsys.readouterr().err
     assert complaint in said

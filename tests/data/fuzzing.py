@@ -1,5 +1,6 @@
 """Valid files of every format, what reads them, and ways to damage them."""
 
+import copy
 import io
 import json
 import pickle
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
 
 from nmpm.data.convert import Options, open_dataset
 from nmpm.data.convert.tfrecord import masked_crc
@@ -216,3 +219,37 @@ def readers() -> dict[str, Reader]:
         "rollout-pickle": Reader("rollout_0.pkl", _rollout(4), _read_foreign),
         "rollout-pickle 2": Reader("rollout_0.pkl", _rollout(2), _read_foreign),
     }
+
+
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.integers(10**99, 10**120),
+    st.floats(),
+    st.text(max_size=20),
+    st.sampled_from(["wall", "periodic", "nmpm.processors.UNet", "nmpm.processors.FNO", "stop", "goop"]),
+)
+VALUES = st.recursive(
+    SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+)
+FUZZ = settings(
+    max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+)
+
+
+def places(plain, path=()):
+    """Every key of nested mappings and lists."""
+    items = plain.items() if isinstance(plain, dict) else enumerate(plain) if isinstance(plain, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+def changed(plain, place, value):
+    """A copy of nested mappings and lists with another value at a place."""
+    copied = inner = copy.deepcopy(plain)
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    return copied

@@ -1,14 +1,18 @@
 """What holds for every scene that ships, of whatever method."""
 
 import json
+from contextlib import suppress
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, NmpmError
 from nmpm.sim import load_preset, preset_from_dict, preset_names
 from nmpm.sim.mpm.ramps import distance_to_ramps
 from nmpm.sim.preset import BOUNDARY
+from tests.data.fuzzing import FUZZ, VALUES, changed, places
 
 MPM = [name for name in preset_names() if load_preset(name).solver == "mls_mpm"]
 SIZES = {
@@ -113,3 +117,25 @@ def test_every_material_is_in_every_scene_of_several():
 def test_invalid_values_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         preset_from_dict(load_preset("waterramps").to_dict() | changes)
+
+
+@pytest.mark.parametrize("name", ["../../../x", "a/b", "..", ".x", "", "a\n", "${oc.env:HOME}", 3, ["goop"]])
+def test_a_name_leads_to_no_other_folder(name):
+    with pytest.raises(ConfigError, match="name = ") as caught:
+        preset_from_dict(load_preset("goop").to_dict() | {"name": name})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["waterramps", "wbcsph"])
+def test_any_value_anywhere_in_a_preset(name):
+    plain = load_preset(name).to_dict()
+    where = sorted(places(plain), key=str)
+
+    @FUZZ
+    @given(st.sampled_from(where), VALUES)
+    def check(place, value):
+        with suppress(NmpmError):
+            preset = preset_from_dict(changed(plain, place, value))
+            assert preset.scene.dim == len(preset.box)
+
+    check()

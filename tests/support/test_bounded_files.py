@@ -3,7 +3,7 @@ import os
 import pytest
 
 from nmpm._support import bounded_files
-from nmpm._support.bounded_files import read_bounded, read_yaml
+from nmpm._support.bounded_files import parse_yaml, read_bounded, read_yaml, to_yaml
 from nmpm.errors import DataError
 
 
@@ -11,6 +11,13 @@ def test_plain_data_are_read(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("a: 1\nb: [0.5, true, null, text, '2026-01-01']\nc: {d: é}\n", encoding="utf-8")
     assert read_yaml(path) == {"a": 1, "b": [0.5, True, None, "text", "2026-01-01"], "c": {"d": "é"}}
+    assert parse_yaml("# nothing\n", "a.yaml") == {}
+
+
+def test_what_is_written_is_read_again_numbers_without_a_point_too():
+    content = {"a": 1e-07, "b": "12e45", "c": "1.e+5", "d": "1e-3 s", "e": 1e30, "f": "é", "g": [None, True, "true"]}
+    assert parse_yaml(to_yaml(content), "") == content
+    assert parse_yaml("a: [1e-3, 4e5, -2.5E+3, 1e, e5]", "") == {"a": [1e-3, 4e5, -2500.0, "1e", "e5"]}
 
 
 @pytest.mark.parametrize("c_loader", [True, False])
@@ -32,7 +39,6 @@ def test_plain_data_are_read(tmp_path):
         ('a: "b\\e]0;c\\a"\n', "has a control character"),
         ('"a\\x9b": 1\n', "has a control character"),
         ("- a\n", "should hold keys and values"),
-        ("", "should hold keys and values"),
         ("a: 1\n---\nb: 1\n", "cannot be read"),
         ("a: [1\n", "cannot be read"),
         ("a: \x07\n", "cannot be read"),

@@ -10,7 +10,7 @@ import struct
 import pytest
 import torch
 import yaml
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import save
 
@@ -19,6 +19,7 @@ from nmpm.errors import ConfigError, DataError, ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo.building import build, read_recipe
 from nmpm.zoo.registry import Zoo, load_model
+from tests.data.fuzzing import FUZZ, VALUES, changed, places
 
 
 def complaint(root) -> str:
@@ -61,7 +62,7 @@ POINTWISE = {"class_path": "nmpm.processors.Pointwise", "init_args": {"hidden": 
         ({"processor__init_args__depth": 10**12}, "depth: an integer is larger"),
         ({"processor__init_args__kernel": 10**7 + 1}, "config.yaml does not describe a model"),
         ({"processor__class_path": "a" * 100_000}, "is not known"),
-        ({"processor__init_args": ["width"]}, "must be a mapping"),
+        ({"processor__init_args": ["width"]}, "must map keys to values"),
         ({"processor__width": 8, "decoder__x": 1}, "has the unknown keys width beside class_path and init_args"),
         ({"decoder__" + "x" * 100_000: 1}, "has the unknown keys xxx"),
         ({"processor": "x" * 100_000}, "Expected a Processor"),
@@ -69,8 +70,8 @@ POINTWISE = {"class_path": "nmpm.processors.Pointwise", "init_args": {"hidden": 
         ({"scene__materials": [f"m{i}" for i in range(30_000)]}, "more than 5,000 modules"),
         ({"scene__bounds": "everywhere"}, "config.yaml does not describe a model"),
         ({"scene": None}, "config.yaml does not describe a model"),
-        ({"constraints": {"energy": "x" * 100_000, "bounds": "no" * 100_000}}, "constraints.bounds"),
-        ({"k" * 100_000: 1}, "unknown or missing keys"),
+        ({"constraints": {"energy": "x" * 100_000, "bounds": "no" * 100_000}}, "energy = 'xxx"),
+        ({"k" * 100_000: 1}, "unknown kkk"),
     ],
 )
 def test_recipes_of_impossible_models(root, values, message):
@@ -169,23 +170,6 @@ def test_the_limits_allow_large_models(small):
     assert sum(p.numel() for p in build(read_recipe(plain)).parameters()) == sum(p.numel() for p in small.parameters())
 
 
-SCALARS = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(),
-    st.integers(10**99, 10**120),
-    st.floats(),
-    st.text(max_size=20),
-    st.sampled_from(["wall", "periodic", "nmpm.processors.UNet", "nmpm.processors.FNO", "stop", "goop"]),
-)
-VALUES = st.recursive(
-    SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
-)
-FUZZ = settings(
-    max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-)
-
-
 def load(root) -> None:
     try:
         Zoo.load("small", root)
@@ -193,14 +177,6 @@ def load(root) -> None:
         message = str(error).replace(str(root), "")
         assert "\n" not in message
         assert len(message) < 900
-
-
-def places(plain, path=()):
-    """Every key of nested mappings and lists."""
-    items = plain.items() if isinstance(plain, dict) else enumerate(plain) if isinstance(plain, list) else ()
-    for key, value in items:
-        yield (*path, key)
-        yield from places(value, (*path, key))
 
 
 @pytest.mark.parametrize("file", ["config.yaml", "card.yaml"])
@@ -212,12 +188,7 @@ def test_any_value_anywhere_in_the_texts(root, file):
     @FUZZ
     @given(st.sampled_from(where), VALUES)
     def check(place, value):
-        changed = copy.deepcopy(plain)
-        inner = changed
-        for key in place[:-1]:
-            inner = inner[key]
-        inner[place[-1]] = value
-        path.write_text(yaml.safe_dump(changed, allow_unicode=False))
+        path.write_text(yaml.safe_dump(changed(plain, place, value), allow_unicode=False))
         load(root)
 
     check()
@@ -261,13 +232,9 @@ def checkpoint(tmp_path, small):
     hyperparameters = copy.deepcopy(dict(module.hparams))
 
     def write(place=(), value=None):
-        changed = copy.deepcopy({"hyper_parameters": hyperparameters})
-        inner = changed
-        for key in place[:-1]:
-            inner = inner[key]
-        if place:
-            inner[place[-1]] = value
-        torch.save({"state_dict": module.state_dict(), "nmpm_format": 1} | changed, tmp_path / "a.ckpt")
+        stored = {"hyper_parameters": hyperparameters}
+        stored = changed(stored, place, value) if place else stored
+        torch.save({"state_dict": module.state_dict(), "nmpm_format": 1} | stored, tmp_path / "a.ckpt")
         return tmp_path / "a.ckpt"
 
     write.places = sorted(places({"hyper_parameters": hyperparameters}), key=str)

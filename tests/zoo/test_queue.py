@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from nmpm._support.plain_data import from_plain
 from nmpm.cli import main
 from nmpm.errors import ConfigError
 from nmpm.metrics import MSE
@@ -214,7 +215,7 @@ def test_mistakes_in_a_queue_are_named(queue, tmp_path):
     content = yaml.safe_load(path.read_text())
     for change, complaint in (
         ({"datasets": [dict(content["datasets"][0]) | {"options": {}} for _ in range(2)]}, "small: occurs twice"),
-        ({"dataset": []}, "dataset: unknown key"),
+        ({"dataset": []}, "unknown dataset; keys: datasets"),
         ({"datasets": [{"name": "small"}]}, "config"),
         ({"datasets": [content["datasets"][0] | {"hours": 0}]}, "hours = 0 must be a positive number"),
         ({"datasets": [content["datasets"][0] | {"start": "lava"}]}, "small: start = lava is no other dataset"),
@@ -567,7 +568,7 @@ def test_what_a_card_leaves_empty_counts_as_not_stated(tmp_path, value):
 )
 def test_values_of_an_extension_are_checked(values, message):
     with pytest.raises(ConfigError, match=message):
-        Extension(**values)
+        from_plain(Extension, values, "extension")
 
 
 @pytest.mark.parametrize(
@@ -576,14 +577,14 @@ def test_values_of_an_extension_are_checked(values, message):
         ({"hours": float("nan")}, "hours = nan"),
         ({"goal": float("inf")}, "goal = inf"),
         ({"publish": "no"}, "publish = 'no'"),
-        ({"options": None}, "options must be keys"),
-        ({"extend": []}, "extend must be keys"),
+        ({"options": None}, "options = None should be keys and values"),
+        ({"extend": []}, "extend = .. should be keys and values"),
     ],
     ids=str,
 )
 def test_values_of_a_dataset_are_checked(values, message):
     with pytest.raises(ConfigError, match=message):
-        Dataset(**{"name": "small", "config": "goop.yaml", "hours": 1.0} | values)
+        from_plain(Dataset, {"name": "small", "config": "goop.yaml", "hours": 1.0} | values, "datasets")
 
 
 def test_a_variant_starts_from_the_training_of_its_dataset(tmp_path):

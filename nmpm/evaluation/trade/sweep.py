@@ -11,10 +11,11 @@ from itertools import product
 from types import MappingProxyType
 
 import torch
-import yaml
 
+from nmpm._support.bounded_files import parse_yaml
 from nmpm._support.digests import short_digest
 from nmpm._support.messages import counted
+from nmpm._support.plain_data import from_plain
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.evaluation.gns import TrainedGraph
@@ -33,7 +34,6 @@ from nmpm.evaluation.trade.simulators import SimulatorChoice
 from nmpm.evaluation.trade.timing import Timing
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
 from nmpm.sim import Preset
-from nmpm.sim.config import from_section, section_entries
 
 
 @dataclass(frozen=True)
@@ -123,18 +123,10 @@ class Sweep:
             "simulator.substeps": self.simulator.substeps,
         }
         for key, values in positive.items():
-            if not isinstance(values, tuple):
-                raise ConfigError(f"{key}: {values!r} must be a list.")
-            wrong = [value for value in values if not isinstance(value, int | float) or not 0 < value < math.inf]
-            if wrong:
-                raise ConfigError(f"{key}: {wrong[0]!r} must be a positive number.")
+            if min(values, default=1) <= 0:
+                raise ConfigError(f"{key}: {min(values)!r} must be a positive number.")
         if max(self.models.batch, default=1) > self.scenes:
             raise ConfigError(f"models.batch: {max(self.models.batch)} scenes at once of {self.scenes} scenes in all.")
-
-
-_SECTIONS = {"measures": Measures, "timing": Timing, "models": ModelSettings} | {
-    "simulator": SimulatorSettings, "floors": Floors,
-}  # fmt: skip
 
 
 def default_sweep_text() -> str:
@@ -150,18 +142,10 @@ def read_sweep(text: str, where: str) -> Sweep:
         where: Name of the file, for errors.
 
     Raises:
+        DataError: if it is not plain YAML.
         ConfigError: naming the key that is unknown or wrong.
     """
-    try:
-        plain = yaml.safe_load(text) or {}
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} is not YAML: {error}") from error
-    entries = section_entries(Sweep, plain, where)
-    for key, kind in _SECTIONS.items():
-        if key in entries:
-            entries[key] = from_section(kind, entries[key] or {}, f"{where}, {key}")
-    sweep: Sweep = from_section(Sweep, entries, where)
-    return sweep
+    return from_plain(Sweep, parse_yaml(text, where), where)
 
 
 def make_choices(

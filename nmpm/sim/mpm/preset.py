@@ -11,9 +11,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from nmpm._support.plain_data import from_plain
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.config import check, from_section, section_entries
+from nmpm.sim.config import check
 from nmpm.sim.gravity import draw_gravity
 from nmpm.sim.initial_state import InitialState
 from nmpm.sim.mpm.blocks import MpmBlockRanges
@@ -103,6 +104,7 @@ class MpmPreset(Preset):
         for key in ("domain", "gravity"):
             check(len(getattr(self, key)) == self.dim, f"{key} = {getattr(self, key)} needs {self.dim} entries.")
         for low, high in self.box:
+            check(self.spacing < high - low, f"spacing = {self.spacing} must be less than the box's sides.")
             cells = (high - low) / self.cell_size
             check(
                 abs(cells - round(cells)) < 1e-6,
@@ -282,13 +284,8 @@ class MpmPreset(Preset):
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> MpmPreset:
-        entries = section_entries(cls, plain, "the preset")
-        entries["blocks"] = from_section(MpmBlockRanges, entries["blocks"], "blocks")
-        entries["materials"] = materials_from_section(entries["materials"])
-        if entries.get("ramps") is not None:
-            entries["ramps"] = from_section(RampRanges, entries["ramps"], "ramps")
-        preset: MpmPreset = from_section(cls, entries, "the preset")
-        return preset
+        read = {"materials": materials_from_section(plain["materials"])} if "materials" in plain else {}
+        return from_plain(cls, {**plain, **read}, "the preset")
 
 
 def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:

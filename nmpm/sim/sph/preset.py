@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from nmpm._support.plain_data import from_plain
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.config import check, from_section, section_entries
+from nmpm.sim.config import check
 from nmpm.sim.gravity import draw_gravity
 from nmpm.sim.initial_state import InitialState
 from nmpm.sim.preset import BOUNDARY, Preset
@@ -207,12 +208,7 @@ class SphPreset(Preset):
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> SphPreset:
-        entries = section_entries(cls, plain, "the preset")
-        sections = {"fluid": Fluid, "column": Column, "blocks": FluidBlocks, "obstacles": ObstacleRanges}
-        for key in sections.keys() & entries.keys():
-            entries[key] = from_section(sections[key], entries[key], key)
-        preset: SphPreset = from_section(cls, entries, "the preset")
-        return preset
+        return from_plain(cls, plain, "the preset")
 
 
 def _polygons_of(start: InitialState) -> tuple[PolygonObstacle, ...]:

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from nmpm._support.bounded_files import read_yaml
 from nmpm._support.messages import suggestion
-from nmpm._support.numbers import is_finite
+from nmpm._support.plain_data import from_plain
 from nmpm._support.shipped import find_config
 from nmpm.errors import ConfigError
 from nmpm.zoo.registry import check_name
@@ -49,10 +49,9 @@ class Extension:
     limit: float = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("hours", "rate", "gain", "limit"):
-            value = getattr(self, name)
-            if not is_finite(value) or (name != "gain" and value < 0):
-                raise ConfigError(f"extension: {name} = {value!r} should be a finite number, not below 0.")
+        for name in ("hours", "rate", "limit"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"extension: {name} = {getattr(self, name)} should not be below 0.")
         if self.gain >= 1:
             raise ConfigError(f"extension: gain = {self.gain} is a share, such as 0.03 for 3%.")
         if self.rate == 0:
@@ -90,13 +89,8 @@ class Dataset:
     def __post_init__(self) -> None:
         check_name(self.name)
         for name, value in (("hours", self.hours), ("goal", 1.0 if self.goal is None else self.goal)):
-            if not is_finite(value) or value <= 0:
-                raise ConfigError(f"{self.name}: {name} = {value!r} must be a positive number.")
-        if not isinstance(self.publish, bool):
-            raise ConfigError(f"{self.name}: publish = {self.publish!r} must be true or false.")
-        for name in ("options", "extend"):
-            if not isinstance(getattr(self, name), Mapping):
-                raise ConfigError(f"{self.name}: {name} must be keys of the configuration with their values.")
+            if value <= 0:
+                raise ConfigError(f"{self.name}: {name} = {value} must be a positive number.")
 
     def extended(self) -> Dataset:
         """The dataset as trainings see it that go on from its weights."""
@@ -155,20 +149,14 @@ class Plan:
                 is not in the file, or from itself.
             DataError: if it cannot be read.
         """
-        content = read_yaml(path)
-        try:
-            datasets = tuple(Dataset(**entry) for entry in content["datasets"])
-            extension = Extension(**content.get("extension", {}))
-        except (KeyError, TypeError) as error:
-            raise ConfigError(f"{path}: {error}; see the comments in the queue.yaml that comes with nmpm.") from error
-        names = [dataset.name for dataset in datasets]
+        plan = from_plain(cls, read_yaml(path), str(path))
+        names = [dataset.name for dataset in plan.datasets]
         twice = sorted({name for name in names if names.count(name) > 1})
-        unknown = sorted(set(content) - {"datasets", "extension"})
-        if twice or unknown:
-            raise ConfigError(f"{path}: {', '.join(twice or unknown)}: {'occurs twice' if twice else 'unknown key'}.")
-        for dataset in datasets:
+        if twice:
+            raise ConfigError(f"{path}: {', '.join(twice)}: occurs twice.")
+        for dataset in plan.datasets:
             _check_start(path, dataset, names)
-        return cls(datasets, extension)
+        return plan
 
     def with_data(self, folders: Mapping[str, str]) -> Plan:
         """The plan with the folders of recorded data, by the datasets' names.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nmpm.errors import ConfigError
+from nmpm.errors import NmpmError
 from nmpm.evaluation.trade import Sweep, default_sweep_text, read_sweep
 
 
@@ -21,14 +21,14 @@ def test_what_a_sweep_leaves_out_is_as_shipped():
         ("scene: 3", r"mine.yaml: unknown scene; keys: floors, measures"),
         ("simulator: {substep: [1]}", r"mine.yaml, simulator: unknown substep"),
         ("models: {batch: [0]}", r"models.batch: 0 must be a positive number"),
-        ("models: {batch: 8}", r"models.batch: 8 must be a list"),
+        ("models: {batch: 8}", r"mine.yaml, models: batch = 8 should be a list, each a whole number"),
         ("models: {batch: [64]}", r"models.batch: 64 scenes at once of 20"),
         ("trivial: [flying]", r"trivial: flying; there are nothing moves, free fall"),
         ("timing: {rounds: 0}", r"rounds = 0"),
-        ("{", r"mine.yaml is not YAML"),
-        ("[1, 2]", r"mine.yaml must map keys to values"),
+        ("{", r"mine.yaml cannot be read"),
+        ("[1, 2]", r"mine.yaml should hold keys and values"),
     ],
 )
 def test_mistakes_are_named(text, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(NmpmError, match=message):
         read_sweep(text, "mine.yaml")

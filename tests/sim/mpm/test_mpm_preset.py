@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 from nmpm.sim import load_preset, preset_from_dict
 
 GOOP = load_preset("goop")
@@ -73,7 +73,7 @@ def test_a_missing_preset_names_the_shipped_ones():
 
 def test_a_broken_file_is_named(tmp_path):
     (tmp_path / "broken.yaml").write_text("frames: [1,")
-    with pytest.raises(ConfigError, match=r"broken\.yaml"):
+    with pytest.raises(DataError, match=r"broken\.yaml"):
         load_preset(tmp_path / "broken.yaml")
 
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from nmpm._support.plain_data import from_plain
 from nmpm.errors import ConfigError
-from nmpm.sim.config import from_section
 from nmpm.sim.mpm.materials.base import Material
 from nmpm.sim.mpm.materials.goop import Goop
 from nmpm.sim.mpm.materials.sand import Sand
@@ -26,4 +26,4 @@ def materials_from_section(section: Any) -> tuple[Material, ...]:
     unknown = sorted(set(section) - set(MATERIALS))
     if unknown:
         raise ConfigError(f"Unknown material {', '.join(map(str, unknown))}; known are {', '.join(MATERIALS)}.")
-    return tuple(from_section(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())
+    return tuple(from_plain(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())
