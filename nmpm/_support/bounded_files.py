@@ -29,7 +29,7 @@ for _kind in (_Loader, _Dumper):
         "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
     )
 _LOADER = _Loader
-_CONTROL = re.compile(r"[^\n\r\t\x20-\x7e\xa0-\U0010ffff]")
+_CONTROL = re.compile(r"[^\n\r\t\x20-\x7e\xa0-\ud7ff\ue000-\U0010ffff]")
 _NUMBER = re.compile(r"[-+0-9_.:eE]+")
 
 
@@ -126,7 +126,7 @@ def check_yaml(text: str) -> None:
 
 
 def check_characters(value: object, path: Path | str) -> None:
-    """Refuse control characters but line breaks and tabs, which would reach the terminal of whoever prints the text.
+    """Refuse control characters but line breaks and tabs, as they reach terminals, and halves of characters.
 
     Args:
         value: Text, or lists and mappings of it; other values are left out.

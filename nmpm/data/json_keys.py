@@ -22,7 +22,7 @@ class JsonKeys:
 
     _REQUIRED = object()
 
-    def __init__(self, path: Path, plain: dict[str, Any]) -> None:
+    def __init__(self, path: Path | str, plain: dict[str, Any]) -> None:
         self.path = path
         self.left = plain
 

@@ -34,7 +34,7 @@ from nmpm.data.json_keys import (
     parse_whole,
     vector_parser,
 )
-from nmpm.errors import DataError, NmpmError
+from nmpm.errors import DataError
 from nmpm.scene import Interval
 
 METADATA_FILE = "metadata.json"
@@ -197,18 +197,29 @@ def load_json(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise DataError(f"{path}: no such file. A dataset needs this file, with bounds, dt, dim and sequence_length.")
     try:
-        plain = json.loads(read_bounded(path, METADATA_BYTES).decode("utf-8-sig"))
-    except NmpmError:
-        raise
+        text = read_bounded(path, METADATA_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not valid JSON ({error}).") from error
+    return parse_json(text, path)
+
+
+def parse_json(text: str, where: Path | str) -> dict[str, Any]:
+    """The JSON object of a text.
+
+    Raises:
+        DataError: if it is not JSON, not an object, or too deep.
+    """
+    try:
+        plain = json.loads(text)
     except (ValueError, RecursionError, MemoryError) as error:
-        raise DataError(f"{path}: not valid JSON ({one_line(error)}).") from error
+        raise DataError(f"{where}: not valid JSON ({one_line(error)}).") from error
     if not isinstance(plain, dict):
-        raise DataError(f"{path}: expected a JSON object, found {type(plain).__name__}.")
-    _check_depth(plain, path)
+        raise DataError(f"{where}: expected a JSON object, found {type(plain).__name__}.")
+    _check_depth(plain, where)
     return plain
 
 
-def _check_depth(plain: Any, path: Path) -> None:
+def _check_depth(plain: Any, path: Path | str) -> None:
     level = [plain]
     for _ in range(TEXT_DEPTH):
         containers = [value for value in level if isinstance(value, list | dict)]
@@ -232,7 +243,7 @@ def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozense
     return types, keys.take("static_types", parse_ids, fallback.static if fallback else walls)
 
 
-def _warn_of_unused(path: Path, family: str, types: Mapping[int, str], others: Mapping[int, str]) -> None:
+def _warn_of_unused(path: Path | str, family: str, types: Mapping[int, str], others: Mapping[int, str]) -> None:
     """Warn where a file's own names of type ids are not those of the family that was given."""
     different = [f"{i} = {name}, not {others[i]}" for i, name in types.items() if others.get(i, name) != name]
     if different:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 
 from nmpm.data.fields import read_fields
 from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
 from nmpm.data.gravity import own_gravity
+from nmpm.data.predictions import read_prediction_facts
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -120,10 +120,7 @@ def _describe(
 ) -> tuple[Scene, dict[int, str], frozenset[int], str]:
     """Scene, names of type ids, static ids, label: from a rollout's own attributes, otherwise from metadata.json."""
     if "scene" in trajectory.attributes:
-        names = json.loads(trajectory.attributes["particle_types"])
-        static = frozenset(int(index) for index in trajectory.attributes["static_types"])
-        scene = Scene.from_dict(json.loads(trajectory.attributes["scene"]))
-        return scene, {int(index): name for index, name in names.items()}, static, "prediction"
+        return *read_prediction_facts(trajectory.attributes, split.path), "prediction"
     metadata = read_metadata(split.path.parent, family)
     label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
     return infer_scene(split.path.parent, family), dict(metadata.particle_types), metadata.static_types, label
