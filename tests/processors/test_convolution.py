@@ -30,17 +30,29 @@ def results_and_gradients(layer, grid, apply, precision):
     return [out.detach(), grid.grad, *(parameter.grad.clone() for parameter in layer.parameters())]
 
 
+def rounding_error(weight, precision):
+    """The error that a convolution may make, relative to its largest result: n roundings of random sign make √n of one.
+
+    In float32 each product is added with a rounding. In bfloat16 products are added in float32 over the channels, but on
+    processors without instructions for it torch rounds and adds those sums in bfloat16, once per cell of the kernel.
+    """
+    cells = weight[0, 0].numel()
+    roundings = cells if precision == torch.bfloat16 else cells * max(weight.shape[:2])
+    return torch.finfo(precision).eps / 2 * roundings**0.5
+
+
 def assert_as_in_double(layer, grid, apply, precision):
-    """Everything agrees with the same in float64, which has loops of its own."""
+    """Everything agrees with the same in float64, which has loops of its own, to `rounding_error`."""
     for tensor in layer.state_dict().values():
         tensor.copy_(tensor.bfloat16())
     grid = grid.bfloat16().float()
     fill_freed_memory()
     found = results_and_gradients(layer, grid, apply, precision)
     expected = results_and_gradients(layer.double(), grid.double(), apply, torch.float64)
+    tolerance = rounding_error(next(layer.parameters()), precision)
     for one, other in zip(found, expected, strict=True):
         assert one.shape == other.shape
-        assert (one - other).abs().max() <= 0.02 * other.abs().max() + 1e-6, grid.shape
+        assert (one - other).abs().max() <= tolerance * other.abs().max(), grid.shape
 
 
 @pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
@@ -67,9 +79,9 @@ def test_few_patches_are_taken_and_returned_as_in_double_precision(dim, precisio
         assert_as_in_double(back, coarse, lambda layer, grid: return_patches(layer, grid, 4), precision)
 
 
-@pytest.mark.parametrize("channels", [8, 12])
-@pytest.mark.parametrize("kernel", [3, 5])
-def test_three_dimensions_of_one_cell_are_convolved_as_in_double_precision(kernel, channels):
+@pytest.mark.parametrize("channels", [8, 12, CHANNELS])
+@pytest.mark.parametrize("kernel", [3, 5, 7])
+def test_three_dimensions_of_few_cells_are_convolved_as_in_double_precision(kernel, channels):
     for cells in product((1, 2, 3), (1, 2, 6), (1, 3, 6)):
         torch.manual_seed(0)
         layer = Convolution(channels, channels, kernel, (False,) * 3)
