@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -36,6 +37,7 @@ from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.callbacks.threads import Threads
 from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.compatibility import check_same_recipe
+from nmpm.training.lost_rank import LostRankError, is_lost_connection, lost_rank
 from nmpm.training.module import OVERALL, EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.precision import fitting_precision
@@ -70,7 +72,7 @@ class EmulatorCLI(LightningCLI):
     """
 
     def __init__(self, command: str, note: str, locks: list[int], **options: Any) -> None:
-        self.command, self.note, self.locks = command, note, locks
+        self.command, self.note, self.locks, self.parent = command, note, locks, os.getppid()
         self.replaced_precision = ""
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
@@ -253,7 +255,12 @@ class EmulatorCLI(LightningCLI):
         return content
 
     def fit(self, **options: Any) -> None:
-        """Train, then test the best weights; an interruption says how to go on."""
+        """Train, then test the best weights; an interruption, or the end of another rank, says how to go on.
+
+        Raises:
+            KeyboardInterrupt: at SIGINT and SIGTERM.
+            LostRankError: if another rank has ended.
+        """
         try:
             self.trainer.fit(**options)
             self._test_best_weights()
@@ -263,6 +270,11 @@ class EmulatorCLI(LightningCLI):
             if self.trainer.is_global_zero:
                 raise KeyboardInterrupt(self._how_to_go_on()) from None
             raise SystemExit(130) from None
+        except RuntimeError as error:
+            if not is_lost_connection(error):
+                raise
+            lost = lost_rank(self.trainer, self.parent)
+            raise LostRankError(f"{lost}: {self._how_to_go_on()}") if lost else SystemExit(1) from None
 
     def _how_to_go_on(self) -> str:
         last = self.run_folder.checkpoints["last"]

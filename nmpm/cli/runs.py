@@ -58,6 +58,27 @@ def expand_run(words: Sequence[str]) -> tuple[list[str], str]:
     return [command, "--config", str(run / CONFIG), *options, *implied], note
 
 
+def _take_first(options: list[str]) -> Path | None:
+    """Take the folder out of the words behind validate, test or predict."""
+    return Path(options.pop(0)) if options and not options[0].startswith("-") else None
+
+
+def _take_resumed(options: list[str]) -> Path | None:
+    """Take `--resume RUN` out of the words behind fit."""
+    if options and not options[0].startswith("-"):
+        raise UsageError(f"to go on with a run, call nmpm fit --resume {options[0]}.")
+    for at, (word, following) in enumerate(pairwise([*options, "-"])):
+        if word == "--resume":
+            if following.startswith("-"):
+                raise UsageError("--resume lacks the folder of a run, such as --resume runs/goop.")
+            del options[at : at + 2]
+            return Path(following)
+        if word.startswith("--resume="):
+            del options[at]
+            return Path(word.removeprefix("--resume="))
+    return None
+
+
 def _run_config(run: Path) -> Mapping[str, Any]:
     if run.is_file():
         raise ConfigError(f"{run} is a file: name the folder of a run, or give --config FILE {CHECKPOINT} {run}.")

@@ -1,9 +1,11 @@
 """Things that go wrong from outside, by really doing them."""
 
+import contextlib
 import hashlib
 import json
 import os
 import pickle
+import re
 import resource
 import signal
 import struct
@@ -99,30 +101,42 @@ def test_a_full_disk_ends_the_run_and_keeps_the_last_checkpoint(run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_lost_process_ends_the_others_and_the_run_goes_on_with_fewer(data):
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_lost_process_is_named_in_one_line_and_the_run_goes_on_with_fewer(data, lost):
     words = [*FIT, *data, "--trainer.max_steps", "100000", "--trainer.max_time", "00:00:05:00"]
     spread = ["--trainer.devices", "2", "--trainer.strategy", "ddp", "--trainer.val_check_interval", "100000"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    first = subprocess.Popen(
-        [sys.executable, "-m", "nmpm", *words, *spread],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    with Path("said").open("w") as said:
+        first = subprocess.Popen(
+            [sys.executable, "-m", "nmpm", *words, *spread],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        )
     last = Path("run/checkpoints/last.ckpt")
     try:
         wait_for(last.exists, first)
         (second,) = children(first.pid)
-        os.kill(second, signal.SIGKILL)
+        killed = (first.pid, second)[lost]
+        os.kill(killed, signal.SIGKILL)
         assert first.wait(timeout=120) != 0
+        end = time.monotonic() + 120
+        while not Path("said").read_text().endswith("\n") and time.monotonic() < end:
+            time.sleep(0.05)
     finally:
-        if first.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
             os.killpg(first.pid, signal.SIGKILL)
+    how = "was killed by SIGKILL" if lost else "has ended"
+    found = re.fullmatch(
+        rf"nmpm fit: rank {lost} \(process {killed}\) {how}: .*\. Go on with: nmpm (fit --resume run)\n",
+        Path("said").read_text(),
+    )
+    assert found
     steps = torch.load(last, weights_only=True)["global_step"]
     assert steps > 0
+    alone = ["--trainer.devices", "1", "--trainer.strategy", "auto"]
     more = ["--trainer.max_steps", str(steps + 2), "--trainer.max_time", "null", "--trainer.val_check_interval", "1"]
-    assert main([*FIT, *data, *more, "--ckpt_path", "last"]) == 0
+    assert main([*found[1].split(), *alone, *more]) == 0
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == steps + 2
 
 

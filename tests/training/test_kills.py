@@ -1,4 +1,4 @@
-"""Killed by -9 at any moment and resumed, a training leaves what an uninterrupted one leaves."""
+"""Killed by -9 at any moment, or moved, and resumed, a training leaves what an uninterrupted one leaves."""
 
 import functools
 import json
@@ -68,6 +68,8 @@ def kill_at(name: str, call: int) -> None:
 
 def run(folder: str, words: list[str], moment: tuple[str, int] | None = None) -> None:
     os.chdir(folder)
+    said = os.open("said.txt", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+    os.dup2(said, 1), os.dup2(said, 2)
     for name in ("write_animation", "write_snapshots"):  # which take most of the time
         setattr(import_module("nmpm.training.callbacks.report"), name, lambda *_: None)
     if moment:
@@ -123,3 +125,48 @@ def test_a_killed_training_goes_on_to_the_same_end(whole, tmp_path, moment):
     more = ["fit", "--resume", "run"] if (tmp_path / "run/checkpoints/last.ckpt").is_file() else words
     assert start(tmp_path, more) == 0
     assert outcome(tmp_path / "run") == outcome(whole / "run")
+
+
+@pytest.fixture
+def moved(whole, tmp_path):
+    """The folder of a copied run, whose best weights those of further steps do not reach."""
+    return Path(shutil.copytree(whole / "run", tmp_path / "moved"))
+
+
+def go_on(moved: Path, path: str) -> tuple[list[list[float]], str]:
+    """Two further steps; steps, MSE and overall error of each validation, and what was said."""
+    assert start(moved.parent, ["fit", "--resume", path, "--trainer.max_steps", "7"]) == 0
+    report = outcome(moved)["report"]
+    return report["curve"], " ".join((moved.parent / "said.txt").read_text().split())
+
+
+@pytest.mark.parametrize("path", ["moved", "link", "absolute"])
+def test_a_moved_run_keeps_its_best_weights(whole, moved, path):
+    (moved.parent / "link").symlink_to("moved")
+    best = (moved / "checkpoints/best.ckpt").read_bytes()
+    curve, said = go_on(moved, str(moved) if path == "absolute" else path)
+    errors = [error for _, _, error in curve]
+    assert min(errors) < min(errors[-2:])  # of the further steps
+    assert (moved / "checkpoints/best.ckpt").read_bytes() == best
+    assert f"Going on from step 5; best so far: valid/overall = {min(errors):.4g} (best.ckpt)." in said
+    assert outcome(moved)["report"]["weights"] == outcome(whole / "run")["report"]["weights"]
+
+
+@pytest.mark.parametrize("loss", ["deleted", "damaged"])
+def test_lost_best_weights_are_said_to_be_and_no_score_is_claimed_for_them(moved, loss):
+    best = moved / "checkpoints" / "best.ckpt"
+    os.truncate(best, 1000) if loss == "damaged" else best.unlink()
+    curve, said = go_on(moved, "moved")
+    assert "Going on from step 5 without the best weights so far: best.ckpt is not in" in said
+    assert ("best.ckpt cannot be read as a checkpoint" in said) == (loss == "damaged")
+    content = torch.load(best, weights_only=True)
+    steps = {step: error for step, _, error in curve}
+    assert content["global_step"] == min((6, 7), key=steps.__getitem__)
+
+
+def test_a_run_is_branched_into_a_folder_of_its_own_only(whole, moved):
+    shutil.copytree(moved, moved.parent / "other")
+    last = str(moved / "checkpoints/last.ckpt")
+    words = ["fit", "--resume", "other", "--ckpt_path", last]
+    assert start(moved.parent, words) == 1
+    assert "other already holds a run (best.ckpt)" in (moved.parent / "said.txt").read_text()

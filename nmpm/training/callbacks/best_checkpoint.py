@@ -38,7 +38,7 @@ class BestCheckpoint(ModelCheckpoint):
         if trainer.state.fn != TrainerFn.FITTING or not self.save_top_k or self.monitor is None:
             return
         step = int(checkpoint["global_step"])
-        self._take(trainer.strategy.broadcast(self._stored_scores() if trainer.is_global_zero else None))
+        self._take(trainer.strategy.broadcast(self._stored_scores() if trainer.is_global_zero else {}))
         state = checkpoint["callbacks"].get(self.state_key, {})
         if self.best_model_score is not None:
             file, score = Path(self.best_model_path).name, float(self.best_model_score)
@@ -71,7 +71,7 @@ class BestCheckpoint(ModelCheckpoint):
 
     def _stored_scores(self) -> dict[str, Tensor]:
         """Paths of the best checkpoints in the folder, and the scores that they state of themselves."""
-        scores = {}
+        scores: dict[str, Tensor] = {}
         for path in sorted(Path(str(self.dirpath)).glob(f"[!.]*{self.FILE_EXTENSION}")):
             try:
                 state = read_checkpoint(path).get("callbacks", {}).get(self.state_key, {})
