@@ -38,7 +38,9 @@ def limit_spinning(environment: MutableMapping[str, str] = os.environ) -> None:
 def stated_threads(option: int | None, environment: Mapping[str, str] = os.environ) -> int | None:
     """The number of threads that the user asks for, by an option or by OMP_NUM_THREADS; None without either."""
     stated = environment.get("OMP_NUM_THREADS", "").split(",")[0]
-    return option or (int(stated) if stated.isdigit() and int(stated) > 0 else None)
+    if option:
+        return int(option)  # (jsonargparse's is of a type of its own, which checkpoints must not hold)
+    return int(stated) if stated.isdigit() and int(stated) > 0 else None
 
 
 class ThreadChoice:

@@ -91,7 +91,9 @@ class _MeanOverParts(torch.autograd.Function):
             return mean.detach(), torch.autograd.grad(mean, weights, allow_unused=True)
 
         means, gradients = zip(*on_threads(compute, rows, threads), strict=True)
-        ctx.gradients = [_add(of_parts) for of_parts in zip(*gradients, strict=True)]
+        ctx.gradients = [
+            _add(weight, parts) for weight, parts in zip(weights, zip(*gradients, strict=True), strict=True)
+        ]
         return torch.stack(means).sum()
 
     @staticmethod
@@ -100,7 +102,12 @@ class _MeanOverParts(torch.autograd.Function):
         return *(None,) * 4, *(None if gradient is None else slope * gradient for gradient in ctx.gradients)
 
 
-def _add(gradients: Sequence[Tensor | None]) -> Tensor | None:
-    """The sum, in order, of those that there are."""
+def _add(weight: Tensor, gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum, in order, of those that there are, in the memory order of their weight."""
     given = [gradient for gradient in gradients if gradient is not None]
-    return torch.stack(given).sum(0) if len(given) > 1 else next(iter(given), None)
+    if not given:
+        return None
+    total = torch.zeros_like(weight)
+    for gradient in given:
+        total += gradient
+    return total

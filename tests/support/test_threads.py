@@ -3,6 +3,7 @@ import subprocess
 import sys
 
 import pytest
+from jsonargparse.typing import PositiveInt
 
 from nmpm._support.parallel import usable_cores
 from nmpm._support.threads import LOOK_AGAIN, LOOK_AGAIN_SHARE, SKIPPED, ThreadChoice, limit_spinning, stated_threads
@@ -60,6 +61,7 @@ def test_an_option_goes_before_the_environment_and_both_before_measuring():
     assert stated_threads(None, {"OMP_NUM_THREADS": "2,1"}) == 2
     assert stated_threads(None, {"OMP_NUM_THREADS": "many"}) is None
     assert stated_threads(None, {}) is None
+    assert type(stated_threads(PositiveInt(3), {})) is int
 
 
 def test_a_waiting_policy_of_the_users_is_kept():
