@@ -192,6 +192,8 @@ class EmulatorCLI(LightningCLI):
             DataError: if the checkpoint cannot be read.
         """
         check_endless_batches(self.trainer)
+        for logger in self.trainer.loggers:
+            check_folder("The logger's save_dir", Path(logger.save_dir or "."))
         check_disk(self.trainer, self.model)
         resumed = self._load_checkpoint()
         if resumed is not None:
@@ -287,7 +289,7 @@ class EmulatorCLI(LightningCLI):
     def _test_best_weights(self) -> None:
         """Validate the last weights too, if no validation has, and test the best ones, once.
 
-        Where validations are turned off, the last weights are tested; where there is no test split, the report says so.
+        Where validations are turned off, the last weights are tested; without a test, the report says why.
         """
         best = self._saver(BestCheckpoint)
         if best.monitor and self.trainer.limit_val_batches and best.scored_step < self.trainer.global_step:
@@ -297,11 +299,13 @@ class EmulatorCLI(LightningCLI):
         path = Path(best.best_model_path or self.run_folder.checkpoints["last"])
         if path.is_file():
             self.model.load_state_dict(read_checkpoint(path)["state_dict"])
-        if self.datamodule.has_test:
-            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+        untested = "" if self.trainer.limit_test_batches else "--trainer.limit_test_batches is 0."
+        if not self.datamodule.has_test:
+            untested = f"{self.datamodule.data_source.folder} has no test.h5."
+        if untested:
+            self.report.report_untested(self.trainer, self.model, untested)
         else:
-            reason = f"{self.datamodule.data_source.folder} has no test.h5."
-            self.report.report_untested(self.trainer, self.model, reason)
+            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
 
     def _saver(self, kind: type[T]) -> T:
         return next(callback for callback in self.trainer.checkpoint_callbacks if isinstance(callback, kind))

@@ -13,6 +13,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from nmpm._support.collectives import broadcast_from_rank0
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.particles import Window
 from nmpm.training.budget import reserve_time, seconds_left, total_steps, validation_interval
 from nmpm.training.module import EmulatorModule
 
@@ -39,12 +40,13 @@ class Forecast(Callback):
     def __init__(self) -> None:
         self._seconds: list[float] = []  # of the steps measured
         self._step, self._since = -1, math.nan
-        self._validation_start = math.nan
-        self._frame_seconds: float | None = None  # of a frame of one trajectory in an evaluation by one process
+        self._batch_start = math.nan
+        # Seconds of a frame of one trajectory in an evaluation by one process: estimated, and of each batch measured.
+        self._estimate: float | None = None
+        self._measured: list[float] = []
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self._seconds, self._step, self._since = [], trainer.global_step, math.nan
-        self._frame_seconds = None
 
     def on_train_batch_end(
         self,
@@ -65,26 +67,42 @@ class Forecast(Callback):
             self._decide(trainer, pl_module, broadcast_from_rank0(pace, trainer.strategy.root_device))
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        self._since, self._validation_start = math.nan, time.monotonic()
+        self._since = math.nan
         data = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         if isinstance(data, TrajectoryDataModule) and data.validated is None and not trainer.sanity_checking:
             data.validated = len(data.data_source.recordings("valid"))  # a resumed training keeps to it
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        frames = _frames(trainer.val_dataloaders, trainer.num_val_batches)
-        if frames and not trainer.sanity_checking:
-            self._frame_seconds = (time.monotonic() - self._validation_start) / frames
+    def on_validation_batch_start(self, *_: Any) -> None:
+        self._batch_start = time.monotonic()
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,  # noqa: ARG002
+        pl_module: LightningModule,  # noqa: ARG002
+        outputs: Any,  # noqa: ARG002
+        batch: Window,
+        batch_idx: int,  # noqa: ARG002
+        dataloader_idx: int = 0,  # noqa: ARG002
+    ) -> None:
+        scenes, frames = batch.target.shape[:2]
+        if scenes:
+            self._measured.append((time.monotonic() - self._batch_start) / (scenes * frames))
+
+    @property
+    def _frame_seconds(self) -> float | None:
+        later = self._measured[1:]  # kernels compile in the first
+        return statistics.fmean(later) if later else self._estimate
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        frames = _frames(trainer.test_dataloaders, trainer.num_test_batches)
-        if not frames or self._frame_seconds is None or not isinstance(pl_module, EmulatorModule):
-            return
+        loader = trainer.test_dataloaders
+        if self._step < 0 or not isinstance(loader, EvaluationLoader) or not isinstance(pl_module, EmulatorModule):
+            return  # no training came before, or another kind
+        split, batches = loader.recordings.split, loader.batches[: int(trainer.num_test_batches[0])]
+        frames = sum(split.frames(index) - 2 for batch in batches for index in batch)
+        takes = f" takes about {_clock(frames * self._frame_seconds)}" if self._frame_seconds else ""
         slow = [type(metric).__name__ for metric in pl_module.test_errors.of_model if not metric.cheap]
         more = f", and the time of {', '.join(slow)}" if slow else ""
-        pl_module.print(
-            f"The closing test takes about {_clock(frames * self._frame_seconds)}{more}"
-            " (--trainer.limit_test_batches N shortens it)."
-        )
+        pl_module.print(f"The closing test{takes or ' follows'}{more} (--trainer.limit_test_batches N shortens it).")
 
     def _decide(self, trainer: Trainer, module: LightningModule, pace: float) -> None:
         """Bound the validations of a training with a pace in seconds per step, and say what fits into its time."""
@@ -92,8 +110,7 @@ class Forecast(Callback):
         if not isinstance(module, EmulatorModule) or not isinstance(data, TrajectoryDataModule):
             return
         windows = data.batch_size * trainer.accumulate_grad_batches
-        if self._frame_seconds is None:
-            self._frame_seconds = pace / (PASSES * windows * module.emulator.frames * module.unroll)
+        self._estimate = pace / (PASSES * windows * module.emulator.frames * module.unroll)
         interval, total = validation_interval(trainer, pace), total_steps(trainer)
         validation = self._bound_validations(trainer, data, module, pace, interval)
         available = seconds_left(trainer)
@@ -105,8 +122,8 @@ class Forecast(Callback):
             module.print(
                 f"At {pace:.2g} s a step, max_time ends this training after about {int(reached)} of {int(total)} steps,"
                 " validations included. The learning rate comes down in time for that, but fewer steps mean a larger"
-                f" error. For all of them: --trainer.max_time {_as_option(needed + elapsed)}; for more: end other"
-                " programs, use a GPU, or a smaller model (--model.processor, --model.cells, --model.unroll)."
+                f" error. For all of them: --trainer.max_time {_as_option(needed + elapsed)}; for faster steps: end"
+                " other programs, use a GPU, or a smaller model (--model.processor, --model.cells, --model.unroll)."
             )
 
     def _bound_validations(
@@ -133,14 +150,6 @@ class Forecast(Callback):
             f" {share:.0%} of the training's time: they use the first {few} (--data.limit_eval sets another number)."
         )
         return seconds * sum(frames[:few]) / sum(frames)
-
-
-def _frames(loader: object, batches: list[int | float]) -> int:
-    """Frames that an evaluation predicts in this process; 0 for a foreign loader."""
-    if not isinstance(loader, EvaluationLoader):
-        return 0
-    split = loader.recordings.split
-    return sum(split.frames(index) - 2 for batch in loader.batches[: int(batches[0])] for index in batch)
 
 
 def _clock(seconds: float) -> timedelta:
