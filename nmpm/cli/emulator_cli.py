@@ -134,7 +134,8 @@ class EmulatorCLI(LightningCLI):
         for saver in ("checkpoint", "resume"):
             folder = Path(trainer["default_root_dir"]) / CHECKPOINTS
             config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
-            check_folder(f"--{saver}.dirpath", Path(config[saver]["dirpath"]))
+            if self.subcommand == "fit":
+                check_folder(f"--{saver}.dirpath", Path(config[saver]["dirpath"]))
         optimizer = config["model"].get("optimizer")
         if isinstance(optimizer, dict) or hasattr(optimizer, "get"):
             check_learning_rate((optimizer.get("init_args") or {}).get("lr"))

@@ -100,6 +100,14 @@ def test_a_field_is_carried_along_by_its_particles_to_the_bit():
     assert torch.equal(predicted.fields["temperature"], expected)
 
 
+def test_a_rollout_of_no_scene_has_none():
+    scene = box(evolving=("temperature",))
+    particles = with_fields(cloud(scene))
+    predicted = predict_rollout(small(scene), particles.scenes(slice(0)), 5)
+    assert predicted.position.shape == (0, 5, *particles.position.shape[1:])
+    assert predicted.fields["temperature"].shape == (0, 5, particles.position.shape[1])
+
+
 def test_a_uniform_rate_adds_up_over_frames_and_bundles():
     scene = box(evolving=("temperature",))
     emulator = constant_rate(small(scene), 0.5)
