@@ -3,10 +3,10 @@
 python benchmarks/kills.py --rounds 20
 
 A round starts a tiny run in a new folder, kills its process at a moment drawn uniformly from the duration of an
-uninterrupted run, and runs the command again until it ends by itself; a fit goes on with
-`--ckpt_path last` where there is such a checkpoint, and starts over where there is none. Then all files of a dataset
-must have the same bytes, and the best and last checkpoints of a fit the same weights, as those of the uninterrupted
-run. Kills that come too late are drawn again. Processes are forked after the imports, so that no kill falls into those.
+uninterrupted run, and runs the command again until it ends by itself; a fit goes on by `nmpm fit --resume` where there
+is a last checkpoint, and starts over where there is none. Then all files of a dataset must have the same bytes, the
+best and last checkpoints of a fit the same weights, and its report the same figures, as those of the uninterrupted run.
+Kills that come too late are drawn again. Processes are forked after the imports, so that no kill falls into those.
 The exit status is 1 if a round differs.
 """
 
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 import multiprocessing
 import os
 import random
@@ -88,10 +89,11 @@ def training(data: Path) -> Task:
     """Trains on a dataset."""
 
     def command(out: Path) -> list[str]:
-        words = [*FIT, str(data), "--trainer.default_root_dir", str(out)]
-        return [*words, "--ckpt_path", "last"] if last(out).is_file() else words
+        if last(out).is_file():
+            return ["fit", "--resume", str(out)]
+        return [*FIT, str(data), "--trainer.default_root_dir", str(out)]
 
-    return Task(command, lambda out: digest(weights(out)), lambda out: last(out).is_file())
+    return Task(command, lambda out: digest([*weights(out), figures(out)]), lambda out: last(out).is_file())
 
 
 def kill_rounds(name: str, task: Task, root: Path, rounds: int, draw: random.Random) -> bool:
@@ -161,6 +163,13 @@ def weights(out: Path) -> list[bytes]:
     states = [torch.load(out / "checkpoints" / f"{name}.ckpt", weights_only=True)["state_dict"] for name in
               ("best", "last")]  # fmt: skip
     return [values.numpy().tobytes() for state in states for values in state.values()]
+
+
+def figures(out: Path) -> bytes:
+    """All figures of the report but times."""
+    report = json.loads((out / "report.json").read_text())
+    del report["training"]["seconds"]
+    return json.dumps(report | {"curve": [errors for _, *errors in report["curve"]]}).encode()
 
 
 def digest(parts: Iterable[bytes]) -> str:

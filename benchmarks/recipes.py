@@ -73,11 +73,8 @@ class Run:
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """The newest configuration that the run was started with."""
-        configs = sorted(self.folder.glob("logs/version_*/config.yaml"), key=lambda path: path.stat().st_mtime)
-        if not configs:
-            raise FileNotFoundError(f"{self.folder} holds no run of nmpm fit: logs/version_*/config.yaml is missing.")
-        return dict(yaml.safe_load(configs[-1].read_text(encoding="utf-8")))
+        """The configuration that the run was started or last gone on with."""
+        return dict(yaml.safe_load((self.folder / "config.yaml").read_text(encoding="utf-8")))
 
     @cached_property
     def report(self) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from nmpm import Zoo
+from nmpm._support.shipped import find_config
 from nmpm.cli import main
 
 ROOT = Path(__file__).parent.parent
@@ -136,6 +137,11 @@ def test_options_of_commands_exist(words, capsys, monkeypatch):
 @pytest.mark.parametrize("words", [w for w in commands() if w[1] in TRAINING], ids=" ".join)
 def test_configurations_of_trainings_are_valid(words, make_dataset, workplace, capsys):
     make_dataset().rename(workplace / "honey")
+    run = workplace / "runs" / "goop"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.yaml").write_text(find_config("goop.yaml").read_text("utf-8"), "utf-8")
+    for name in ("best.ckpt", "last.ckpt"):
+        (run / "checkpoints" / name).touch()
     given = [str(workplace / "honey") if word in RECORDED else word for word in words[1:]]
     with contextlib.suppress(SystemExit):
         main([*given, *([] if "--print_config" in given else ["--print_config"])])

@@ -39,7 +39,7 @@ commands:
 
 first steps:
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
-  nmpm fit --config goop.yaml --ckpt_path last go on after an interruption
+  nmpm fit --resume runs/goop                  go on after an interruption
   nmpm inspect FOLDER                          summarise recorded data of any format known
   nmpm fit --config waterdrop.yaml --data.path FOLDER
                                                train on recorded data

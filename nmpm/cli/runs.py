@@ -52,7 +52,7 @@ def expand_run(words: Sequence[str]) -> tuple[list[str], str]:
     given = {word.partition("=")[0] for word in options}
     implied = [] if ROOT in given else [ROOT, str(run)]
     if CHECKPOINT not in given:
-        implied += [CHECKPOINT, str(_find_checkpoint(run, config, checkpoints))]
+        implied += [CHECKPOINT, str(_find_checkpoint(run, config, savers))]
     changes = "; ".join(_changes(options, config))
     note = f"Run: {run}{f', changed: {changes}' if changes else ''}.\n"
     return [command, "--config", str(run / CONFIG), *options, *implied], note

@@ -18,8 +18,10 @@ INDENT, WIDTH = 30, 100
 
 _TEXT = """\
 usage: nmpm {command} --config FILE [--SECTION.KEY VALUE ...]
+       nmpm {command} {run} [--SECTION.KEY VALUE ...]
 
 {summary}
+RUN is the folder of a run, which holds its configuration; it may have been moved or copied.
 Options replace what the configuration says, and later --config files what earlier ones say. What
 none of them says has the default that --help_all shows.
 
@@ -51,17 +53,17 @@ more:
 _EXAMPLES = {
     "fit": """\
   nmpm fit --config goop.yaml                           simulate data, train, test, draw
-  nmpm fit --config goop.yaml --ckpt_path last          go on after an interruption
+  nmpm fit --resume runs/goop                           go on after an interruption
   nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
   nmpm fit --config waterdrop.yaml --data.path FOLDER   train on recorded data""",
     "validate": """\
-  nmpm validate --config goop.yaml --ckpt_path best     after nmpm fit --config goop.yaml""",
+  nmpm validate runs/goop                               its best weights""",
     "test": """\
-  nmpm test --config goop.yaml --ckpt_path best         after nmpm fit --config goop.yaml
-  nmpm test --config goop.yaml --ckpt_path best --data.path FOLDER
-                                                        on other scenes""",
+  nmpm test runs/goop                                   its best weights
+  nmpm test runs/goop --ckpt_path last                  its last ones
+  nmpm test runs/goop --data.path FOLDER                on other scenes""",
     "predict": """\
-  nmpm predict --config goop.yaml --ckpt_path best      after nmpm fit --config goop.yaml""",
+  nmpm predict runs/goop                                its best weights""",
 }
 _OPTIONS = {
     "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
@@ -89,7 +91,8 @@ def training_help(command: str, summary: str) -> str:
     """
     own = {group: "\n".join(_entries(dict(_described(group)))) for group in SIGNATURES}
     shared = {"options": "\n".join(_entries(_OPTIONS)), "trainer": "\n".join(_entries(_TRAINER))}
-    return _TEXT.format(command=command, summary=summary, examples=_EXAMPLES[command], **shared, **own)
+    run = "--resume RUN" if command == "fit" else "RUN"
+    return _TEXT.format(command=command, run=run, summary=summary, examples=_EXAMPLES[command], **shared, **own)
 
 
 def _described(group: str) -> Iterator[tuple[str, str]]:

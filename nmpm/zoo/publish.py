@@ -105,7 +105,7 @@ def _publish(run: Path, name: str, target: Path, about: str, keep: Keep | None =
             raise ZooError(f"{run} is not a finished run: {needed} is missing. Let `nmpm fit` end with its test.")
     figures = _read_json(report)
     if figures.get("weights", digest := _digest(checkpoint)) != digest:
-        raise ZooError(f"{report} is of other weights than {checkpoint}: test these by `nmpm test --ckpt_path best`.")
+        raise ZooError(f"{report} is of other weights than {checkpoint}: test these by `nmpm test {run}`.")
     emulator = _rounded(checkpoint)
     weights = serialise(emulator)
     files = [path for path in (run / file for file in COPIED) if path.is_file()]

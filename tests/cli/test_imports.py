@@ -32,6 +32,9 @@ def test_a_command_leaves_alone_what_it_does_not_need(words, unwanted, tmp_path)
     assert done.stdout.splitlines()[-1] == "imported []"
 
 
+GOOP, TRAINING = ["fit", "--config", "goop.yaml"], ("fit", "validate", "test", "predict")
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -42,13 +45,26 @@ def test_a_command_leaves_alone_what_it_does_not_need(words, unwanted, tmp_path)
         (["--data.path", "nowhere"], "--data.path nowhere: there is no such dataset."),
         (["--data.name", "lava"], "No embedded dataset is called 'lava'"),
         (["--ckpt_path=nowhere.ckpt"], "--ckpt_path nowhere.ckpt: there is no such checkpoint."),
+        (["test", "nowhere"], "nmpm test: nowhere: there is no such folder."),
+        (["predict", "mine.yaml"], "mine.yaml is a file: name the folder of a run"),
+        (["validate", "."], ". is not the folder of a run: there is no config.yaml in it."),
+        (
+            ["test", "run"],
+            "no run/checkpoints/best.ckpt or run/checkpoints/last.ckpt; checkpoints there: none.",
+        ),
+        (["fit", "--resume=run"], "run: there is no run/checkpoints/last.ckpt; checkpoints there: none."),
+        (["fit", "--resume"], "--resume lacks the folder of a run"),
+        (["fit", "run"], "to go on with a run, call nmpm fit --resume run."),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_common_mistakes_are_found_before_torch_and_lightning_are_imported(words, complaint, tmp_path):
     (tmp_path / "mine.yaml").write_text("model: {cels: 3}\n")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text("model: {cells: 3}\n")
+    words = words if words[0] in TRAINING else [*GOOP, *words]
     script = (
-        f"import sys; from nmpm.cli import main; assert main({['fit', '--config', 'goop.yaml', *words]!r}); "
+        f"import sys; from nmpm.cli import main; assert main({words!r}); "
         "print('imported', sorted({'torch', 'lightning'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)

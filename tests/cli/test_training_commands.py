@@ -214,7 +214,7 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]) == 0
     assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data]) == 1
-    assert "--ckpt_path last" in capsys.readouterr().err
+    assert "nmpm fit --resume run" in capsys.readouterr().err
     changed = ["--model.processor.width", "8", "--ckpt_path", "last"]
     for command in ("fit", "test"):
         assert main([command, "--config", "waterdrop.yaml", *TINY, *data, *changed]) == 1
@@ -309,7 +309,7 @@ def test_an_untrained_model_is_not_judged(command, capsys):
     assert said.out == ""
     assert said.err == (
         f"nmpm {command}: --ckpt_path is missing, so the model would be an untrained one: give best or last, of"
-        " runs/goop, or a checkpoint's file.\n"
+        f" runs/goop, or a checkpoint's file; or call nmpm {command} RUN, with the folder of a run.\n"
     )
 
 

@@ -33,7 +33,7 @@ def results_and_gradients(layer, grid, apply, precision):
 def rounding_error(weight, precision):
     """The error that a convolution may make, relative to its largest result: n roundings of random sign make √n of one.
 
-    In float32 each product is added with a rounding. In bfloat16 products are added in float32 over the channels, but on
+    In float32 each product is added with a rounding. In bfloat16 products are added in float32 over channels, but on
     processors without instructions for it torch rounds and adds those sums in bfloat16, once per cell of the kernel.
     """
     cells = weight[0, 0].numel()

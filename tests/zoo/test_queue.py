@@ -758,7 +758,7 @@ def test_the_queue_slows_a_diverging_training_down(queue, monkeypatch, capsys, d
     assert capsys.readouterr().out.count("has diverged") == min(divergences, 3)
     assert rates[1:] == [3e-3, 1.5e-3, 0.75e-3][: len(rates) - 1]
     if done:
-        configuration = yaml.safe_load(next(Path("runs/small/1/logs").glob("*/config.yaml")).read_text())
+        configuration = yaml.safe_load(Path("runs/small/1/config.yaml").read_text())
         assert configuration["model"]["optimizer"]["init_args"]["lr"] == 3e-3
 
 
