@@ -245,8 +245,8 @@ def _check_constraints(emulator: Emulator) -> None:
     if constraints.solids and emulator.scene.obstacles:
         raise ConfigError(
             "constraints.solids cannot be exported: contact with obstacles splits paths into as many pieces as the"
-            " fastest particle needs, and a program has a fixed number. Export with --free (constraints: solids: false,"
-            " as `nmpm.Constraints(solids=False)`), or roll out in Python."
+            " fastest particle needs, and a program has a fixed number. Export with --free, or in Python"
+            " `emulator.with_constraints(nmpm.emulator.constraints.Constraints(solids=False))`."
         )
     if constraints.bounds == "error":
         raise ConfigError(
