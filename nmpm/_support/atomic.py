@@ -42,12 +42,19 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     Creates the folder if it does not exist. Readers of `path` see the old file or the complete new one; after an
     exception the temporary file is deleted and `path` is unchanged.
+
+    Raises:
+        OSError: naming `path` where the system names no file, as on a full disk, or the temporary one.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_path(path)
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary), temporary):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -60,5 +60,5 @@ def replace_picture(path: Path) -> Iterator[Path]:
             yield temporary
     except OSError as error:
         # The encoder's message continues with its whole command line.
-        reason = str(error).partition("\n")[0]
+        reason = error.strerror or str(error).partition("\n")[0]
         raise DataError(f"Cannot write {path}: {reason}. The file was left as it was before.") from error

@@ -1,5 +1,6 @@
 """Files and folders appear whole or not at all."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -134,3 +135,14 @@ def test_a_file_is_old_or_new(tmp_path):
     with pytest.raises(TypeError), atomic_write(tmp_path / "deep" / "one") as part:
         part.touch() or part.write_text(None)
     assert files_of(tmp_path) == {"deep/one": "first"}
+
+
+def test_a_full_disk_is_told_of_the_file_and_leaves_no_half_of_it(tmp_path):
+    def fill_disk(path):
+        with atomic_write(path) as part:
+            part.write_text("half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as the system does: of no file
+
+    with pytest.raises(OSError, match=r"No space left on device: '.*/one.onnx'"):
+        fill_disk(tmp_path / "one.onnx")
+    assert not files_of(tmp_path)

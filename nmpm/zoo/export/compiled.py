@@ -6,6 +6,7 @@ They read inputs as contiguous tensors and do not check: call `contiguous()` on 
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -34,16 +35,19 @@ def write_compiled(part: Part, metadata: Mapping[str, str], path: Path) -> None:
     check_compiler()
     exported = program(part)
     settings = {"aot_inductor.metadata": dict(metadata)}
-    with atomic_write(path) as temporary:
+    # Compiled elsewhere: torch crashes where its package cannot be written.
+    with atomic_write(path) as temporary, tempfile.TemporaryDirectory() as folder:
+        package = Path(folder) / path.name
         try:
             with torch.no_grad():
-                _inductor.aoti_compile_and_package(exported, package_path=str(temporary), inductor_configs=settings)
+                _inductor.aoti_compile_and_package(exported, package_path=str(package), inductor_configs=settings)
         except Exception as error:  # the compiler's own among them
             recipe = type(part.emulator.recipe.processor).__name__
             raise ConfigError(
                 f"AOTInductor cannot compile the model with its {recipe} ({type(error).__name__}: {first_line(error)})."
                 " --format onnx needs no compiler."
             ) from error
+        temporary.write_bytes(package.read_bytes())
 
 
 def run_compiled(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
