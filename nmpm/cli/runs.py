@@ -31,23 +31,11 @@ def expand_run(words: Sequence[str]) -> tuple[list[str], str]:
         UsageError: if `--resume` lacks the folder, or `nmpm fit` gets one without `--resume`.
         ConfigError: if the folder, its configuration or its checkpoint does not exist.
     """
-    command, *options = (
-        part for word in words for part in (word.split("=", 1) if word.startswith("--resume=") else [word])
-    )
-    if command == "fit":
-        if options and not options[0].startswith("-"):
-            raise UsageError(f"to go on with a run, call nmpm fit --resume {options[0]}.")
-        if "--resume" not in options:
-            return list(words), ""
-        at = options.index("--resume")
-        if at + 1 == len(options) or options[at + 1].startswith("-"):
-            raise UsageError("--resume lacks the folder of a run, such as --resume runs/goop.")
-        run, checkpoints = Path(options[at + 1]), ("resume",)
-        del options[at : at + 2]
-    elif options and not options[0].startswith("-"):
-        run, checkpoints = Path(options.pop(0)), ("checkpoint", "resume")
-    else:
+    command, *options = words
+    run = _take_resumed(options) if command == "fit" else _take_first(options)
+    if run is None:
         return list(words), ""
+    savers = ["resume"] if command == "fit" else ["checkpoint", "resume"]
     config = _run_config(run)
     given = {word.partition("=")[0] for word in options}
     implied = [] if ROOT in given else [ROOT, str(run)]

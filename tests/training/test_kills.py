@@ -21,14 +21,14 @@ FIT = [
     *("--model.cells", "8", "--model.processor.width", "2", "--model.processor.depth", "1"),
     *("--model.processor.perceptron", "[2]", "--model.optimizer.lr", "0.3", "--model.schedule.warmup", "0"),
     *("--trainer.accelerator", "cpu", "--trainer.precision", "32-true", "--trainer.enable_progress_bar", "false"),
-    *("--trainer.max_steps", "5", "--trainer.val_check_interval", "2", "--resume.every_n_train_steps", "3"),
+    *("--trainer.max_steps", "5", "--trainer.val_check_interval", "2", "--resume.every_n_train_steps", "2"),
 ]
 AVERAGING = {"class_path": "lightning.pytorch.callbacks.EMAWeightAveraging", "init_args": {"decay": 0.5}}
 SAVING = "nmpm.training.checkpoints:torch.save"
 BEST = "nmpm.training.callbacks.best_checkpoint:BestCheckpoint"
 LAST = "nmpm.training.callbacks.last_checkpoint:LastCheckpoint"
 MODULE = "nmpm.training.module:EmulatorModule"
-# Saved are last.ckpt before the first validation, best.ckpt and last.ckpt after it, last.ckpt at step 3, …
+# Saved are last.ckpt at step 2 and before its validation, best.ckpt and last.ckpt after it, …
 MOMENTS = {
     "when a step is over": (f"{LAST}.on_train_batch_end", 2),
     "before a validation": (f"{LAST}.on_validation_start", 1),
@@ -36,10 +36,10 @@ MOMENTS = {
     "in the second validation": (f"{MODULE}.validation_step", 2),
     "after a validation": (f"{BEST}.on_validation_end", 1),
     "after one that is not the best": (f"{BEST}.on_validation_end", 2),
-    "within last.ckpt before a validation": (SAVING, 1),
-    "within best.ckpt": (SAVING, 2),
+    "within last.ckpt before a validation": (SAVING, 2),
+    "within best.ckpt": (SAVING, 3),
     "between best.ckpt and last.ckpt": (f"{LAST}.on_validation_end", 1),
-    "within last.ckpt after a validation": (SAVING, 3),
+    "within last.ckpt after a validation": (SAVING, 4),
     "when the last step is over": (f"{LAST}.on_train_batch_end", 5),
     "in the closing validation": (f"{MODULE}.validation_step", 3),
     "in the closing test": (f"{MODULE}.test_step", 1),
