@@ -103,7 +103,7 @@ class Particles(_Batched):
         return dataclasses.replace(self, fields={**self.fields, **fields})
 
 
-@dataclass(frozen=True)
+@dataclass  # (not frozen: Lightning assigns the tensors that it has converted to another precision)
 class Window(_Batched):
     """Consecutive recorded frames of B scenes: two to start from, the rest to predict.
 

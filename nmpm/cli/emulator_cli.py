@@ -12,17 +12,19 @@ from typing import Any, TypeVar
 from jsonargparse.typing import PositiveInt
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
+from nmpm.cli.early_checks import UsageError
 from nmpm.cli.options import check_folder
 from nmpm.cli.runs import CONFIG
-from nmpm.cli.typos import BriefParser
+from nmpm.cli.typos import BriefParser, explain, is_of_other_packages
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
@@ -129,6 +131,10 @@ class EmulatorCLI(LightningCLI):
                 )
             if config.get("verbose"):
                 config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
+        if trainer["barebones"] or trainer["enable_checkpointing"] is False:
+            raise ConfigError(
+                "nmpm fit saves, logs and tests: for a bare Trainer, train from Python (docs/lightning.md)."
+            )
         self._choose_precision(trainer)
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
         for saver in ("checkpoint", "resume"):
@@ -147,6 +153,19 @@ class EmulatorCLI(LightningCLI):
             trainer["precision"] = fitting_precision(configured, find_device(trainer["accelerator"]))
             self.replaced_precision = configured if trainer["precision"] != configured else ""
 
+    def instantiate_classes(self) -> None:
+        """Make data, model and trainer.
+
+        Raises:
+            ConfigError: saying what Lightning, or a package for loggers and the like, does not take.
+        """
+        try:
+            super().instantiate_classes()
+        except Exception as error:  # (other packages document none)
+            if isinstance(error, NmpmError | UsageError) or not is_of_other_packages(error):
+                raise
+            raise ConfigError(explain(str(error), ())) from error
+
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer, with CSV and TensorBoard logs in the run's folder unless the configuration says otherwise."""
         config = self.config_init[self.subcommand]["trainer"]
@@ -164,8 +183,13 @@ class EmulatorCLI(LightningCLI):
         self.threads = Threads(stated_threads(self.config_init[self.subcommand]["threads"]))
         kwargs["callbacks"] = [*callbacks, self.threads, DivergenceGuard(), self.report, PredictionWriter()]
         trainer = super().instantiate_trainer(**kwargs)
+        if isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
+            raise ConfigError(f"--trainer.strategy {config['strategy']} is for notebooks: give ddp.")
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+        if "logger" not in kwargs:
+            for logger in trainer.loggers:  # some ask for an account, better before data are simulated
+                getattr(logger, "experiment", None)
         return trainer
 
     def _parse_ckpt_path(self) -> None:
@@ -292,6 +316,8 @@ class EmulatorCLI(LightningCLI):
 
         Where validations are turned off, the last weights are tested; without a test, the report says why.
         """
+        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
+        callbacks[:] = [one for one in callbacks if not isinstance(one, BatchSizeFinder)]  # (it would act here, too)
         best = self._saver(BestCheckpoint)
         if best.monitor and self.trainer.limit_val_batches and best.scored_step < self.trainer.global_step:
             self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)

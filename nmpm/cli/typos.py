@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 import sys
+import traceback
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
+from pathlib import Path
 from typing import NoReturn
 
 from lightning.pytorch.cli import LightningArgumentParser
 
+from nmpm._support.shipped import PACKAGE
 from nmpm.cli.early_checks import UsageError
 from nmpm.decoders import Decoder
 from nmpm.processors import Processor
@@ -51,9 +54,21 @@ def explain(message: str, names: Iterable[str]) -> str:
         return f"{option}{found[2]} is not of type {found[1]}."
     if found := re.search(r"Expected a typing\.Literal\[(.*?)\]\.? Got value: (\S+)", message):
         return f"{option}{found[2]} is not one of {found[1]}."
+    if found := re.search(r"Problem with given class_path '([\w.]+)':\s+(.+)", message):
+        return f"{found[1]}: {found[2]}"
     rest = re.sub(r"- Expected a path but \S+ either not accessible or invalid", "", message[key.end() if key else 0 :])
     line = " ".join(rest.split()).removeprefix("- ")
     return option + (line if len(line) <= LONGEST else f"{line[:LONGEST]} …")
+
+
+def is_of_other_packages(error: BaseException) -> bool:
+    """Whether an error, and what it follows from, was raised by other packages, called by nothing but the CLI."""
+    parts: set[Path] = set()
+    following: BaseException | None = error
+    while following is not None:
+        parts |= {Path(frame.filename) for frame in traceback.extract_tb(following.__traceback__)}
+        following = following.__cause__ or following.__context__
+    return not any(path.is_relative_to(PACKAGE) and not path.is_relative_to(PACKAGE / "cli") for path in parts)
 
 
 def _hint(wrong: str, names: Iterable[str], mark: str) -> str:

@@ -186,7 +186,9 @@ class TrajectoryDataModule(LightningDataModule):
     def train_dataloader(self) -> TrainingLoader:
         """Endless batches of training windows; after a resumed checkpoint, those that come next."""
         _, world = self.ranks
-        history = self._history or _BatchHistory(PlanStart(), self.batch_size, world)
+        history = self._history
+        if history is None or history.start.batch > self.batches_seen:  # (the batch-size finder starts over)
+            history = _BatchHistory(PlanStart(), self.batch_size, world)
         self._provider, plan = self.data_source.training_data(
             self.horizon + 2,
             batch_size=self.batch_size,
@@ -199,8 +201,11 @@ class TrajectoryDataModule(LightningDataModule):
             start=history.start,
         )
         plan = plan.resume_after(self.batches_seen, history.batch_size, history.world, world)
-        self._history = _BatchHistory(plan.start, self.batch_size, world)
         return TrainingLoader(TrajectoryBuffer(self._provider, plan, self.buffer_device(self._provider, plan)), self)
+
+    def begin_batches(self, plan: WindowPlan) -> None:
+        """Remember, for checkpoints, that batches are of this plan from now on."""
+        self._history = _BatchHistory(plan.start, plan.batch_size, self.ranks[1])
 
     @property
     def target_device(self) -> torch.device:
@@ -271,7 +276,13 @@ class TrainingLoader:
         self.buffer, self.owner = buffer, owner
 
     def __iter__(self) -> Iterator[Window]:
-        batches = self.buffer.batches(self.owner.batches_seen, *self.owner.ranks)
+        if self.buffer.plan.start.batch > self.owner.batches_seen:
+            self.buffer = self.owner.train_dataloader().buffer
+        self.owner.begin_batches(self.buffer.plan)
+        first = self.owner.batches_seen
+        if repeated := int(getattr(self.owner.trainer, "overfit_batches", 0)):
+            first %= repeated  # the same batches again in each epoch
+        batches = self.buffer.batches(first, *self.owner.ranks)
         return pin_for(self.owner.target_device, batches) if self.buffer.device.type == "cpu" else batches
 
     def state_dict(self) -> dict[str, Any]:

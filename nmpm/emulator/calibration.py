@@ -137,10 +137,10 @@ def _combine(parts: Sequence[_Inputs]) -> _Inputs:
 
 
 def _state(emulator: Emulator, window: Window) -> Tensor:
-    start, grid = window.initial, emulator.grid
-    cells, velocity = grid.to_cells(start.position), grid.to_cell_displacement(start.velocity)
-    solid = emulator.solid(start)
-    return grid_state(emulator.scene, grid, emulator.transfer, start, cells, velocity, solid, emulator.field_scales)
+    start = window.initial
+    cells, velocity, _ = emulator.in_cells(start)
+    solid, scales = emulator.solid(start), emulator.field_scales
+    return grid_state(emulator.scene, emulator.grid, emulator.transfer, start, cells, velocity, solid, scales)
 
 
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
@@ -209,10 +209,9 @@ def _root_mean_square(parts: Sequence[_Unknowns]) -> Tensor:
 
 def _unknown_velocity(emulator: Emulator, window: Window) -> Tensor:
     """(B, m, N, D) true velocities less what the decoder knows, in cells per frame."""
-    grid, decoder = emulator.grid, emulator.decoder
-    steps = grid.to_cell_displacement(window.frames[:, 1:].diff(dim=1))[:, : emulator.frames]
-    velocity = grid.to_cell_displacement(window.initial.velocity)
-    gravity = grid.to_cell_displacement(window.gravity).unsqueeze(1)
+    decoder, steps = emulator.decoder, window.frames[:, 1:].diff(dim=1)[:, : emulator.frames]
+    steps = emulator.grid.to_cell_displacement(steps, emulator.precision)
+    _, velocity, gravity = emulator.in_cells(window.initial)
     carried = decoder.carried_velocity(velocity, velocity)
     before = [carried, *steps.unbind(1)]
     known = [decoder.known_velocity(carried, before[i - 1], gravity, i) for i in range(1, emulator.frames + 1)]

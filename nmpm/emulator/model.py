@@ -10,7 +10,7 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -86,6 +86,8 @@ class Emulator(nn.Module):
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
         self.register_buffer("bounds", self.grid.bounds_in_cells(scene), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
+        self.register_state_dict_post_hook(_with_plain_names)  # type: ignore[no-untyped-call]  # (torch's own)
+        self.register_load_state_dict_pre_hook(_with_names_of)  # type: ignore[no-untyped-call]
 
     @property
     def scene(self) -> Scene:
@@ -281,3 +283,20 @@ class Emulator(nn.Module):
             self.grid.to_cell_displacement(particles.velocity, self.precision),
             self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
         )
+
+
+COMPILED = "processor._orig_mod."
+"""How names of weights begin in a network that `torch.compile` has wrapped, instead of "processor."."""
+
+
+def _with_plain_names(_module: nn.Module, state: dict[str, Any], prefix: str, _local: object) -> None:
+    """Save a network that is wrapped by `torch.compile` as the plain one."""
+    for name in [name for name in state if name.startswith(prefix + COMPILED)]:
+        state[f"{prefix}processor.{name.removeprefix(prefix + COMPILED)}"] = state.pop(name)
+
+
+def _with_names_of(module: nn.Module, state: dict[str, Any], prefix: str, *_options: object) -> None:
+    """Load plain weights into a network that is wrapped by `torch.compile`."""
+    if hasattr(module.processor, "_orig_mod"):
+        for name in [name for name in state if name.startswith(f"{prefix}processor.")]:
+            state[prefix + COMPILED + name.removeprefix(f"{prefix}processor.")] = state.pop(name)

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convnext import ChannelNorm
 from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
@@ -113,16 +113,15 @@ class Attention(nn.Module):
         """Map (B, C, *S) to the same shape."""
         rows = hidden.movedim((self.axis, 1), (-2, -1))
         query, key, value = self.project(rows).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0).transpose(-2, -3)
-        angles = _angles(rows.shape[-2], query.shape[-1] // 2, self.wraps, rows.device)
+        angles = _angles(rows.shape[-2], query.shape[-1] // 2, self.wraps, full_precision(rows[:0]))
         mixed = functional.scaled_dot_product_attention(_rotate(query, angles), _rotate(key, angles), value)
         out: Tensor = self.out(mixed.transpose(-2, -3).flatten(-2))
         return out.movedim((-2, -1), (self.axis, 1))
 
 
-def _angles(length: int, pairs: int, wraps: bool, device: torch.device) -> Tensor:
-    """(L, P) by how much each pair of channels is turned at each place."""
-    place = torch.arange(length, device=device, dtype=torch.float32)
-    order = torch.arange(pairs, device=device, dtype=torch.float32)
+def _angles(length: int, pairs: int, wraps: bool, like: Tensor) -> Tensor:
+    """(L, P) by how much each pair of channels is turned at each place, of the type and on the device of `like`."""
+    place, order = (torch.arange(count, device=like.device, dtype=like.dtype) for count in (length, pairs))
     speed = 2 * math.pi / length * (order + 1) if wraps else _SLOWEST ** (-order / max(1, pairs - 1))
     return place[:, None] * speed
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution
 from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
 from nmpm.processors.ushape import UShape, upsample_nearest, ushape_radius
@@ -104,6 +104,6 @@ class ChannelNorm(nn.Module):
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (B, C, *S) to the same shape."""
-        # In float32, as squares of half precision overflow; the floor keeps empty cells at zero.
-        inverse = (hidden.float().square().mean(dim=1, keepdim=True) + 1e-6).rsqrt()
+        # Squares of half precision overflow; the floor keeps empty cells at zero.
+        inverse = (full_precision(hidden).square().mean(dim=1, keepdim=True) + 1e-6).rsqrt()
         return hidden * inverse.to(hidden.dtype) * self.scale

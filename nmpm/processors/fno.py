@@ -6,8 +6,9 @@ weights: Kossaifi et al., Multi-Grid Tensorized Fourier Neural Operator, TMLR 20
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -91,6 +92,19 @@ class FNONetwork(GridProcessor):
             placed = torch.cat([grid, places(grid, self.periodic)], dim=1)
             out: Tensor = self.operator(placed).unflatten(1, (self.frames, -1))
         return out
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """As torch's, with complex weights in the precision of the others: `double()` would leave them as they are."""
+
+        def convert(values: Tensor) -> Tensor:
+            converted = fn(values)
+            if not converted.is_complex():
+                return converted
+            precision = torch.promote_types(fn(values.real.new_empty(0)).dtype, torch.float32)
+            return converted.to(precision.to_complex())
+
+        super()._apply(convert, recurse)  # type: ignore[no-untyped-call]  # (torch's own)
+        return self
 
 
 def _without_metadata(_module: nn.Module, state: dict[str, Any], _prefix: str, _local: object) -> None:

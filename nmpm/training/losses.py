@@ -120,7 +120,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
         ValueError: if the shapes differ.
     """
     check_comparable(predicted, target, frames=1)
-    squared = grid.to_cell_displacement(predicted - target).square() * mask[:, None, :, None]
+    squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square() * mask[:, None, :, None]
     return squared.sum() / (mask.sum() * predicted.shape[1] * predicted.shape[3])
 
 
@@ -143,7 +143,7 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
 
         errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
         return errors
-    squared = grid.to_cell_displacement(predicted - target).square().mean(-1) * mask.unsqueeze(1)
+    squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1) * mask.unsqueeze(1)
     bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
     return bundles.mean(-1) / mask.sum(1, keepdim=True)
 
@@ -190,7 +190,8 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
     """
     fraction = scene.particle_volume / grid.cell_volume
     count = _kernel_counts if _kernels_support(predicted, target, grid) else _counts
-    found, true = (fraction * count(grid.to_cells(frames), window, scene, grid) for frames in (predicted, target))
+    cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
+    found, true = (fraction * count(of, window, scene, grid) for of in cells)
     particles = window.mask.sum() * predicted.shape[1]
     return (found - true).square().sum() / (2 * fraction * particles)
 
@@ -199,7 +200,7 @@ def _counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
     """The number of particles of each material on the nodes by linear weights, (B F, M, *S), at cells (B, F, N, D)."""
     kinds = torch.arange(len(scene.materials), device=window.material.device)
     member = (window.material.unsqueeze(-1) == kinds) & window.mask.unsqueeze(-1)
-    weight = member.to(torch.float32).repeat_interleave(cells.shape[1], dim=0)
+    weight = member.to(cells.dtype).repeat_interleave(cells.shape[1], dim=0)
     return Linear().p2g(weight, cells.flatten(0, 1), grid)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import Callback, LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
@@ -40,10 +40,16 @@ from nmpm.training.compatibility import (
     check_same_scene,
 )
 from nmpm.training.losses import FieldError, TrainingError
-from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer
+from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer, with_learning_rate
 from nmpm.training.parts import MOST_PARTS, mean_over_parts, on_threads, split_rows
 from nmpm.training.precision import warn_of_slow_precision
 from nmpm.training.schedules import Schedule
+from nmpm.training.trainer_checks import (
+    check_evaluating_trainer,
+    check_new,
+    check_resuming_trainer,
+    check_trainer,
+)
 from nmpm.training.unrolling import Discount, direct, unroll_training
 
 CALIBRATION_BATCHES = 4
@@ -146,6 +152,8 @@ class EmulatorModule(LightningModule):
         self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
         self.test_errors = Comparison(scene, chosen)
         self._clock = Clock()
+        self._steps_before = 0  # of the trainer, in other trainings
+        self._configured = self._rate_changed = False
 
     @classmethod
     def of(cls, emulator: Emulator, **options: Any) -> EmulatorModule:
@@ -162,6 +170,31 @@ class EmulatorModule(LightningModule):
         module = cls(**(recipe | options))
         module.emulator.load_state_dict(emulator.state_dict())
         return module
+
+    @property
+    def lr(self) -> float:
+        """The optimizer's learning rate before the schedule, which Lightning's learning-rate finder sets."""
+        rate: float = build_optimizer(self.make_optimizer, self.emulator.parameters()).param_groups[0]["lr"]
+        return rate
+
+    @lr.setter
+    def lr(self, rate: float) -> None:
+        self.make_optimizer = with_learning_rate(self.make_optimizer, rate)
+        self._rate_changed = True
+
+    def configure_callbacks(self) -> Sequence[Callback] | Callback:
+        """No further callbacks; Lightning asks for them before it prepares data, the moment to check the trainer.
+
+        Raises:
+            ConfigError: naming an option of the trainer that does not work, and what to do instead.
+        """
+        fitting = self.trainer.state.fn == TrainerFn.FITTING
+        if fitting:
+            check_trainer(self.trainer, self)
+        else:
+            check_evaluating_trainer(self.trainer)
+        self._steps_before, self._configured = self.trainer.global_step, False
+        return super().configure_callbacks()
 
     def setup(self, stage: str) -> None:
         """Make sure that the data are of the model's scene, and training windows as long as its horizon.
@@ -181,10 +214,9 @@ class EmulatorModule(LightningModule):
             check_horizon(self.emulator.frames, self.unroll, horizon)
 
     def on_fit_start(self) -> None:
-        """Calibrate a new emulator and compile the network, once the strategy has moved them to the device."""
-        if not self.emulator.calibrated:
-            loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]  # (Lightning sets it)
-            calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
+        """Compile the network, once the strategy has moved it to the device."""
+        if self._rate_changed:  # by the learning-rate finder, after the optimizer was made
+            self.trainer.strategy.setup_optimizers(self.trainer)
         if self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
             compile_network(self.emulator.processor, example)
@@ -206,11 +238,14 @@ class EmulatorModule(LightningModule):
         A training goes on with this model's arguments; those that the checkpoint has otherwise are logged.
 
         Raises:
-            ConfigError: if a newer version wrote it, or a part differs.
+            ConfigError: if a newer version wrote it, a part differs, or a callback of the trainer cannot go on.
         """
         check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
         check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
         if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
+            if not self._configured:  # (finders load their own checkpoint later)
+                check_resuming_trainer(self._trainer)
+                self._steps_before = 0
             changed = self.adopt_arguments(checkpoint)
             if changed:
                 step = checkpoint.get("global_step")
@@ -322,12 +357,21 @@ class EmulatorModule(LightningModule):
         self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """The optimizer, and the schedule of its learning rate.
+        """The optimizer, and the schedule of its learning rate. A new emulator is calibrated first.
+
+        Here and not in `on_fit_start`, as Lightning's finders take their steps before that.
 
         Raises:
-            ConfigError: if the learning rate is not a positive number, or the training has no end.
+            ConfigError: if the learning rate is not a positive number, the training has no end, or the trainer has
+                been used for another one.
         """
+        check_new(self._steps_before)
         check_end(self.trainer)
+        if not self.emulator.calibrated:
+            self.trainer.fit_loop.setup_data()
+            loader: Iterable[Window] = self.trainer.train_dataloader  # type: ignore[assignment]  # (loaded)
+            calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
+        self._configured, self._rate_changed = True, False
         optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
         total = total_steps(self.trainer)
         scheduler = torch.optim.lr_scheduler.LambdaLR(

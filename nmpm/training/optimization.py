@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -17,6 +18,19 @@ OptimizerCallable = Callable[[Iterable], Optimizer]  # type: ignore[type-arg]  #
 def adam(parameters: Iterable[Tensor]) -> Optimizer:
     """The paper's optimizer."""
     return torch.optim.Adam(parameters, lr=1e-3)
+
+
+def with_learning_rate(make: OptimizerCallable, rate: float) -> OptimizerCallable:
+    """The optimizers that a function makes, with another learning rate."""
+    check_learning_rate(rate)
+    return partial(_build_at_rate, make, rate)
+
+
+def _build_at_rate(make: OptimizerCallable, rate: float, parameters: Iterable[Tensor]) -> Optimizer:
+    optimizer = make(parameters)
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    return optimizer
 
 
 def check_learning_rate(rate: object) -> None:
