@@ -138,7 +138,8 @@ class Emulator(nn.Module):
     @property
     def shapes_are_compiled(self) -> bool:
         """Whether another shape of the state, such as fewer scenes, would cost a compilation."""
-        return self.runtime.fixed_shapes or self.processor._compiled_call_impl is not None
+        compiled = self.processor._compiled_call_impl is not None or hasattr(self.processor, "_orig_mod")
+        return self.runtime.fixed_shapes or compiled
 
     def with_network(self, precision: torch.dtype) -> Emulator:
         """This emulator if its network has weights of this type, else a copy with the network's weights converted.

@@ -339,7 +339,8 @@ class EmulatorModule(LightningModule):
 
         All in one where torch compiles for a shape, or noise is drawn for all windows together.
         """
-        whole = self.device.type != "cpu" or self.compiled or self.emulator.recipe.grid_noise > 0
+        compiled = self.compiled or self.emulator.shapes_are_compiled
+        whole = self.device.type != "cpu" or compiled or self.emulator.recipe.grid_noise > 0
         return split_rows(len(batch.frames), 1 if whole else self.parts or min(torch.get_num_threads(), MOST_PARTS))
 
     def on_validation_epoch_start(self) -> None:
