@@ -228,7 +228,7 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert trained["seconds"] >= round(best["trained_seconds"], 1)
     capsys.readouterr()
     for command, title, end in (
-        ("validate", "dataset: validation error ×10⁻³", "┘"),
+        ("validate", "dataset: validation error ×10⁻³", "before using it."),  # no better than a trivial predictor
         ("test", "dataset: test error ×10⁻³", "written to run: report.json, errors.csv, rollout.png, rollout.gif"),
         ("predict", "Data: dataset.", "written to run/predictions.h5; to draw them: nmpm render run/predictions.h5"),
     ):
