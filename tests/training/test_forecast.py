@@ -62,31 +62,32 @@ def test_one_whose_time_reaches_far_enough_says_nothing(make_dataset, set_pace, 
     assert capsys.readouterr().out == ""
 
 
-VALID = {"valid": ((12, 5),) * 12}
+VALID = {"valid": ((12, 5),) * 24}
 BOUNDED = {"max_steps": 30, "val_check_interval": 25}
 
 
 def test_validations_take_a_fifth_of_the_time_of_steps_also_when_it_goes_on(make_dataset, set_pace, tmp_path, capsys):
-    """12 trajectories of 10 frames cost 5 of the 9 steps that are left: a step has 24 frames, those with gradients."""
+    """24 trajectories of 10 frames cost as much as 10 of the 30 steps: a step has 8 frames, and gradients."""
     folder = make_dataset(**VALID)
     set_pace(1.0)
     begun = fit(folder, 28, **BOUNDED)
     begun.save_checkpoint(tmp_path / "last.ckpt")
-    (count,) = re.findall(r"Validations on all 12 .* the first (\d+) \(--data\.limit_eval", capsys.readouterr().out)
-    assert int(count) == 4
-    assert begun.val_dataloaders.batches == ((0, 1), (2, 3))
+    (count,) = re.findall(r"Validations on all 24 .* the first (\d+) \(--data\.limit_eval", capsys.readouterr().out)
+    assert int(count) == 14
+    used = tuple((index, index + 1) for index in range(0, 14, 2))
+    assert begun.val_dataloaders.batches == used
     begun.validate(begun.lightning_module, datamodule=begun.datamodule, verbose=False)
-    assert sum(begun.num_val_batches) == 2  # the last weights are compared with those before
+    assert sum(begun.num_val_batches) == 7  # the last weights are compared with those before
     resumed = fit(folder, 30, tmp_path / "last.ckpt", **BOUNDED)
-    assert resumed.datamodule.validated == 4
-    assert resumed.val_dataloaders.batches == ((0, 1), (2, 3))
+    assert resumed.datamodule.validated == 14
+    assert resumed.val_dataloaders.batches == used
 
 
 @pytest.mark.parametrize(
     "unbounded",
     [
-        {"data": {"limit_eval": 12}},
-        {"limit_val_batches": 6},
+        {"data": {"limit_eval": 24}},
+        {"limit_val_batches": 12},
         {"val_check_interval": 10},  # the first validation came before there was a pace
         {"max_steps": 10**4, "val_check_interval": 10**3},
     ],
@@ -96,14 +97,14 @@ def test_validations_that_the_user_bounds_or_that_cost_little_are_left_alone(mak
     set_pace(1.0)
     trainer = fit(make_dataset(**VALID), 26, **(BOUNDED | unbounded))
     assert capsys.readouterr().out == ""
-    assert trainer.datamodule.validated == 12
+    assert trainer.datamodule.validated == 24
 
 
 def test_the_last_validation_is_within_max_time(make_dataset, set_pace):
     set_pace(10.0)
     trainer = fit(make_dataset(**VALID), DECIDED + 1, **(LONG | {"limit_val_batches": 1.0}))
     (timer,) = (one for one in trainer.callbacks if isinstance(one, lightning.pytorch.callbacks.Timer))
-    assert 3540 < timer._duration < 3560  # a validation takes 50 s
+    assert 3440 < timer._duration < 3520  # a validation takes 100 s
 
 
 def test_the_closing_test_is_announced(make_dataset, set_pace, capsys):

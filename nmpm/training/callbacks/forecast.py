@@ -136,8 +136,9 @@ class Forecast(Callback):
         limit = data.limit_eval or data.validated or len(split)
         frames = [split.frames(index) - 2 for index in range(len(split))][:limit]
         seconds = (self._frame_seconds or 0.0) * sum(frames) / trainer.world_size
-        training = min(seconds_left(trainer), (total_steps(trainer) - trainer.global_step) * pace)
-        share = seconds * math.ceil(training / pace / interval or 1) / training if training > 0 else 0.0
+        left = min(seconds_left(trainer), (total_steps(trainer) - trainer.global_step) * pace)
+        count = math.ceil(left / pace / interval) or 1
+        share = seconds * count / (trainer.global_step * pace + left)
         by_user = data.limit_eval or trainer.limit_val_batches != 1.0
         few = max(int(len(frames) * VALIDATION_SHARE / share), data.eval_batch_size) if share else len(frames)
         loader = trainer.val_dataloaders
