@@ -242,6 +242,8 @@ class EmulatorModule(LightningModule):
         """
         check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
         check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
+        if self._trainer is not None:  # Lightning does so after loading the weights, which would be rounded
+            self._trainer.precision_plugin.convert_module(self)
         if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
             if not self._configured:  # (finders load their own checkpoint later)
                 check_resuming_trainer(self._trainer)

@@ -109,7 +109,8 @@ def _trainer_reasons(trainer: Trainer, module: LightningModule) -> Iterator[str]
     if isinstance(trainer.strategy, ModelParallelStrategy):
         yield 'ModelParallelStrategy splits networks that are too large for one device: give strategy="ddp".'
     if trainer.fit_loop.min_epochs and not _counts_epochs(trainer):
-        yield f"min_epochs={trainer.fit_loop.min_epochs} {COUNT_EPOCHS}, or min_steps."
+        option = "min_epochs" if trainer.fit_loop.min_steps is None else "min_steps"  # (which sets min_epochs to 1)
+        yield f"{option}={getattr(trainer.fit_loop, option)} {COUNT_EPOCHS}, or leave it out."
 
 
 def _callback_reasons(trainer: Trainer, module: LightningModule) -> Iterator[str]:
