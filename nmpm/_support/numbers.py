@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TypeGuard
+import operator
+from typing import Any, TypeGuard
+
+from nmpm._support.messages import one_line
+from nmpm.errors import ConfigError
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
@@ -14,3 +18,18 @@ def is_number(value: object) -> TypeGuard[int | float]:
 def is_finite(value: object) -> TypeGuard[int | float]:
     """Whether a value is a number, no truth value, and finite."""
     return is_number(value) and math.isfinite(value)
+
+
+def check_whole(name: str, value: Any, least: int) -> int:
+    """An argument that must be a whole number of at least `least`; NumPy's are taken too.
+
+    Raises:
+        ConfigError: naming the argument and its value.
+    """
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise ConfigError(f"{name} = {one_line(repr(value), 60)}: it must be a whole number, at least {least}.")
+    return number

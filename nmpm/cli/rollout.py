@@ -43,6 +43,7 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
     chosen = _parser().parse_args(words[1:])
     _check(chosen)
+    from nmpm.emulator.rollouts import warn_of_start_outside
     from nmpm.zoo.registry import load_model
 
     model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime, chosen.precision)
@@ -50,6 +51,7 @@ def run(words: list[str]) -> None:
     window = None if chosen.data is None else _recorded(model, chosen.data, chosen.trajectory)
     recorded = 0 if window is None else window.target.shape[1]
     state = _thrown_state(model, chosen) if window is None else window.initial
+    warn_of_start_outside(model.emulator, state.to(model.emulator.device))
     rollout = _predict(model, state, chosen.frames or recorded or FRAMES, chosen)
     _write(model, state, rollout, window if recorded else None, chosen)
     if window is not None and recorded:

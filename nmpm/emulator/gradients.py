@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from nmpm._support.numbers import check_whole
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.periods import Periods
@@ -66,14 +67,13 @@ def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int
         (B, frames, N, D) positions in domain length.
 
     Raises:
-        ValueError: if `frames` is below 1.
+        ConfigError: if `frames` is below 1, or no whole number.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
 
     Warns:
         UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
-    if frames < 1:
-        raise ValueError(f"A rollout with gradients has 1 or more frames, not {frames}.")
+    frames = check_whole("frames", frames, 1)
     warn_of_training_mode(emulator)
     with torch.no_grad():
         check_inputs(emulator, particles)

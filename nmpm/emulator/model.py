@@ -218,7 +218,8 @@ class Emulator(nn.Module):
 
         Weights that need no gradients need none in the copy.
         """
-        other = recipe.build().to(self.device)
+        with torch.random.fork_rng(devices=[]):  # the weights drawn here are replaced
+            other = recipe.build().to(self.device)
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())

@@ -69,7 +69,7 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
     """
     batch = particles.position.shape[0]
     if not scene.walled:
-        return particles.position.new_zeros(batch, 0, *grid.shape)
+        return walls.new_zeros(batch, 0, *grid.shape)
     if not scene.obstacles:
         return walls.expand(batch, 1, *grid.shape)
     precision = torch.promote_types(walls.dtype, torch.float32)

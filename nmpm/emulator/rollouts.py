@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nmpm._support.numbers import check_whole
 from nmpm.emulator.bundle import Bundle
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
@@ -19,6 +20,9 @@ from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.transfer.chunks import can_branch
+
+ROUNDING = 1e-3
+"""Cells by which particles may start outside of the bounds without a warning."""
 
 
 def unroll(
@@ -198,6 +202,23 @@ def warn_of_training_mode(emulator: Emulator) -> None:
         )
 
 
+def warn_of_start_outside(emulator: Emulator, particles: Particles) -> None:
+    """Warn of particles that start outside of the bounds by more than rounding: the first frame moves them in."""
+    scene = emulator.scene
+    sides = [
+        torch.zeros_like(column) if wraps else torch.maximum(low - column, column - high)
+        for column, (low, high), wraps in zip(particles.position.unbind(-1), scene.bounds, scene.periodic, strict=True)
+    ]
+    apart = torch.stack(sides).amax(0).masked_fill(~particles.mask, 0.0)
+    outside = apart > ROUNDING * min(emulator.grid.spacing)
+    if outside.any():
+        warnings.warn(
+            f"{int(outside.sum())} of {int(particles.mask.sum())} particles start outside of the bounds"
+            f" {list(scene.bounds)}, by up to {float(apart.max()):.3g}: rollouts move them in.",
+            stacklevel=4,
+        )
+
+
 def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
     """Whether positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
     sides = [
@@ -258,15 +279,14 @@ def stream_rollout(
         Up to m frames; the last bundle is cut to the frames asked for.
 
     Raises:
-        ValueError: if `frames` is negative.
+        ConfigError: if `frames` is negative, or no whole number.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
 
     Warns:
         UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
-    if frames < 0:
-        raise ValueError(f"A rollout has 0 or more frames, not {frames}.")
+    frames = check_whole("frames", frames, 0)
     warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
     bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames)
@@ -297,7 +317,7 @@ def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monit
     """Predict `frames` frames of positions and evolving fields without gradients.
 
     Raises:
-        ValueError: if `frames` is negative.
+        ConfigError: if `frames` is negative, or no whole number.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
 

@@ -65,7 +65,9 @@ def _check_network(recipe: EmulatorRecipe) -> None:
 
 @contextmanager
 def bounded_network() -> Iterator[None]:
-    """Count parameters, their tensors and modules as networks are built.
+    """Count parameters, their tensors and modules as networks are built for stored weights.
+
+    The weights that they draw first leave torch's random state as it was.
 
     Raises:
         ConfigError: at the first that is too many.
@@ -90,7 +92,8 @@ def bounded_network() -> Iterator[None]:
         hooks.register_module_module_registration_hook(add_module),
     ]
     try:
-        yield
+        with torch.random.fork_rng(devices=[]):
+            yield
     finally:
         for handle in handles:
             handle.remove()

@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nmpm._support.devices import find_device
+from nmpm._support.numbers import check_whole
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, Windows, differentiable_rollout, predict_rollout
 from nmpm.emulator.calibrated import with_usual_gravity
+from nmpm.emulator.rollouts import warn_of_start_outside
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -138,8 +140,7 @@ class Pretrained:
         """
         blocks = len(self.scene.materials) if blocks is None else blocks
         for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
-            if value < least:
-                raise ConfigError(f"{name} = {value}: it must be at least {least}.")
+            check_whole(name, value, least)
         try:
             state = thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
         except ValueError as error:
@@ -184,7 +185,7 @@ class Pretrained:
 
         Args:
             runtime: A name of `nmpm.emulator.runtimes.RUNTIMES`: "openvino" (CPU, needs `nmpm[openvino]`), "cuda-graph"
-                (GPU) or "eager", torch itself; "auto" for the fastest that can run the model here.
+                (GPU) or "eager", torch itself; "auto" for the fastest here, as measured in short rollouts.
             precision: As for `with_network`; the network's own if left out.
 
         Raises:
@@ -225,12 +226,17 @@ class Pretrained:
 
         Returns:
             (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
+
+        Warns:
+            UserWarning: if particles start outside of the bounds, into which the first frame moves them.
         """
         return self.predict(state, frames).position
 
     def predict(self, state: Particles, frames: int) -> Rollout:
         """As `rollout`, with the evolving fields of the particles, such as a temperature, beside their positions."""
-        return predict_rollout(self.emulator, state.to(self.emulator.device), frames)
+        there = state.to(self.emulator.device)
+        warn_of_start_outside(self.emulator, there)
+        return predict_rollout(self.emulator, there, frames)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
         """Predict with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
@@ -240,4 +246,6 @@ class Pretrained:
         Returns:
             (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
         """
-        return differentiable_rollout(self.emulator, state.to(self.emulator.device), frames)
+        there = state.to(self.emulator.device)
+        warn_of_start_outside(self.emulator, there)
+        return differentiable_rollout(self.emulator, there, frames)

@@ -272,6 +272,8 @@ def _numbers(name: str, values: Any) -> Tensor:
         DataError: if they are not real numbers.
     """
     try:
+        if not isinstance(values, Tensor) and (array := np.asarray(values)).dtype.kind in "iuf":
+            values = array.astype(np.float64)  # torch takes neither all strides nor other byte orders
         found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
     except (TypeError, ValueError, RuntimeError) as error:
         raise DataError(f"{name} cannot be read as an array of numbers: {one_line(error)}.") from error

@@ -243,7 +243,7 @@ def test_rollouts_are_cut_to_the_frames_asked_for():
     for frames in (0, 1, 3, 7):
         assert torch.equal(rollout(emulator, particles, frames), whole[:, :frames])
     assert [len(part[0]) for part in stream(emulator, particles, 7)] == [3, 3, 1]
-    with pytest.raises(ValueError, match="not -1"):
+    with pytest.raises(ValueError, match="frames = -1"):
         rollout(emulator, particles, -1)
 
 

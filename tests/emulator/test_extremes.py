@@ -130,6 +130,23 @@ def test_an_origin_far_away_costs_nothing_in_float64():
     torch.testing.assert_close(other - 1e8, one, rtol=0, atol=1e-6)
 
 
+UNWALLED = {"bounds": ((0.0, 1.0),), "domain": ((0.0, 1.0),)}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(
+    "changes", [{}, UNWALLED, UNWALLED | {"obstacles": True}, {"gravity": None, "gravity_varies": True}], ids=str
+)
+def test_states_in_float64_are_taken_by_every_kind_of_scene(dim, changes):
+    changes = {name: value * dim if name in UNWALLED else value for name, value in changes.items()}
+    scene = dataclasses.replace(box(dim), **changes, evolving=("heat",), parameters=("angle",))
+    particles = cloud(scene, statics=3 * scene.obstacles)
+    particles = particles.with_fields({"heat": particles.position[..., 0], "angle": torch.ones(1, 1)})
+    one, other = (rollout(emulator_of(scene, cells=8), state, 3) for state in (particles, particles.double()))
+    assert other.dtype == torch.float64
+    torch.testing.assert_close(other.float(), one, rtol=0, atol=1e-5)
+
+
 def test_an_origin_too_far_for_float32_is_refused_by_name():
     scene = far_away(1e8)
     particles = cloud(box(gravity=None))

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from collections.abc import Iterator
 from importlib.util import find_spec
 
@@ -29,10 +30,29 @@ class Wrong(Runtime):
         return 2 * network(grid) + 0.1
 
 
-def test_the_fastest_that_runs_here_is_taken_and_checked(model, caplog):
+class Slow(Eager):
+    """Torch with a pause."""
+
+    name = "openvino"
+
+    def fields(self, network, grid, precision):
+        time.sleep(0.05)
+        return super().fields(network, grid, precision)
+
+
+@pytest.mark.parametrize("order", [("openvino", "eager"), ("eager", "openvino")])
+def test_the_fastest_as_measured_is_taken(model, monkeypatch, order):
+    runtimes = {name: {"openvino": Slow, "eager": Eager}[name] for name in order}
+    monkeypatch.setattr("nmpm.emulator.runtimes.RUNTIMES", runtimes)
+    monkeypatch.setattr(optimization, "RUNTIMES", runtimes)
+    assert model.optimized().emulator.runtime.name == "eager"
+
+
+def test_what_runs_here_is_taken_and_checked(model, caplog, monkeypatch):
     if find_spec("openvino") is None:  # importing it would report to its makers
         pytest.skip("openvino is not installed")
     caplog.set_level(logging.INFO, "nmpm")
+    monkeypatch.setattr(optimization, "_seconds", lambda emulator, _: not isinstance(emulator.runtime, OpenVINO))
     quick = model.optimized()
     assert isinstance(quick.emulator.runtime, OpenVINO)
     assert isinstance(model.emulator.runtime, Eager)

@@ -8,7 +8,7 @@ import torch
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import UNet
-from nmpm.zoo import Pretrained
+from nmpm.zoo import Pretrained, Zoo
 from nmpm.zoo.golden import golden_distance, golden_rollout
 from tests.scenes import box, set_gravity_statistics
 
@@ -60,6 +60,14 @@ def test_over_a_wider_domain_the_same_weights_get_more_cells_of_the_same_size(mo
 def test_scenes_that_a_model_cannot_take_are_refused(model, change, message):
     with pytest.raises(ConfigError, match=message):
         model.over(dataclasses.replace(model.scene, **change))
+
+
+def test_torchs_random_state_is_left_as_it_is(model, root):
+    before = torch.get_rng_state()
+    model.over(model.scene)
+    model.optimized()
+    Zoo.load("small", root)
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_a_model_prints_as_one_line(model):

@@ -8,7 +8,7 @@ from scenes import box, set_gravity_statistics
 
 from nmpm.data.predictions import predicted_trajectory
 from nmpm.emulator import EmulatorRecipe
-from nmpm.errors import DataError
+from nmpm.errors import ConfigError, DataError
 from nmpm.obstacles import Disc, Ramp
 from nmpm.processors import Pointwise
 from nmpm.zoo.registry import Pretrained
@@ -49,6 +49,8 @@ def test_numpy_torch_lists_and_batches_are_the_same(model):
         model.state(torch.from_numpy(POSITIONS), torch.from_numpy(velocity)),
         model.state(POSITIONS.tolist(), velocity.tolist()),
         model.state(np.stack([POSITIONS] * 3), velocity).scenes(slice(1, 2)),
+        model.state(POSITIONS[::-1].copy()[::-1], velocity[:, ::-1].copy()[:, ::-1]),
+        model.state(POSITIONS.astype(">f8"), velocity.astype(np.longdouble), np.zeros(20, ">i4")),
     )
     for other in others:
         for name in {field.name for field in dataclasses.fields(one)} - {"fields", "obstacle_share"}:
@@ -198,6 +200,28 @@ def test_bodies_that_do_not_fit_are_refused():
     state = model.state(POSITIONS, bodies=[disc])
     with pytest.raises(DataError, match="fill them with particles"):
         predicted_trajectory(model.scene, state, model.rollout(state, 2), "a test")
+
+
+def test_particles_that_start_outside_of_the_bounds_are_counted(model):
+    outside = model.state([[0.5, 0.5], [0.09, 0.5], [0.5, 0.915], [0.1 - 1e-6, 0.5]])
+    for predict in (model.rollout, model.differentiable_rollout):
+        with pytest.warns(
+            UserWarning, match=r"2 of 4 particles start outside of the bounds .*, by up to 0.015:"
+        ) as caught:
+            predict(outside, 2)
+        assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.rollout(outside.map(lambda values: values[:, [0, 3]] if values.shape[1:2] == (4,) else values), 2)
+
+
+@pytest.mark.parametrize("frames", [-1, 7.5, "8", None, True, float("nan")])
+def test_frames_are_a_whole_number(model, frames):
+    state = model.state(POSITIONS)
+    for predict in (model.rollout, model.predict, model.differentiable_rollout):
+        with pytest.raises(ConfigError, match=f"frames = {frames!r}: it must be a whole number, at least [01]"):
+            predict(state, frames)
+    assert model.rollout(state, np.int64(3)).shape[1] == 3
 
 
 def test_particles_that_start_inside_an_obstacle_are_named():

@@ -18,7 +18,7 @@ from nmpm.errors import ConfigError
 __all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "check_runtime", "find_runtime"]
 
 RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType({kind.name: kind for kind in (CudaGraph, OpenVINO, Eager)})
-"""Runtimes by name, the fastest first; the last one runs every network everywhere."""
+"""Runtimes by name; the last one runs every network everywhere."""
 
 
 def find_runtime(name: str) -> Runtime:
