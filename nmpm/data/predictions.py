@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm._support.bounded_files import check_characters
 from nmpm._support.version import __version__
 from nmpm.data.families import FAMILIES
 from nmpm.data.format import TRUTH, Trajectory
-from nmpm.data.json_keys import JsonKeys, parse_ids, parse_names
-from nmpm.data.metadata import parse_json
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 
@@ -82,31 +78,6 @@ def _with_obstacle(moving: Tensor, obstacle: np.ndarray) -> np.ndarray:
     """(T, N + M, D) positions: those of the particles that move, then those of the obstacle (M, D)."""
     resting = np.broadcast_to(obstacle, (len(moving), *obstacle.shape))
     return np.concatenate([moving.cpu().numpy(), resting], axis=1)
-
-
-def read_prediction_facts(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[int, str], frozenset[int]]:
-    """Scene, names of type ids, and ids that do not move, which `predicted_trajectory` has stored.
-
-    Args:
-        attributes: Of the trajectory.
-        path: Of its file, for messages.
-
-    Raises:
-        DataError: naming the attribute that is missing or not as it was stored.
-    """
-    texts = {key: attributes.get(key) for key in ("scene", "particle_types")}
-    if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
-        raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
-    scene, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
-    check_characters([scene, names], path)
-    keys = JsonKeys(
-        path, {"particle_types": names, "static_types": np.asarray(attributes.get("static_types")).tolist()}
-    )
-    try:
-        facts = Scene.from_dict(scene)
-    except ConfigError as error:
-        raise DataError(f"{path}: {error}") from error
-    return facts, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids)
 
 
 def _field_frames(start: Tensor, predicted: Tensor, real: Tensor, obstacles: int) -> np.ndarray:

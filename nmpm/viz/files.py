@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from nmpm._support.bounded_files import check_characters
 from nmpm.data.fields import read_fields
 from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
 from nmpm.data.gravity import own_gravity
-from nmpm.data.predictions import read_prediction_facts
+from nmpm.data.json_keys import JsonKeys, parse_ids, parse_names
+from nmpm.data.metadata import parse_json
 from nmpm.data.scene_inference import infer_scene
-from nmpm.errors import DataError
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 from nmpm.viz.trajectories import LabelledTrajectories, material_names
 
@@ -120,7 +125,23 @@ def _describe(
 ) -> tuple[Scene, dict[int, str], frozenset[int], str]:
     """Scene, names of type ids, static ids, label: from a rollout's own attributes, otherwise from metadata.json."""
     if "scene" in trajectory.attributes:
-        return *read_prediction_facts(trajectory.attributes, split.path), "prediction"
+        return *_read_facts(trajectory.attributes, split.path), "prediction"
     metadata = read_metadata(split.path.parent, family)
     label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
     return infer_scene(split.path.parent, family), dict(metadata.particle_types), metadata.static_types, label
+
+
+def _read_facts(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[int, str], frozenset[int]]:
+    """Scene, names of type ids, and ids that do not move, as `nmpm.data.predictions` stores them."""
+    texts = {key: attributes.get(key) for key in ("scene", "particle_types")}
+    if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
+        raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
+    scene, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
+    check_characters([scene, names], path)
+    static = np.asarray(attributes.get("static_types")).tolist()
+    keys = JsonKeys(path, {"particle_types": names, "static_types": static})
+    try:
+        facts = Scene.from_dict(scene)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from error
+    return facts, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids)
