@@ -35,7 +35,7 @@ def test_a_scene_that_is_not_yaml_is_named_in_one_line(folder, capsys):
     (folder / "scene.yaml").write_text("a: [\n")
     assert main(["simulate", "scene.yaml"]) == 1
     said = capsys.readouterr().err
-    assert "Preset scene.yaml: it is not YAML (" in said
+    assert "Preset scene.yaml cannot be read: while parsing" in said
     assert said.count("\n") == 1
 
 
