@@ -61,7 +61,7 @@ def test_values_are_read_back_at_the_start_at_logged_steps_and_at_the_end_alone(
         ReportWriter(),
         LastCheckpoint(tmp_path, "last", every_n_train_steps=1000),
     ]
-    trainer = trainer_with(tmp_path, *guards, max_steps=25, precision="bf16-mixed")
+    trainer = trainer_with(tmp_path, *guards, max_steps=25, precision="bf16-mixed", enable_checkpointing=True)
     with Readings(trainer) as readings:
         trainer.fit(module_of(data, optimizer=optimizer, mirror=(0,)), data)
     assert readings.steps == {0, 10, 20, 25}
