@@ -87,7 +87,6 @@ class Emulator(nn.Module):
         self.register_buffer("bounds", self.grid.bounds_in_cells(scene), persistent=False)
         self.register_buffer("walls", wall_fraction(scene, self.grid), persistent=False)
         self.register_state_dict_post_hook(_with_plain_names)  # type: ignore[no-untyped-call]  # (torch's own)
-        self.register_load_state_dict_pre_hook(_with_names_of)  # type: ignore[no-untyped-call]
 
     @property
     def scene(self) -> Scene:
@@ -278,6 +277,13 @@ class Emulator(nn.Module):
         """The bundle, with only the network left to the runtime."""
         return steps_for(self, self._plan, particles, context.solid).predict(self, particles, context)
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *options: Any) -> None:
+        """As torch's, of plain weights also into a network that is wrapped by `torch.compile`."""
+        if hasattr(self.processor, "_orig_mod"):
+            for name in [name for name in state_dict if name.startswith(f"{prefix}processor.")]:
+                state_dict[prefix + COMPILED + name.removeprefix(f"{prefix}processor.")] = state_dict.pop(name)
+        super()._load_from_state_dict(state_dict, prefix, *options)
+
     def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
         return (
@@ -295,10 +301,3 @@ def _with_plain_names(_module: nn.Module, state: dict[str, Any], prefix: str, _l
     """Save a network that is wrapped by `torch.compile` as the plain one."""
     for name in [name for name in state if name.startswith(prefix + COMPILED)]:
         state[f"{prefix}processor.{name.removeprefix(prefix + COMPILED)}"] = state.pop(name)
-
-
-def _with_names_of(module: nn.Module, state: dict[str, Any], prefix: str, *_options: object) -> None:
-    """Load plain weights into a network that is wrapped by `torch.compile`."""
-    if hasattr(module.processor, "_orig_mod"):
-        for name in [name for name in state if name.startswith(f"{prefix}processor.")]:
-            state[prefix + COMPILED + name.removeprefix(f"{prefix}processor.")] = state.pop(name)
