@@ -16,10 +16,9 @@ from functools import partial
 import torch
 from timing import clock_for, make_parser, time_alternating
 
-from nmpm._support.devices import device_name
+from nmpm._support.devices import computes_bfloat16, device_name
 from nmpm.particles import Window
 from nmpm.training import EmulatorModule
-from nmpm.training.precision import computes_bfloat16
 from nmpm.zoo import Zoo
 
 UNROLL = 4

@@ -49,6 +49,19 @@ def device_name(device: torch.device, threads: int | None = None) -> str:
     return device.type
 
 
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether a device has instructions for convolutions in bfloat16, and torch uses them.
+
+    An x86 CPU has with AVX512_BF16. With other AVX-512, oneDNN emulates them, and a training step takes 1.7 times as
+    long as in float32; without, torch's own loops take 8 to 10 times as long (`benchmarks/precision_steps.py`).
+    """
+    if device.type != "cpu":
+        return True
+    if not torch.backends.mkldnn.is_available() or not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        return False
+    return not torch.cpu._is_avx2_supported() or torch.cpu._is_avx512_bf16_supported()  # (Arm has no AVX2)
+
+
 def join_hardware(*names: str) -> str:
     """Results of `device_name`, or of this function, as one text that names each device once, in their order."""
     return "; ".join(dict.fromkeys(part for name in names for part in name.split("; ") if part))

@@ -6,20 +6,11 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.utilities import rank_zero_warn
 
+from nmpm._support.devices import computes_bfloat16
+
 BFLOAT16 = frozenset({"bf16", "bf16-mixed"})
 """Lightning's names of mixed precision with bfloat16."""
 FLOAT32 = "32-true"
-
-
-def computes_bfloat16(device: torch.device) -> bool:
-    """Whether a device computes convolutions in bfloat16 by instructions for it.
-
-    A CPU does with AVX-512 or Arm's bfloat16, by oneDNN. Without, torch's own loops take over, in which a training step
-    takes eight to ten times as long as in float32 (`benchmarks/precision_steps.py`).
-    """
-    if device.type != "cpu":
-        return True
-    return torch.backends.mkldnn.is_available() and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def fitting_precision(precision: str, device: torch.device) -> str:

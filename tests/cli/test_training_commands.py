@@ -13,6 +13,7 @@ import yaml
 from lightning.pytorch import Callback
 from PIL import Image
 
+from nmpm._support.devices import computes_bfloat16
 from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
 from nmpm.cli.early_checks import argument_names
@@ -20,7 +21,6 @@ from nmpm.cli.emulator_cli import EmulatorCLI
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
-from nmpm.training.precision import computes_bfloat16
 from nmpm.zoo import Zoo, publish
 
 TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']

@@ -158,6 +158,19 @@ def test_networks_that_it_cannot_run_are_named():
         OpenVINO().fields(Spectral().eval(), torch.zeros(1, 3, 8, 8), torch.float32)
 
 
+def test_networks_that_it_cannot_compile_for_this_processor_are_named(monkeypatch):
+    from nmpm.emulator.runtimes import openvino
+
+    class Core:
+        def compile_model(self, *_):
+            raise RuntimeError("could not create a primitive descriptor")
+
+    monkeypatch.setattr(openvino, "_core", lambda _: Core())
+    network = emulator_of(processor=Pointwise())
+    with pytest.raises(ConfigError, match=r"OpenVINO cannot run .*: use the runtime eager .*primitive descriptor"):
+        OpenVINO().fields(network.processor, grid_of(network), torch.float32)
+
+
 def test_other_devices_and_types_are_refused(pair):
     emulator, quick = pair
     with pytest.raises(ConfigError, match=r"runs on CPUs; the model is on meta\."):

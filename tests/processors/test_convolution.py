@@ -1,5 +1,8 @@
 """Convolutions and their gradients on grids of few cells, in the precisions that trainings use."""
 
+import os
+import subprocess
+import sys
 from itertools import product
 from operator import call
 
@@ -87,6 +90,19 @@ def test_three_dimensions_of_few_cells_are_convolved_as_in_double_precision(kern
         layer = Convolution(channels, channels, kernel, (False,) * 3)
         grid = torch.randn(2, channels, *cells)
         assert_as_in_double(layer, grid, call, torch.bfloat16)
+
+
+@pytest.mark.skipif(not torch.cpu._is_avx2_supported(), reason="the variables limit the instructions of x86 alone")
+@pytest.mark.parametrize("instructions", ["AVX2", "AVX512_CORE"])
+def test_convolutions_are_as_in_double_precision_on_processors_with_fewer_instructions(instructions):
+    if instructions == "AVX512_CORE" and not torch.cpu._is_avx512_supported():
+        pytest.skip("this processor has no AVX-512")
+    chosen = "three_dimensions and (5-8 or 3-24) or halved and periodic1"
+    environment = os.environ | {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": instructions}
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", chosen]
+    run = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    assert run.returncode == 0, run.stdout
+    assert "4 passed" in run.stdout
 
 
 LAYOUTS = [GridLayout(5, 2, 8, (False, False)), GridLayout(5, 2, 8, (True, False)), GridLayout(6, 3, 2, (False,) * 3)]

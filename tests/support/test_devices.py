@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nmpm._support.devices import find_device
+from nmpm._support.devices import computes_bfloat16, find_device
 from nmpm.errors import ConfigError
 
 
@@ -42,3 +42,19 @@ def test_names_that_are_no_devices(name):
     with pytest.raises(ConfigError, match="is not one of auto, cpu, cuda, mps") as caught:
         find_device(name)
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("onednn", "avx2", "avx512_bf16", "expected"),
+    [(True, True, True, True), (True, True, False, False), (False, True, True, False), (True, False, False, True)],
+    ids=["avx512_bf16", "avx512", "avx2", "arm"],
+)
+def test_bfloat16_is_computed_where_torch_has_instructions_for_it(monkeypatch, onednn, avx2, avx512_bf16, expected):
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: True)
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: onednn)
+    monkeypatch.setattr(torch.cpu, "_is_avx2_supported", lambda: avx2)
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx512_bf16)
+    assert computes_bfloat16(torch.device("cpu")) is expected
+    assert computes_bfloat16(torch.device("cuda"))
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    assert not computes_bfloat16(torch.device("cpu"))

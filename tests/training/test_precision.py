@@ -33,13 +33,6 @@ def test_mixed_bfloat16_is_replaced_on_processors_without_instructions_alone(ins
         assert precision.fitting_precision(name, CPU) == name
 
 
-def test_a_processor_with_avx512_computes_bfloat16_and_one_without_mkldnn_does_not(monkeypatch):
-    if torch.backends.cpu.get_cpu_capability() == "AVX512":
-        assert precision.computes_bfloat16(CPU)
-    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
-    assert not precision.computes_bfloat16(CPU)
-
-
 def test_a_shipped_configuration_trains_in_what_the_processor_computes_and_says_so(
     instructions, make_dataset, tmp_path, monkeypatch, capsys
 ):

@@ -101,23 +101,22 @@ def _compile(network: GridProcessor, grid: Tensor, precision: torch.dtype, threa
     """The network as a program.
 
     Raises:
-        ConfigError: if OpenVINO is not installed, or lacks an operation of the network.
+        ConfigError: if OpenVINO is not installed, or lacks an operation of the network here.
     """
     openvino = _import_openvino()
+    options = _options(_precision_here(openvino, precision), threads)
     try:
         with kept_signal_stack(), _without_telemetry(), torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch.export, about torch's own code
             own, rows = _ChannelsLast(copy.deepcopy(network).float()), grid.float().movedim(1, -1).contiguous()
             model = openvino.convert_model(torch.export.export(own, (rows,)))
             model.reshape(list(rows.shape))
+            request = _core(openvino).compile_model(model, "CPU", options).create_infer_request()
     except Exception as error:  # (neither documents its exceptions)
         raise ConfigError(
             f"OpenVINO cannot run {type(network).__name__}: use the runtime eager ({type(error).__name__}:"
             f" {one_line(error, 200)})."
         ) from error
-    with kept_signal_stack():
-        options = _options(_precision_here(openvino, precision), threads)
-        request = _core(openvino).compile_model(model, "CPU", options).create_infer_request()
     return _Program(request, openvino.Tensor, tuple(model.output(0).shape))
 
 
