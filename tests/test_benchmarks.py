@@ -37,7 +37,7 @@ if not ROOT.is_dir():
     pytest.skip("benchmarks are not part of this distribution", allow_module_level=True)
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
-    "against_recordings", "beside_simulator", "bodies", "calibration", "call_profile", "cropping", "dam_break",
+    "against_recordings", "beside_simulator", "bodies", "busy", "calibration", "call_profile", "cropping", "dam_break",
     "ensembles", "former_entries", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state",
     "installed_wheel", "kills", "precision_steps", "random_commits", "recipe_pictures", "run_time_knob",
     "settled_shape", "simulators", "stable_substeps", "stiffness", "trade_tables", "trades", "where_emulation_pays",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from nmpm._support.limits import DIGITS, TEXT_BYTES, TEXT_DEPTH
+from nmpm._support.limits import ALIASED, DIGITS, TEXT_BYTES, TEXT_DEPTH
 from nmpm._support.messages import one_line
 from nmpm._support.regular_files import check_mode
 from nmpm.errors import DataError
@@ -58,8 +59,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping that a YAML file holds, of strings, numbers, truth values, lists and mappings.
 
     Raises:
-        DataError: if the file cannot be read or is too large, too deep or not YAML, uses anchors, aliases or tags, or
-            holds other values, such as dates, or control characters.
+        DataError: if the file cannot be read or is too large, too deep or not YAML, its aliases repeat too much, it
+            has tags, or holds other values, such as dates, or control characters.
     """
     return parse_yaml(read_text(path), path)
 
@@ -103,6 +104,19 @@ def to_yaml(content: Mapping[str, Any]) -> str:
     return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
 
 
+@dataclass
+class _Extent:
+    """How large a node is, its aliases written out: values in it, and levels below it."""
+
+    anchor: str | None
+    values: int = 1
+    depth: int = 0
+
+    def add(self, inner: _Extent) -> None:
+        self.values += inner.values
+        self.depth = max(self.depth, inner.depth + 1)
+
+
 def check_yaml(text: str) -> None:
     """Refuse what makes a short text a large or slow one, before anything is built.
 
@@ -110,17 +124,29 @@ def check_yaml(text: str) -> None:
         ValueError: naming it and its line.
         yaml.YAMLError: if it is not YAML.
     """
-    depth = 0
+    anchors: dict[str, _Extent] = {}
+    open_nodes, repeated = [_Extent("")], 0
     for event in yaml.parse(text, _LOADER):
         line = event.start_mark.line + 1 if event.start_mark else 0
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise ValueError(f"line {line} has an anchor or alias; write the values out.")
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in anchors:
+                raise ValueError(f"line {line}: *{one_line(event.anchor, 60)} stands for nothing before it.")
+            open_nodes[-1].add(anchors[event.anchor])
+            repeated += anchors[event.anchor].values
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append(_Extent(event.anchor))
+        elif isinstance(event, yaml.CollectionEndEvent | yaml.ScalarEvent):
+            ended = open_nodes.pop() if isinstance(event, yaml.CollectionEndEvent) else _Extent(event.anchor)
+            open_nodes[-1].add(ended)
+            if ended.anchor:
+                anchors[ended.anchor] = ended
+        if len(open_nodes) + open_nodes[-1].depth > TEXT_DEPTH + 2:
+            raise ValueError(f"line {line} is nested more than {TEXT_DEPTH} deep.")
+        if repeated > ALIASED:
+            raise ValueError(f"line {line}: aliases stand for more than {ALIASED:,} values; write fewer.")
         tag = getattr(event, "tag", None)
         if tag is not None:
             raise ValueError(f"line {line} has the tag {one_line(tag, 60)}; only plain values are read.")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > TEXT_DEPTH:
-            raise ValueError(f"line {line} is nested more than {TEXT_DEPTH} deep.")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > DIGITS and _NUMBER.fullmatch(event.value):
             raise ValueError(f"line {line} has a number of more than {DIGITS} digits.")
 

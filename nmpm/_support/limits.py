@@ -8,6 +8,8 @@ TEXT_BYTES = 2**20
 """Size of a card, configuration or report."""
 TEXT_DEPTH = 32
 """Nesting of lists and mappings in a YAML file."""
+ALIASED = 10_000
+"""Values in a YAML file that aliases repeat."""
 DIGITS = 100
 """Length of a number in a YAML file; PyYAML's time to read one grows with the square of its length."""
 NAME_LENGTH = 100

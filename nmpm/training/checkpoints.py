@@ -77,7 +77,7 @@ def load_module(path: Path) -> EmulatorModule:
     """
     content = read_checkpoint(path)
     stored = content.get("hyper_parameters", {})
-    if not isinstance(stored, dict):
+    if not isinstance(stored, dict) or not isinstance(stored.get("scene", {}), dict):
         raise DataError(f"{path} is not a checkpoint of an emulator: its hyperparameters are not named values.")
     arguments = {key: value for key, value in stored.items() if key not in FORMER_ARGUMENTS}
     try:

@@ -59,7 +59,7 @@ def test_a_scene_of_ones_own_starts_from_a_copy(tmp_path, capsys):
     [
         ("name: ../../../x", "name = '../../../x'"),
         ("name: ${oc.env:HOME}", "name = '${oc.env:HOME}'"),
-        ("a: &a [x, x]", "line 1 has an anchor or alias"),
+        ("a: &a [*a]", "line 1: *a stands for nothing before it"),
         ("a: " + "[" * 20_000, "nested more than 32 deep"),
         ("name: \udce9", "'utf-8' codec can't decode"),
     ],

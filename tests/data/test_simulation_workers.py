@@ -199,7 +199,7 @@ def test_a_process_that_ends_is_named_with_what_it_simulated(worker, prepared, m
 
 
 def test_a_stopped_process_leaves_no_half_written_part(worker, prepared):
-    left = part_path(prepared, "train", 0).with_name(f".train-00000.{worker._process.pid}.part.npz")
+    left = part_path(prepared, "train", 0).with_name(f".train-00000.{worker._process.pid}.0123abcd.part.npz")
     left.write_bytes(b"half")
     worker.stop()
     assert not left.exists()

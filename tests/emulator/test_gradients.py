@@ -116,7 +116,7 @@ def test_what_a_bundle_keeps_is_recomputed():
 
 def test_states_are_checked():
     model, particles = emulator(), state(torch.tensor(0.0))
-    with pytest.raises(ValueError, match="not 0"):
+    with pytest.raises(ValueError, match="at least 1"):
         differentiable_rollout(model, particles, 0)
     outside = dataclasses.replace(particles, position=particles.position + 1)
     with pytest.raises(DataError, match="outside of the domain"):

@@ -14,7 +14,7 @@ TRIVIAL = {"still/mse": 0.02, "free_fall/mse": 0.01}
 def test_a_model_that_is_no_better_than_a_trivial_predictor_is_said_to_be_so(error):
     said = no_better_than_trivial({"mse": error, "mse@8": 0.0} | TRIVIAL)
     assert said.startswith("The model is no better than a trivial predictor")
-    assert "'free fall, stopped at walls' 10e-3" in said
+    assert "'free fall, stopped at walls' 10 ×10⁻³" in said
     assert no_better_than_trivial({"mse": 0.009} | TRIVIAL) == no_better_than_trivial({"mse": error}) == ""
 
 

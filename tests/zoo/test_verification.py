@@ -117,7 +117,7 @@ def test_headline_figures_are_the_means_of_those_of_the_scenes():
         ({"test": {}}, "test of its card should state figures"),
         ({"test": None}, "test of its card should state figures"),
         ({"simulation": {}}, "simulation of its card cannot be read: KeyError"),
-        ({"simulation": {"preset": "x"}}, "simulation of its card cannot be read: ConfigError"),
+        ({"simulation": {"preset": "x"}}, "simulation of its card cannot be read: ValueError"),
         ({"simulation": "x"}, "simulation of its card cannot be read: TypeError"),
     ],
     ids=str,

@@ -95,7 +95,7 @@ class ReportWriter(Callback):
             self.curve.append([round(self._elapsed(), 1), self.trained_steps, *errors])
         if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
             dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
-            Console().print(error_table(f"{dataset}: validation", _logged(trainer, "valid/")))
+            _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
         self.trained_seconds, self._since = self._elapsed(), None

@@ -29,7 +29,7 @@ def test_advice_steps_from_the_least_budget_to_the_simulator_itself():
     assert [step.milliseconds for step in steps] == pytest.approx([0, 0.001, 1, 2, 4])
     assert "Nothing that was measured is as fast" in steps[0].sentence
     assert steps[3].sentence.startswith("Run the simulator, 6 substeps")
-    assert "the best emulator there, ours, has 1 (0.8 to 1.2)." in steps[3].sentence
+    assert "the best emulator there, ours, has 1000 (800 to 1200) ×10⁻³." in steps[3].sentence
     assert "it made these data" in steps[4].sentence
 
 
