@@ -66,10 +66,10 @@ def _beside_truth(split: Split, index: int, trajectory: Trajectory, label: str) 
     truth = split.fields(index).get(TRUTH) if label == "prediction" else None
     if truth is None:
         return {label: position}
-    if truth.ndim != 3 or truth.shape[1:] != position.shape[1:] or not len(truth):
+    if truth.dtype.kind not in "iuf" or truth.ndim != 3 or truth.shape[1:] != position.shape[1:] or not len(truth):
         raise DataError(
-            f"{split.where(index)}: truth has the shape {truth.shape}, beside positions of the shape {position.shape}."
-            " Both should be (frames, particles, dimensions), of the same particles."
+            f"{split.where(index)}: truth has the shape {truth.shape} and the type {truth.dtype}, beside positions of"
+            f" the shape {position.shape}. Both should be (frames, particles, dimensions), of the same particles."
         )
     frames = min(len(truth), len(position))
     return {TRUTH: truth[:frames], label: position[:frames]}

@@ -15,6 +15,8 @@ from nmpm.scene import Interval, Scene
 
 STRAIGHT = math.radians(1)
 """Gravity within this angle of straight down needs no arrow."""
+MOST_OBLONG = 1000
+"""Longest side of a box over the shortest; pictures grow with it."""
 Floats = NDArray[np.floating[Any]]
 
 
@@ -205,6 +207,9 @@ class LabelledTrajectories:
         for name, box in {"bounds": self.bounds, "domain": self.outer_bounds}.items():
             if len(box) != self.dim or not all(low < high and np.isfinite(high - low) for low, high in box):
                 raise DataError(f"{name} = {box} must be (lower, upper) for each of {self.dim} axes.")
+        sides = [high - low for low, high in self.outer_bounds]
+        if max(sides) > MOST_OBLONG * min(sides):
+            raise DataError(f"A box of {sides} is too oblong to draw: at most {MOST_OBLONG} times as long as wide.")
         for name, values in {"periodic": self.periodic, "gravity": self.gravity}.items():
             if values and len(values) != self.dim:
                 raise DataError(f"{name} = {values} must have one entry for each of {self.dim} axes.")

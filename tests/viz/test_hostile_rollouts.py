@@ -61,7 +61,8 @@ def content(tmp_path_factory):
     )  # fmt: skip
     predicted = position[:, None] + 0.01 * torch.arange(3)[None, :, None, None]
     path = tmp_path_factory.mktemp("rollout") / "out.h5"
-    write_split(path, [predicted_trajectory(SCENE, state, predicted, "a test", fields={"heat": predicted[..., 0]})])
+    fields, truth = {"heat": predicted[..., 0]}, position[:, None].expand(-1, 4, -1, -1)
+    write_split(path, [predicted_trajectory(SCENE, state, predicted, "a test", fields=fields, truth=truth)])
     return path.read_bytes()
 
 

@@ -34,6 +34,7 @@ def test_trajectories_must_have_the_same_frames_and_particles(falling):
         ({"material": np.array(["water"])}, "one name for each of 2"),
         ({"bounds": ((0.1, 0.9),)}, "bounds"),
         ({"domain": ((0.9, 0.1), (0.1, 0.9))}, "domain"),
+        ({"domain": ((0.0, 1e5), (0.0, 1.0))}, "too oblong to draw"),
         ({"obstacle": np.zeros((4, 3))}, "Obstacles"),
         ({"obstacle": np.full((4, 2), np.nan)}, "obstacle"),
         ({"periodic": (True,)}, "periodic"),
