@@ -24,7 +24,7 @@ from nmpm.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parent.parent
 STATUS = "exit status "
-TESTS = ("tests/test_on_device.py", "tests/processors", "tests/transfer")
+TESTS = ("tests/test_on_device.py", "tests/emulator/test_gpu.py", "tests/processors", "tests/transfer")
 """What `--device` changes."""
 LARGE_GRIDS = ("64x64", "256x256", "1024x1024", "64x64x64", "128x128x128")
 

@@ -62,7 +62,8 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
         "--runtime",
         default="eager",
         help="what computes the network: eager (torch, default), openvino (CPU, nmpm[openvino]), cuda-graph (GPU,"
-        " one scene in a fifth of the time), or auto for the fastest that runs here",
+        " one scene in a fifth of the time), triton (GPU, not tried on one yet), or auto for the fastest that runs here"
+        " but triton",
     )
 
 

@@ -41,7 +41,7 @@ def optimize(emulator: Emulator, runtime: str, make_example: Callable[[], Partic
     if runtime != AUTO:
         return _checked(emulator, runtime, make_example)
     fitting = []
-    for name in RUNTIMES:
+    for name in (name for name, kind in RUNTIMES.items() if kind.automatic):
         try:
             fitting.append(_checked(emulator, name, make_example))
         except ConfigError as error:

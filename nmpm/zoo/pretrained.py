@@ -185,7 +185,8 @@ class Pretrained:
 
         Args:
             runtime: A name of `nmpm.emulator.runtimes.RUNTIMES`: "openvino" (CPU, needs `nmpm[openvino]`), "cuda-graph"
-                (GPU) or "eager", torch itself; "auto" for the fastest here, as measured in short rollouts.
+                or "triton" (GPU), or "eager", torch itself; "auto" for the fastest here but "triton", which no GPU has
+                tried yet, as measured in short rollouts.
             precision: As for `with_network`; the network's own if left out.
 
         Raises:

@@ -73,7 +73,7 @@ def test_another_runtime_gives_the_same_rollout_to_rounding(folder):
         (["goop", "--device", "cuda:77"], "has no device 'cuda:77'"),
         (["goop", "--device", "gpu"], "--device gpu: it is not one of auto, cpu, cuda, mps"),
         (["goop", "--device", "meta"], "--device meta: it is not one of"),
-        (["goop", "--runtime", "fast"], "No runtime is called 'fast'; there are auto, cuda-graph, openvino, eager."),
+        (["goop", "--runtime", "fast"], "called 'fast'; there are auto, cuda-graph, triton, openvino, eager."),
         (["goop", "--runtime", "cuda-graph"], "The runtime cuda-graph needs a CUDA GPU; the model is on cpu."),
         (["gop"], "Did you mean goop?"),
         (["nothing.ckpt"], "nothing.ckpt: there is no such checkpoint"),

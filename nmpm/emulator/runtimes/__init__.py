@@ -13,11 +13,14 @@ from nmpm.emulator.runtimes.base import Runtime
 from nmpm.emulator.runtimes.cuda_graph import CudaGraph
 from nmpm.emulator.runtimes.eager import Eager
 from nmpm.emulator.runtimes.openvino import OpenVINO
+from nmpm.emulator.runtimes.triton import Triton
 from nmpm.errors import ConfigError
 
-__all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "check_runtime", "find_runtime"]
+__all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "Triton", "check_runtime", "find_runtime"]
 
-RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType({kind.name: kind for kind in (CudaGraph, OpenVINO, Eager)})
+RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType(
+    {kind.name: kind for kind in (CudaGraph, Triton, OpenVINO, Eager)}
+)
 """Runtimes by name; the last one runs every network everywhere."""
 
 

@@ -64,11 +64,15 @@ class CudaGraph(Runtime):
             values: dict[str, Any] = dict(zip(state, copies, strict=False))
             own = dataclasses.replace(particles, **values)
             budget = None if context.budget is None else copies[-1]
-            return emulator.predict(own, dataclasses.replace(context, solid=copies[len(state)], budget=budget))
+            return self.predict(emulator, own, dataclasses.replace(context, solid=copies[len(state)], budget=budget))
 
         shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
         recorded = self._programs.find(emulator, shapes, lambda: Recorded(predict, inputs))
         return recorded(inputs)
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        """The bundle that is recorded."""
+        return emulator.predict(particles, context)
 
 
 class Recorded:

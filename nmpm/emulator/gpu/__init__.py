@@ -1,0 +1,5 @@
+"""Steps of a call on a CUDA GPU as kernels in Triton, for `nmpm.emulator.runtimes.triton`.
+
+`grid` has the kernels between particles and grid, `flight` those of a path, `contact` and `crowding` those that change
+it; `steps` launches them.
+"""

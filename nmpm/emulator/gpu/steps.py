@@ -1,0 +1,172 @@
+"""The steps of a call on a CUDA GPU: which kernel runs when, on which memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import triton
+from torch import Tensor
+
+from nmpm.emulator.bundle import RolloutContext
+from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
+from nmpm.emulator.contact import SURFACE, obstacle_share
+from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
+from nmpm.emulator.departure import Departure
+from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.gpu import contact, crowding, flight, grid
+from nmpm.emulator.steps import TensorSteps
+from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
+from nmpm.particles import Particles
+
+_BLOCK = 256
+"""Particles, or nodes, of a program."""
+
+_COLUMNS = 16
+"""Of cells that a program of `grid.support` treats."""
+
+
+@dataclass(frozen=True)
+class TritonSteps(TensorSteps):
+    """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.triton` takes. States are contiguous.
+
+    Args:
+        plan: Of the emulator.
+    """
+
+    plan: Plan
+
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        plan, materials = self.plan, len(self.plan.mass)
+        cells, velocity, gravity = (values.contiguous() for values in self.emulator.in_cells(particles))
+        sums = cells.new_zeros(len(cells), *plan.shape, 3 * materials)
+        grid.scatter[_programs(cells)](
+            cells, velocity, particles.material, particles.mask, sums, cells.shape[1], **self._axes,
+            MATERIALS=materials, BLOCK=_BLOCK,
+        )  # fmt: skip
+        count = sums[..., 2 * materials :]
+        mean = sums[..., : 2 * materials] / torch.where(count > 0, count, 1.0).repeat_interleave(2, dim=-1)
+        parts = [mean, count * plan.particle_volume, solid.movedim(1, -1)]
+        if plan.constants:
+            parts.append(gravity.unsqueeze(1).expand(-1, *plan.shape, -1))
+        return cells, velocity, gravity, torch.cat(parts, dim=-1).movedim(-1, 1)
+
+    def path(self, start: Departure, context: RolloutContext) -> Tensor:
+        plan, (tiles, batch), frames = self.plan, _programs(start.cells), start.output.shape[1]
+        path = start.cells.new_empty(batch, frames + 1, start.cells.shape[1], 2)
+        sums = path.new_empty(batch, frames, tiles, flight.SUMS.value)
+        share, weight = self._share(context), self._weight(start)
+        self._advance(start, weight, context.budget, path, sums)
+        if plan.obstacles and plan.solids:
+            self._hold(path, weight, share, sums)
+        if plan.rest_speed:
+            self._rest(start, path, share)
+        return path[:, 1:]
+
+    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+        plan, (tiles, batch), frames = self.plan, _programs(start.cells), path.shape[1]
+        weight, count = self._weight(start), path.shape[2]
+        path = torch.cat([start.cells.unsqueeze(1), path], dim=1)
+        flow = self._flow(path, weight, context.solid)
+        spreads, energies = torch.empty_like(path), path.new_empty(batch, frames + 1, tiles, 2)
+        crowding.spread[tiles, batch](
+            path, weight, start.gravity, self._share(context), flow, spreads, energies, frames, count, tiles,
+            *self._limits, float(plan.ratio[1]), **self._axes, CONTACT=plan.obstacles and plan.solids, SURFACE=SURFACE,
+            SHIFT=MAX_SHIFT, BLOCK=_BLOCK,
+        )  # fmt: skip
+        if context.budget is not None:
+            crowding.land[tiles, batch](
+                path, spreads, energies, context.budget, frames, count, tiles, BLOCK=_BLOCK, TILES=_power(tiles)
+            )
+        return spreads[:, 1:]
+
+    @property
+    def _axes(self) -> dict[str, int]:
+        """What kernels are told of the grid."""
+        (nx, ny), (wx, wy) = self.plan.shape, self.plan.wraps
+        return {"nx": nx, "ny": ny, "WX": int(wx), "WY": int(wy)}
+
+    @property
+    def _limits(self) -> tuple[float, ...]:
+        """Lowest and highest position along the first and the second axis, in cells."""
+        low, high, _ = self.plan.limits
+        return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+    def _weight(self, start: Departure) -> Tensor:
+        """(B, N, 1) each particle's share of its scene's mass, 0 for padding."""
+        return mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
+
+    def _share(self, context: RolloutContext) -> Tensor:
+        """(B, 1, *S) share of each cell's room that is obstacle; of no use where there are no obstacles."""
+        walls = self.emulator.walls
+        return obstacle_share(context.solid, walls).contiguous() if self.plan.obstacles else walls
+
+    def _advance(self, start: Departure, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor) -> None:
+        plan, fields, (batch, frames, tiles, _) = self.plan, start.fields, sums.shape
+        kept, of_grid, fall, keeps = plan.decoder
+        state, carried = start.state.movedim(1, -1).contiguous(), torch.empty_like(start.cells)
+        for frame in range(frames + 1):
+            flight.advance[tiles, batch](
+                start.cells, start.velocity, start.material, weight, start.gravity, state, fields,
+                sums if budget is None else budget, carried, path, sums, frame, frames, path.shape[2], tiles,
+                plan.channels, *self._limits, float(plan.ratio[1]), *fields.stride(), **self._axes,
+                MATERIALS=len(plan.mass), OWN=kept, GRID=of_grid, FALL=fall, KEEPS=keeps > 0,
+                LIMITED=budget is not None, FIRST=frame == 0, LAST=frame == frames, BLOCK=_BLOCK, TILES=_power(tiles),
+            )  # fmt: skip
+
+    def _hold(self, path: Tensor, weight: Tensor, share: Tensor, sums: Tensor) -> None:
+        (batch, frames, tiles, _), count = sums.shape, path.shape[2]
+        free = torch.empty_like(weight, dtype=torch.int32)
+        way, lengths = path.new_empty(batch, 2, count, 2), path.new_empty(batch, tiles)
+        known: dict[str, Any] = {"SURFACE": SURFACE, "BLOCK": _BLOCK, "STEPS": _power(tiles * frames)} | self._axes
+        contact.touch[tiles, batch](path, weight, share, sums, free, way, lengths, frames, count, tiles, **known)
+        contact.hold[tiles, batch](
+            path, share, sums, free, way, lengths, frames, count, tiles, *self._limits, **known, TILES=_power(tiles)
+        )
+
+    def _rest(self, start: Departure, path: Tensor, share: Tensor) -> None:
+        plan, longest, batch = self.plan, max(self.plan.shape), len(path)
+        held = start.mask.new_empty(batch, plan.size, dtype=torch.int8)
+        (left, right), (down, up) = plan.floors
+        known: dict[str, Any] = {"OBSTACLES": plan.obstacles, "SURFACE": SURFACE} | self._axes
+        grid.support[triton.cdiv(longest, _COLUMNS), batch](
+            start.filled.contiguous(), share, start.gravity, held, **known, LEFT=left, RIGHT=right, DOWN=down, UP=up,
+            REACH=REACH, ENOUGH=ENOUGH, ROWS=_power(longest), COLUMNS=_COLUMNS,
+        )  # fmt: skip
+        flight.rest[_programs(start.cells)](
+            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, plan.rest_speed, **known,
+            FREE_FALL=FREE_FALL_SHARE, DROP=MAX_DROP, BLOCK=_BLOCK,
+        )  # fmt: skip
+
+    def _flow(self, path: Tensor, weight: Tensor, solid: Tensor) -> Tensor:
+        """(B, *S, 2) displacements at the nodes that spread overfull cells at the path's end."""
+        plan, (batch, frames, count, _) = self.plan, path.shape
+        taken, per_scene = (solid, plan.size) if plan.solid else (self.emulator.walls, 0)
+        counts = path.new_zeros(batch, *plan.shape)
+        crowding.count_ends[_programs(path[:, 0])](path, weight, counts, count, frames - 1, **self._axes, BLOCK=_BLOCK)
+        before, after, over_nodes = torch.empty_like(counts), torch.empty_like(counts), (_blocks(plan.size), batch)
+        factor = 1 / float(plan.ratio[1]) ** 2
+        for sweep in range(SWEEPS):
+            before, after = after, before
+            crowding.relax[over_nodes](
+                counts, taken, per_scene, before, after, plan.particle_volume / plan.density_cap, factor, **self._axes,
+                CLOSED=CLOSED, FIRST=sweep == 0, BLOCK=_BLOCK,
+            )  # fmt: skip
+        flow = path.new_empty(batch, *plan.shape, 2)
+        crowding.find_flow[over_nodes](taken, per_scene, after, flow, factor, **self._axes, BLOCK=_BLOCK)
+        return flow
+
+
+def _blocks(count: int) -> int:
+    return max(1, -(-count // _BLOCK))
+
+
+def _programs(cells: Tensor) -> tuple[int, int]:
+    """Programs of a launch over particles (B, N, D)."""
+    return _blocks(cells.shape[1]), len(cells)
+
+
+def _power(count: int) -> int:
+    """The least power of two that is not below."""
+    return 1 << (count - 1).bit_length()

@@ -1,0 +1,153 @@
+"""The GPU's kernels, run by Triton's interpreter on a CPU, give what tensor operations give."""
+
+import dataclasses
+import os
+
+import pytest
+import torch
+from scenes import box, cloud
+
+from nmpm.decoders import Absolute, Acceleration, Blend
+from nmpm.emulator import Emulator, EmulatorRecipe, rollout
+from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.runtimes import Triton, cuda_graph
+from nmpm.emulator.steps import TensorSteps
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+from nmpm.processors import UNet
+from nmpm.transfer import Quadratic, using
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported
+SMALL = UNet(width=4, depth=1, perceptron=(4,))
+FAST = {"count": 60, "batch": 2, "speed": 0.04}
+
+
+def emulator_of(scene, reach: float = 0.3, frames: int = 3, cells=16, decoder=None, **held) -> Emulator:
+    """With random weights that move particles by about `reach` cells in a frame."""
+    torch.manual_seed(0)
+    parts = {} if decoder is None else {"decoder": decoder}
+    recipe = EmulatorRecipe(scene, cells, frames, processor=SMALL, constraints=Constraints(**held), **parts)
+    emulator = recipe.build().eval().requires_grad_(False)
+    emulator.output_scale.fill_(reach)
+    return emulator
+
+
+CASES = {
+    "free": (box(), {}, {}),
+    "one frame": (box(), {"frames": 1, "rest_speed": 0.1}, {}),
+    "energy": (box(), {"energy": True}, {"speed": 0.01}),
+    "at rest": (box(), {"energy": True, "rest_speed": 1.0, "reach": 0.05}, {"count": 120}),
+    "obstacles": (box(obstacles=True), {"energy": True, "rest_speed": 0.3}, FAST),
+    "crowded": (box(obstacles=True), {"energy": True, "density_cap": 1.0, "reach": 0.02}, FAST | {"count": 120}),
+    "crowded, free": (box(), {"density_cap": 0.5, "reach": 0.02}, {"count": 120}),
+    "materials": (
+        box(materials=("water", "sand"), densities=(1.0, 3.0)),
+        {"energy": True, "density_cap": 1.0, "rest_speed": 0.05},
+        {"speed": 0.02, "batch": 2},
+    ),
+    "acceleration": (box(), {"decoder": Acceleration(), "energy": True}, {}),
+    "absolute": (box(), {"decoder": Absolute()}, {}),
+    "blend, gravity differs": (
+        box(gravity=None, gravity_varies=True),
+        {"decoder": Blend(), "energy": True, "rest_speed": 0.1},
+        {"batch": 2},
+    ),
+    "periodic": (
+        box(boundary=("periodic", "wall"), domain=((0.1, 0.9), (0.08, 0.92))),
+        {"energy": True, "rest_speed": 0.2, "cells": (16, 14)},
+        {"count": 120},
+    ),
+}
+
+
+def state_of(scene, **motion) -> Particles:
+    """A cloud in which obstacles are a wall of two cells, some of them padded; gravity is not the same everywhere."""
+    state = cloud(scene, **{"speed": 0.005} | motion)
+    batch = len(state.position)
+    state.mask[:, -3:] = False
+    gravity = torch.tensor([[0.0, 2e-4], [-3e-4, 1e-4]])[:batch] if scene.gravity_varies else state.gravity
+    if scene.obstacles:
+        sides = torch.linspace(0.5, 0.6, 6), torch.linspace(0.2, 0.6, 20)
+        wall = torch.cartesian_prod(*sides).expand(batch, -1, -1)
+        state = dataclasses.replace(state, obstacle=wall, obstacle_mask=torch.ones(wall.shape[:2], dtype=torch.bool))
+    return dataclasses.replace(state, gravity=gravity)
+
+
+def run_again(function, _):
+    """A stand-in for the GPU's recorder."""
+    made = function()
+
+    def replay():
+        again = function()
+        made.position.copy_(again.position)
+        made.velocity.copy_(again.velocity)
+
+    return replay, made
+
+
+@pytest.fixture
+def triton(monkeypatch, device):
+    """Lets emulators take the runtime; without a GPU in Triton's interpreter, and without a graph."""
+    pytest.importorskip("triton", reason="triton is not installed")
+    from nmpm.emulator.gpu import steps
+
+    monkeypatch.setattr(steps, "_BLOCK", 64)  # more than one program for each scene
+    if device.type != "cuda":
+        if torch.cuda.is_available():
+            pytest.skip("kernels are compiled for the GPU: --device cuda")
+        monkeypatch.setattr(Triton, "obstacle", lambda *_: "")
+        monkeypatch.setattr(cuda_graph, "record", run_again)
+
+
+@pytest.mark.usefixtures("triton")
+@pytest.mark.parametrize("name", CASES)
+def test_bundles_are_those_of_tensor_operations(name, device):
+    scene, form, motion = CASES[name]
+    emulator, state = emulator_of(scene, **form).to(device), state_of(scene, **motion).to(device)
+    with torch.no_grad():
+        context = emulator.context(state)
+        for _ in range(2):
+            there = emulator.with_runtime("triton")(state, context)
+            here = TensorSteps(emulator).predict(emulator, state, context)
+            real = state.mask
+            gap = (there.position - here.position).abs().amax((1, 3)) / emulator.grid.spacing[0]
+            assert gap[real].max() < 1e-4
+            torch.testing.assert_close(there.velocity[real], here.velocity[real], rtol=1e-3, atol=1e-6)
+            state = here.state_after(state)
+
+
+@pytest.mark.usefixtures("triton")
+def test_rollouts_go_on_from_states_of_any_size_and_precision(device):
+    emulator = emulator_of(box(), energy=True).to(device)
+    quick = emulator.with_runtime("triton")
+    for count in (60, 1, 60):
+        state = cloud(box(), count, seed=count).to(device)
+        for own in (state, state.double()):
+            with using("native"):
+                expected = rollout(emulator, own, 6)
+            got = rollout(quick, own, 6)
+            assert got.dtype == expected.dtype
+            torch.testing.assert_close(got, expected, rtol=0, atol=1e-4 * emulator.grid.spacing[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda own: own, "needs a CUDA GPU; the model is on cpu"),
+        (lambda own: own.to("cuda"), "needs Triton"),
+        (lambda own: emulator_of(box(3)), "has no kernels for 3 dimensions: use cuda-graph or eager"),
+        (Emulator.double, "torch.float64"),
+        (lambda own: own.with_constraints(Constraints(bounds="reflect")), "constraints.bounds reflect"),
+        (lambda own: own.rebuilt(dataclasses.replace(own.recipe, transfer=Quadratic())), "the transfer Quadratic"),
+        (lambda own: emulator_of(box(evolving=("heat",))), r"fields \(heat\)"),
+    ],
+)
+def test_what_the_kernels_do_not_take_is_refused(change, reason, monkeypatch):
+    monkeypatch.setattr(Emulator, "to", lambda own, _: own)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    emulator = change(emulator_of(box()))
+    if "cpu" not in reason:
+        monkeypatch.setattr(Emulator, "device", torch.device("cuda"))
+    with pytest.raises(ConfigError, match=f"The runtime triton .*{reason}"):
+        emulator.with_runtime("triton")
