@@ -24,8 +24,9 @@ def test_what_is_written_is_read_again_numbers_without_a_point_too():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: &x [1]\nb: [*x, *x]\n", "line 1 has an anchor or alias"),
-        ("a: &x 1\n", "anchor"),
+        ("a: &x [1, *x]\n", r"line 1: \*x stands for nothing before it"),
+        (f"a: &x [{'1, ' * 99}1]\nb: [{'*x, ' * 100}1]\n", "line 2: aliases stand for more than 10,000 values"),
+        ("a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}]\n" for i in range(1, 40)), "nested more than 32 deep"),
         ("a: !!python/object/apply:os.system ['true']\n", "has the tag"),
         ("a: !!int '3'\n", "has the tag"),
         ("a: " + "[" * 33 + "]" * 33 + "\n", "nested more than 32 deep"),

@@ -98,7 +98,8 @@ def mutate(group, rng):
     name = rng.choice(names)
     text = group.attrs[name]
     if kind == "json":
-        group.attrs[name] = rng.choice([*TEXTS, damage(text.encode(), random_changes(rng)).decode(errors="replace")])
+        damaged = damage(text.encode(), random_changes(rng)).decode(errors="replace")
+        group.attrs[name] = rng.choice([*TEXTS, damaged.replace("\0", "0")])  # (h5py writes no NUL)
     elif kind == "value":
         plain = json.loads(text)
         group.attrs[name] = json.dumps(changed(plain, rng.choice(list(places(plain))), rng.choice(VALUES)))
