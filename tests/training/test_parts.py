@@ -1,5 +1,7 @@
 """Batches in parts: the same error and gradients as in one, and the same bits by any number of threads."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from nmpm.decoders import Residual
 from nmpm.emulator.constraints import Constraints
 from nmpm.processors import FNO, UNet
 from nmpm.training import EmulatorModule
+from nmpm.training.callbacks.threads import Threads
 from nmpm.training.parts import mean_over_parts, split_rows
 from nmpm.transfer import Linear
 
@@ -74,6 +77,20 @@ def test_rollouts_in_parts_are_those_of_the_whole(step):
     whole = module.predict_step(batch, 0)
     module.parts = 3
     torch.testing.assert_close(module.predict_step(batch, 0), whole, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("stated", "stored", "parts"), [(2, 3, 2), (None, 3, 3), (None, 0, 1)])
+def test_a_resumed_training_keeps_its_parts_unless_threads_are_stated_or_a_gpu_had_none(
+    step, monkeypatch, stated, stored, parts
+):
+    monkeypatch.setattr("nmpm._support.threads.usable_cores", lambda: 1)
+    module, _ = step(UNet(width=4, depth=1, perceptron=(4,)))
+    trainer = SimpleNamespace(strategy=SimpleNamespace(root_device=torch.device("cpu")), world_size=1, num_nodes=1)
+    callback = Threads(stated)
+    callback.setup(trainer, module, "fit")
+    callback.load_state_dict({"parts": stored})
+    assert callback.state_dict() == {"parts": parts}
+    assert module.parts == parts
 
 
 def test_an_error_in_a_thread_is_raised(step):

@@ -55,8 +55,10 @@ class Threads(Callback):
         return {"parts": self._parts}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._parts = int(state_dict["parts"])
-        if self._module is not None and not self.stated:
+        if self.stated:
+            return
+        self._parts = int(state_dict["parts"]) or self._parts  # 0 where it was trained on a GPU
+        if self._module is not None:
             self._module.parts = self._parts
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:  # noqa: ARG002
