@@ -20,6 +20,7 @@ from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.baselines import still
 from nmpm.evaluation.comparison import Comparison
 from nmpm.training.module import OVERALL, EmulatorModule
+from nmpm.training.trainer_checks import may_log_more
 
 CHECKPOINT_SIZE = 5
 """Bytes of a checkpoint for each of the weights', at most: averaged ones and the state of SOAP or Adam with them."""
@@ -76,11 +77,10 @@ def check_monitors(trainer: Trainer, module: EmulatorModule, errors: set[str]) -
     Raises:
         ConfigError: naming the errors that there are.
     """
-    callbacks = trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
-    if any(type(one).__module__.partition(".")[0] not in ("lightning", "nmpm") for one in (module, *callbacks)):
+    if may_log_more(trainer, module):
         return
     names = ["train/loss", *sorted(f"valid/{name}" for name in errors)]
-    for callback in callbacks:
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]  # (Lightning sets it)
         monitor = getattr(callback, "monitor", None)
         if monitor is not None and monitor not in names:
             raise ConfigError(

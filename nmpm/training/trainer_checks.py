@@ -132,10 +132,14 @@ def _callback_reasons(trainer: Trainer, module: LightningModule) -> Iterator[str
         ):
             yield f"{name}: give use_buffers=False; normalisation statistics are constants, which have no average."
 
-    extended = any(not type(one).__module__.startswith(OURS) for one in (module, *_callbacks(trainer)))
-    for one, monitor in [] if extended else _monitors(trainer):
+    for one, monitor in [] if may_log_more(trainer, module) else _monitors(trainer):
         if not monitor.startswith(LOGGED):
             yield f"{type(one).__name__} monitors {monitor}, which is not logged: give valid/overall, for example."
+
+
+def may_log_more(trainer: Trainer, module: LightningModule) -> bool:
+    """Whether a module or callback of the user's may log what callbacks monitor."""
+    return any(not type(one).__module__.startswith(OURS) for one in (module, *_callbacks(trainer)))
 
 
 def _monitors(trainer: Trainer) -> Iterator[tuple[object, str]]:
