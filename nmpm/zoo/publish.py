@@ -6,19 +6,18 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import check_characters, to_yaml
-from nmpm._support.digests import float32_digest, weights_digest
-from nmpm._support.messages import one_line
+from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
 from nmpm.errors import DataError, ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
-from nmpm.zoo.cards import MALFORMED, readme, stress_digest
+from nmpm.zoo.cards import readme, stress_digest
 from nmpm.zoo.charts import write_chart
 from nmpm.zoo.entries import CARD, writing
 from nmpm.zoo.golden import golden_rollout
@@ -32,9 +31,6 @@ STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
 """Files of `nmpm stress --report`, with and without constraints, by the key of the card."""
 COPIED = ("rollout.png", "errors.csv")
 """Files of a run that its entry keeps."""
-Keep = Callable[[Mapping[str, Any], str], Mapping[str, Any]]
-_EMULATOR = "emulator."
-"""Before the names of the emulator's weights in a checkpoint."""
 
 
 def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -> Path:
@@ -60,34 +56,6 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
     return target
 
 
-def replace(run: Path, name: str, root: Path, about: str = "", keep: Keep | None = None) -> Path:
-    """Like `add`, in place of the entry `root/name` where there is one.
-
-    Args:
-        run: As for `add`.
-        name: Of the entry.
-        root: The zoo's folder.
-        about: As for `add`.
-        keep: Given the new card and the text of its config.yaml, what that takes over from the former entry's card.
-    """
-    target = _writable_zoo(root) / check_name(name)
-    _publish(run, name, target, about, keep)
-    write_index(root)
-    return target
-
-
-def weights_of(checkpoint: Path) -> str:
-    """The SHA-256 of the weights that an entry of a checkpoint has."""
-    return hashlib.sha256(serialise(_rounded(checkpoint))).hexdigest()
-
-
-def rounded_checkpoint(checkpoint: Path) -> dict[str, Any]:
-    """The content of a checkpoint, with the weights that its entry has: what is measured of it holds for the entry."""
-    content, rounded = read_checkpoint(checkpoint), _rounded(checkpoint).state_dict()
-    content["state_dict"] |= {f"{_EMULATOR}{name}": value for name, value in rounded.items()}
-    return content | {"nmpm_digest": weights_digest(content["state_dict"])}
-
-
 def _digest(checkpoint: Path) -> str:
     """That of a checkpoint's weights, as reports of its test state it."""
     return float32_digest(read_checkpoint(checkpoint)["state_dict"])
@@ -98,7 +66,7 @@ def _rounded(checkpoint: Path) -> Emulator:
     return round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
 
 
-def _publish(run: Path, name: str, target: Path, about: str, keep: Keep | None = None) -> None:
+def _publish(run: Path, name: str, target: Path, about: str) -> None:
     checkpoint, report = run / BEST, run / "report.json"
     for needed in (checkpoint, report):
         if not needed.is_file():
@@ -113,34 +81,21 @@ def _publish(run: Path, name: str, target: Path, about: str, keep: Keep | None =
         card = _card(name, about, figures, emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
         present = {key: run / file for key, file in STRESS_REPORTS.items() if (run / file).is_file()}
         card |= {key: stress_digest(_read_json(path)) for key, path in present.items()}
-        readme(card, ())
-    except (KeyError, TypeError) as error:
-        raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
-    recipe = to_yaml(emulator.recipe.to_dict())
-    try:
-        with writing(target):
-            card, text = _with_kept(card, {} if keep is None else keep(card, recipe), target, files)
-            _write(target, weights, {"config.yaml": recipe, "card.yaml": to_yaml(card), "README.md": text}, files)
-    except OSError as error:
-        raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
-
-
-def _with_kept(
-    card: dict[str, Any], kept: Mapping[str, Any], target: Path, files: Sequence[Path]
-) -> tuple[dict[str, Any], str]:
-    """The card with what it takes over from the former one, and its README.
-
-    Raises:
-        ZooError: if either cannot be shown.
-    """
-    path, card = target / CARD, {**card, **kept}
-    try:
-        check_characters(card, path)
-        return card, readme(card, [file.name for file in files])
+        check_characters(card, target / CARD)
+        texts = {
+            "config.yaml": to_yaml(emulator.recipe.to_dict()),
+            CARD: to_yaml(card),
+            "README.md": readme(card, [file.name for file in files]),
+        }
     except DataError as error:
         raise ZooError(str(error)) from error
-    except MALFORMED as error:
-        raise ZooError(f"{path} has {', '.join(kept)} that are malformed ({one_line(repr(error))}).") from error
+    except (KeyError, TypeError) as error:
+        raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
+    try:
+        with writing(target):
+            _write(target, weights, texts, files)
+    except OSError as error:
+        raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
 
 
 def new_entry_folder(name: str, root: str | Path | None) -> Path:

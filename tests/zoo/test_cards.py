@@ -11,7 +11,7 @@ from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo import Zoo
 from nmpm.zoo.cards import readme, stress_line
-from nmpm.zoo.publish import add, replace
+from nmpm.zoo.publish import add
 
 TEST = {"mse": 0.00055842194, "mse@8": 3.4241e-08, "still/mse": 0.0535708, "free_fall/mse": 0.03128, "emd": 0.012345}
 
@@ -105,17 +105,13 @@ def test_a_report_of_other_weights_is_refused(run, small):
         add(run, "others")
 
 
-@pytest.mark.parametrize("write", [add, replace])
-def test_variants_stay_when_the_model_that_they_lie_beside_is_written(run, home, write):
+def test_variants_stay_when_the_model_that_they_lie_beside_is_written(run, home):
     fast = add(run, "mine/fast")
     before = {path: path.read_bytes() for path in fast.iterdir()}
     assert Zoo.variants("mine", home / "zoo") == ["mine/fast"]
-    write(run, "mine", home / "zoo")
+    add(run, "mine", home / "zoo")
     assert Zoo.variants("mine", home / "zoo") == ["mine", "mine/fast"]
     assert {path: path.read_bytes() for path in fast.iterdir()} == before
-    replace(run, "mine/fast", home / "zoo", about="again")
-    assert Zoo.card("mine/fast", home / "zoo")["about"] == "again"
-    assert Zoo.card("mine", home / "zoo")["about"] == ""
     assert [path.name for path in (home / "zoo").glob("**/.*")] == []
 
 
