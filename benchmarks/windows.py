@@ -17,7 +17,7 @@ import torch
 from timing import Spread, clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
 from nmpm.emulator import Emulator
-from nmpm.emulator.steps import steps_for
+from nmpm.emulator.steps import TensorSteps
 from nmpm.emulator.windows import choose_windows
 from nmpm.particles import Particles
 from nmpm.processors import Patched, Processor, UNet
@@ -77,7 +77,7 @@ def fill(emulator: Emulator, share: float) -> Particles:
 def measure(emulator: Emulator, state: Particles, rounds: int) -> dict[str, Any]:
     """Seconds of the network and of a call, on windows and on the whole grid, and the cells of the windows."""
     whole, context, network = emulator.with_windows(None), emulator.context(state), emulator.processor
-    _, _, _, grid_state = steps_for(emulator, emulator._plan, state, context.solid).rasterise(state, context.solid)
+    _, _, _, grid_state = TensorSteps(emulator).rasterise(state, context.solid)
     inputs = emulator.normalise(grid_state).to(emulator.network_precision)
     chosen = []
 

@@ -20,7 +20,7 @@ from nmpm.particles import Particles
 
 if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator
-    from nmpm.emulator.steps import Steps
+    from nmpm.emulator.steps import TensorSteps
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Flight:
     evolved: Mapping[str, Tensor]
 
 
-def predict_bundle(emulator: Emulator, steps: Steps, particles: Particles, context: RolloutContext) -> Bundle:
+def predict_bundle(emulator: Emulator, steps: TensorSteps, particles: Particles, context: RolloutContext) -> Bundle:
     """The next m frames, operation by operation; only the network is left to the runtime.
 
     Args:
@@ -68,14 +68,16 @@ def predict_bundle(emulator: Emulator, steps: Steps, particles: Particles, conte
         return _land(emulator, steps, flight, context, particles.position.dtype)
 
 
-def _land(emulator: Emulator, steps: Steps, flight: Flight, context: RolloutContext, precision: torch.dtype) -> Bundle:
+def _land(
+    emulator: Emulator, steps: TensorSteps, flight: Flight, context: RolloutContext, precision: torch.dtype
+) -> Bundle:
     start, path = flight.start, flight.path
     step = path[:, -1] - (path[:, -2] if emulator.frames > 1 else start.cells)
     if emulator.constraints.density_cap and not emulator.training:
         # Spreading is no motion of the material: the velocity is that of the path without it.
         path = steps.uncrowded(start, path, context)
     velocity = emulator.grid.to_displacement(step.to(precision))
-    return Bundle(steps.to_length(path, precision), velocity, flight.evolved)  # the last use of the path's memory
+    return Bundle(emulator.grid.to_length(path.to(precision)), velocity, flight.evolved)
 
 
 def _evolve_fields(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -27,17 +27,26 @@ if TYPE_CHECKING:
 
 
 class Steps(ABC):
-    """What a call does before and after the network."""
+    """How an emulator's calls are computed."""
 
     def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
-        """What these steps prepare for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
+        """What is prepared for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
         return None
 
+    @abstractmethod
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        """The next m frames of `emulator`, from these steps and its network."""
+        """The next m frames, from these steps and the emulator's network."""
+
+
+@dataclass(frozen=True)
+class TensorSteps(Steps):
+    """The steps as tensor operations; subclasses replace some of them."""
+
+    emulator: Emulator
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
         return predict_bundle(emulator, self, particles, context)
 
-    @abstractmethod
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Particles in grid units, and the grid state.
 
@@ -48,57 +57,30 @@ class Steps(ABC):
         Returns:
             (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) state.
         """
-
-    @abstractmethod
-    def path(self, start: Departure, context: RolloutContext) -> Tensor:
-        """(B, m, N, D) positions in cells, held to the emulator's constraints.
-
-        Raises:
-            UncoveredReadError: if a particle reads the network's output where it must not.
-        """
-
-    @abstractmethod
-    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
-        """The path (B, m, N, D) with its overfull cells spread, see `Advection.uncrowded_path`."""
-
-    @abstractmethod
-    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
-        """The path in domain length and of this type.
-
-        Args:
-            path: (B, m, N, D) in cells; its memory may be used for the result.
-            precision: Of the result.
-        """
-
-
-@dataclass(frozen=True)
-class TensorSteps(Steps):
-    """The steps as tensor operations."""
-
-    emulator: Emulator
-
-    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         own = self.emulator
         cells, velocity, gravity = own.in_cells(particles)
         state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid, own.field_scales)
         return cells, velocity, gravity, state
 
     def path(self, start: Departure, context: RolloutContext) -> Tensor:
+        """(B, m, N, D) positions in cells, held to the emulator's constraints.
+
+        Raises:
+            UncoveredReadError: if a particle reads the network's output where it must not.
+        """
         advection = self.emulator.advection
         if self.emulator.training:
             return advection.free_path(start)
         return advection.constrained_path(start, context.solid, context.budget)
 
     def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+        """The path (B, m, N, D) with its overfull cells spread, see `Advection.uncrowded_path`."""
         return self.emulator.advection.uncrowded_path(start, path, context.solid, context.budget)
-
-    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:
-        return self.emulator.grid.to_length(path.to(precision))
 
 
 @dataclass(frozen=True)
 class FusedSteps(Steps):
-    """The steps as kernels; only for what `steps_for` gives them to.
+    """All steps as kernels; only for what `steps_for` gives them to.
 
     Args:
         plan: Of the emulator.
@@ -109,45 +91,14 @@ class FusedSteps(Steps):
     walls: Tensor
 
     def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
-        if torch.compiler.is_compiling():
-            return None
-        found: tuple[Surroundings, ...] = _kernels().survey_rollout(self.plan, solid, self.walls)
-        return found
+        from nmpm.emulator.fused.surroundings import survey_rollout  # imported late, as Numba is
+
+        return survey_rollout(self.plan, solid, self.walls)
 
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        """As `Steps.predict`; outside of graphs being traced, without operations of torch around the network."""
-        if torch.compiler.is_compiling():
-            return super().predict(emulator, particles, context)
         from nmpm.emulator.fused.direct import predict
 
         return predict(emulator, self.plan, particles, context)
-
-    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        own = particles
-        cells, velocity, gravity, state = _kernels().rasterise(
-            self.plan, own.position, own.velocity, own.gravity, own.material, own.mask, solid
-        )
-        return cells, velocity, gravity, state
-
-    def path(self, start: Departure, context: RolloutContext) -> Tensor:
-        known = () if torch.compiler.is_compiling() else (start.readable, context.surroundings)
-        path: Tensor = _kernels().predict_path(
-            self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
-            start.output, start.scale, context.solid, self.walls, context.budget, *known,
-        )  # fmt: skip
-        return path
-
-    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
-        known = () if torch.compiler.is_compiling() else (context.surroundings,)
-        spread: Tensor = _kernels().uncrowd(
-            self.plan, start.cells, start.gravity, start.material, start.mask, path, context.solid, self.walls,
-            context.budget, *known,
-        )  # fmt: skip
-        return spread
-
-    def to_length(self, path: Tensor, precision: torch.dtype) -> Tensor:  # noqa: ARG002 (float32, as the path)
-        positions: Tensor = _kernels().to_length(self.plan, path)
-        return positions
 
 
 @dataclass(frozen=True)
@@ -179,31 +130,22 @@ class TrainingSteps(TensorSteps):
         return path
 
 
-def _kernels() -> Any:
-    """The functions of `calls`; in graphs that are being traced those of `operators`. Imported late, as Numba is."""
-    if torch.compiler.is_compiling():
-        from nmpm.emulator.fused import operators
-
-        return operators
-    from nmpm.emulator.fused import calls
-
-    return calls
-
-
 def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
     Kernels run on a CPU, in float32, for the parts of this package (`make_plan`) and outside of `nmpm.transfer.using`:
     in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation mode those without.
+    Graphs that `torch.compile` traces take tensor operations.
     """
     own = (particles.position, particles.velocity)
     fixed = (particles.gravity, solid)
-    if plan is None or emulator.precision != torch.float32 or not kernels_take(*own, particles.gravity):
+    kernels = plan is not None and emulator.precision == torch.float32 and kernels_take(*own, particles.gravity)
+    if plan is None or not kernels or torch.compiler.is_compiling():
         return TensorSteps(emulator)
     if emulator.training:
-        covered = plan.trains and not _needs_gradients(*fixed) and not torch.compiler.is_compiling()
+        covered = plan.trains and not _needs_gradients(*fixed)
         return TrainingSteps(emulator, plan) if covered else TensorSteps(emulator)
-    if torch.is_grad_enabled() and _needs_gradients(*own, *fixed, *emulator.parameters()):
+    if _needs_gradients(*own, *fixed, *emulator.parameters()):
         return TensorSteps(emulator)
     return FusedSteps(plan, emulator.walls)
 

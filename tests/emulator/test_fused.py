@@ -15,7 +15,7 @@ from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.fused import calls, operators
+from nmpm.emulator.fused.direct import DirectCall
 from nmpm.emulator.rollouts import rollout
 from nmpm.emulator.steps import FusedSteps, TensorSteps, steps_for
 from nmpm.particles import Particles
@@ -205,16 +205,17 @@ def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):
     for name in ("path._CHUNK", "rasterise._CHUNK", "batch._CHUNK"):
         monkeypatch.setattr(f"nmpm.emulator.fused.{name}", 256)
     emulator = emulator_of(scene, constraints=Constraints(energy=True, rest_speed=0.01)).requires_grad_(False)
-    threads = torch.get_num_threads()
-    first, second = operator_inputs(emulator, cloud(scene, 3000, 2, statics=20))
-    results = []
+    particles, threads, positions = cloud(scene, 3000, 2, statics=20), torch.get_num_threads(), []
+    call = DirectCall(emulator, emulator._plan, emulator.context(particles))
+    output = torch.randn(2, emulator.frames, 2, *emulator.grid.shape)
     try:
         for number in (1, 3):
             torch.set_num_threads(number)
-            results.append((*calls.rasterise(emulator._plan, *first), calls.predict_path(emulator._plan, *second)))
+            start = call.rasterise(particles)
+            positions.append(call.finish(start, call.path(start, output, None)).position)
     finally:
         torch.set_num_threads(threads)
-    assert all(map(torch.equal, *results))
+    assert torch.equal(*positions)
 
 
 def test_a_rollout_goes_on_from_its_middle_to_the_bit():
@@ -264,52 +265,16 @@ def test_gradients_and_everything_else_take_tensor_operations():
     assert not fused(frozen, dataclasses.replace(particles, velocity=particles.velocity.requires_grad_()))
 
 
-def operator_inputs(emulator, particles):
-    own = particles
-    solid = emulator.solid(particles)
-    first = (own.position, own.velocity, own.gravity, own.material, own.mask, solid)
-    cells, velocity, gravity, state = calls.rasterise(emulator._plan, *first)
-    output = torch.randn(len(cells), emulator.frames, len(emulator.scene.output_channels), *emulator.grid.shape)
-    budget = torch.full((len(cells),), 100.0)
-    start = (cells, velocity, gravity, own.material, own.mask, state, output, emulator.output_scale)
-    return first, (*start, solid, emulator.walls, budget)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_the_operators_are_sound(dim):
-    scene = box(dim, ("water", "sand"), obstacles=True)
-    constraints = Constraints(density_cap=0.2)
-    emulator = emulator_of(scene, cells=8, constraints=constraints).requires_grad_(False)
-    first, second = operator_inputs(emulator, cloud(scene, 20, 2, statics=3))
-    checks = ("test_schema", "test_faketensor")
-    text = emulator._plan.to_text()
-    torch.library.opcheck(torch.ops.nmpm.rasterise.default, (text, *first), test_utils=checks)
-    torch.library.opcheck(torch.ops.nmpm.predict_path.default, (text, *second), test_utils=checks)
-    path = operators.predict_path(emulator._plan, *second)
-    assert torch.equal(path, calls.predict_path(emulator._plan, *second))
-    cells, _, *start = second[:5]
-    third = (cells, *start, path, *second[-3:])
-    torch.library.opcheck(torch.ops.nmpm.uncrowd.default, (text, *third), test_utils=checks)
-    assert torch.equal(operators.uncrowd(emulator._plan, *third), calls.uncrowd(emulator._plan, *third))
-
-
-def test_traced_graphs_contain_the_operators():
+def test_traced_graphs_take_tensor_operations():
     scene = box()
     emulator, particles = emulator_of(scene, constraints=Constraints(energy=True)), cloud(scene, 30)
-    graphs = []
-
-    def keep(graph, _):
-        graphs.append(graph)
-        return graph.forward
 
     def call(position, velocity):
         return emulator(particles.with_motion(position, velocity)).position
 
     with torch.no_grad():
-        traced = torch.compile(call, backend=keep)(particles.position, particles.velocity)
+        traced = torch.compile(call, backend="eager")(particles.position, particles.velocity)
         torch.testing.assert_close(traced, emulator(particles).position, rtol=0, atol=1e-6)
-    targets = {str(node.target) for graph in graphs for node in graph.graph.nodes}
-    assert any("predict_path" in target for target in targets)
 
 
 def test_importing_nmpm_and_loading_a_model_do_not_import_numba():

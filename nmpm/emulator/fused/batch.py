@@ -124,6 +124,11 @@ def spread_batch(plan: Plan, start: Batch, path: Array, budget: Array | None, kn
     return spread
 
 
+def to_grid(plan: Plan, rows: Array) -> Tensor:
+    """Rows (B, size, C), one per node, as a tensor (B, C, *S) of the same memory."""
+    return torch.from_numpy(rows.reshape(len(rows), *plan.shape, rows.shape[2])).movedim(-1, 1)
+
+
 def land_batch(plan: Plan, path: Array) -> Array:
     """The path (B, m, N, D) in domain length, in its own memory: fresh memory would take longer than the conversion."""
     for frames in path:

@@ -1,4 +1,4 @@
-"""A bundle by the kernels, without gradients and outside of traced graphs: arrays from the state to the positions.
+"""A bundle by the kernels, without gradients: arrays from the state to the positions.
 
 Only the network, and the choice of windows for it, take tensors: a dispatch of torch takes as long as a kernel does on
 a small scene.
@@ -15,8 +15,7 @@ from torch import Tensor
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.fused.arrays import as_array
-from nmpm.emulator.fused.batch import Batch, fly_batch, land_batch, rasterise_batch, spread_batch
-from nmpm.emulator.fused.calls import to_grid
+from nmpm.emulator.fused.batch import Batch, fly_batch, land_batch, rasterise_batch, spread_batch, to_grid
 from nmpm.emulator.fused.flight import last_velocity
 from nmpm.emulator.fused.plan import Array, Plan
 from nmpm.emulator.fused.surroundings import Surroundings, survey

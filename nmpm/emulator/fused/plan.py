@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nmpm._support.plain_data import to_tuples
 from nmpm.decoders import Absolute, Acceleration, Blend, Decoder, Flip, Residual
 from nmpm.emulator.support import floor_rows
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
@@ -83,10 +80,6 @@ class Plan:
     solids: bool
     floors: tuple[tuple[int, int], ...]
     density_cap: float
-
-    def to_text(self) -> str:
-        """The plan as JSON."""
-        return json.dumps(dataclasses.asdict(self))
 
     @property
     def dim(self) -> int:
@@ -193,9 +186,3 @@ def make_plan(recipe: EmulatorRecipe) -> Plan | None:
         floors=floor_rows(scene, grid),
         density_cap=constraints.density_cap,
     )
-
-
-@lru_cache(maxsize=16)
-def read_plan(text: str) -> Plan:
-    """The plan of `Plan.to_text`."""
-    return Plan(**{name: to_tuples(value) for name, value in json.loads(text).items()})

@@ -17,24 +17,32 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nmpm._support.parallel import for_each
-from nmpm.emulator.fused import calls
 from nmpm.emulator.fused.adjoint import fly_back, rasterise_back
 from nmpm.emulator.fused.arrays import as_array, as_copy, check_materials, material_rows, output_arrays
+from nmpm.emulator.fused.batch import rasterise_batch, to_grid
 from nmpm.emulator.fused.path import SceneArrays, fly_scene
 from nmpm.emulator.fused.plan import Plan
 
 
 class Rasterise(torch.autograd.Function):
-    """`calls.rasterise` with gradients with respect to positions and velocities."""
+    """Particles in grid units and the grid state, with gradients with respect to positions and velocities."""
 
     @staticmethod
-    def forward(ctx: Any, plan: Plan, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What `calls.rasterise` returns for the same arguments."""
-        cells, moved, gravity, state = calls.rasterise(plan, *tensors)
+    def forward(
+        ctx: Any, plan: Plan, position: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor,
+        solid: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+        """(B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) grid state."""
+        kinds = material_rows(material, len(plan.mass))
+        batch = rasterise_batch(
+            plan, as_array(position), as_array(velocity), as_array(gravity), kinds, as_array(mask), as_array(solid)
+        )
+        cells, moved, pull = map(torch.from_numpy, (batch.cells, batch.velocity, batch.gravity))
+        pull, state = pull.unsqueeze(1), to_grid(plan, batch.state)
         ctx.plan = plan
-        ctx.save_for_backward(cells, moved, state, *tensors[3:5])
-        ctx.mark_non_differentiable(gravity)
-        return cells, moved, gravity, state
+        ctx.save_for_backward(cells, moved, state, material, mask)
+        ctx.mark_non_differentiable(pull)
+        return cells, moved, pull, state
 
     @staticmethod
     @once_differentiable
