@@ -29,7 +29,7 @@ from nmpm.evaluation.bootstrap import ratio_interval
 from nmpm.evaluation.stress.settling import Shapes, predicted_shapes, recorded_shapes
 from nmpm.evaluation.stress.subject import Subject, simulate_beside
 from nmpm.sim import load_preset
-from nmpm.sim.twin import twin_of
+from nmpm.sim.predictability import twin_of
 
 Array = NDArray[np.float64]
 TRUTH, TWIN = "simulator", "twin"

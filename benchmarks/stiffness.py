@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 
 from nmpm.sim import Preset, load_preset
-from nmpm.sim.mpm.materials import Material
+from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.sph.preset import SphPreset
 

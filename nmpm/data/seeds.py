@@ -10,7 +10,7 @@ import numpy as np
 
 from nmpm.errors import UnstableError
 from nmpm.sim import Preset
-from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+from nmpm.sim.state import Progress, SimulatedTrajectory
 
 DRAWS = 5
 """Seeds tried for one trajectory; if all are unstable, the preset is at fault."""

@@ -4,12 +4,11 @@
 SPH, 2-D) implement it, and `presets/` describes the shipped scenes.
 """
 
-from nmpm.sim.initial_state import InitialState
 from nmpm.sim.loading import load_preset, preset_from_dict, preset_names
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.mpm.ramps import Ramp
 from nmpm.sim.preset import Preset
-from nmpm.sim.trajectory import SimulatedTrajectory
+from nmpm.sim.state import InitialState, SimulatedTrajectory
 
 __all__ = [
     "InitialState",

@@ -1,12 +1,16 @@
-"""Ranges from which the rectangular blocks of an initial state are drawn; the same keys for every solver."""
+"""Initial states: ranges from which rectangular blocks are drawn, the same keys for every solver, and gravity."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
+
 from nmpm.sim.config import check
+from nmpm.sim.state import Array
 
 
 @dataclass(frozen=True)
@@ -54,3 +58,25 @@ class BlockRanges:
             number=(self.number[0], times * self.number[1]),
             share=self.share / times,
         )
+
+
+def lattice(low: Array, shape: tuple[int, ...], spacing: float, shift: Array | float = 0.0) -> Array:
+    """(N, D) centres of the cells of a lattice, the last axis varying fastest.
+
+    Args:
+        low: (D,) its lower corner, in length.
+        shape: Cells along each axis.
+        spacing: Side of a cell, in length.
+        shift: (N, D) displacement of each point, in spacings.
+    """
+    nodes = np.stack(np.meshgrid(*(np.arange(number) for number in shape), indexing="ij"), axis=-1)
+    return np.asarray(low + spacing * (nodes.reshape(-1, len(shape)) + 0.5 + shift))
+
+
+def draw_gravity(gravity: tuple[float, ...], max_turn: float, rng: np.random.Generator) -> tuple[float, ...]:
+    """A gravity of two axes, turned by a random angle of at most `max_turn` degrees; unchanged for 0."""
+    if not max_turn:
+        return gravity
+    angle = math.radians(rng.uniform(-max_turn, max_turn))
+    (x, y), cos, sin = gravity, math.cos(angle), math.sin(angle)
+    return cos * x - sin * y, sin * x + cos * y

@@ -14,8 +14,7 @@ from nmpm._support.messages import one_line
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.config import check, to_plain
-from nmpm.sim.initial_state import InitialState
-from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory
 
 BOUNDARY = 3
 """Type id of particles that never move, as in DeepMind's scenes."""
@@ -173,8 +172,8 @@ class Preset(abc.ABC):
 
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {"solver": self.solver} | {key: to_plain(value) for key, value in own.items() if value is not None}
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {"solver": self.solver} | {key: to_plain(value) for key, value in values.items() if value is not None}
 
     @classmethod
     @abc.abstractmethod

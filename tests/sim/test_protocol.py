@@ -9,7 +9,7 @@ from nmpm.errors import ConfigError, DataError
 from nmpm.sim import InitialState, load_preset, preset_names
 from nmpm.sim.mpm.ramps import Ramp
 from nmpm.sim.preset import BOUNDARY
-from nmpm.sim.sph.obstacles import PolygonObstacle
+from nmpm.sim.sph.boundary import PolygonObstacle
 
 NAMES = preset_names()
 # The column of dambreak2d takes seconds to draw; its layout is tested in sph/test_layouts.py.

@@ -11,7 +11,7 @@ from nmpm.errors import UnstableError, ZooError
 from nmpm.evaluation.stress import QUICK, Line
 from nmpm.evaluation.stress.settling import settling
 from nmpm.sim import load_preset
-from nmpm.sim.nudge import nudge
+from nmpm.sim.predictability import nudge
 from nmpm.zoo import Zoo, index
 from nmpm.zoo.cards import readme
 from nmpm.zoo.index import refresh

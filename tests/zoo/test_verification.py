@@ -13,7 +13,7 @@ from nmpm.cli import main
 from nmpm.errors import ConfigError, ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.sim import load_preset
-from nmpm.sim.twin import twin_of
+from nmpm.sim.predictability import twin_of
 from nmpm.zoo import Zoo
 from nmpm.zoo.choice import stated_milliseconds
 from nmpm.zoo.golden import TOLERANCE, golden_distance

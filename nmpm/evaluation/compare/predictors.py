@@ -14,7 +14,7 @@ from nmpm.evaluation.trade.models import ModelChoice, over_scenes
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.simulators import SimulatorChoice
 from nmpm.evaluation.trade.trivial import PREDICTORS, TrivialChoice
-from nmpm.sim.twin import twin_of
+from nmpm.sim.predictability import twin_of
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def make_predictors(scenes: Scenes, models: Mapping[str, Emulator], device: torc
     """The simulator of the scenes, if it is known, and its twin; the models; the trivial predictors.
 
     A model of other scenes is rebuilt over these, with grid cells of the size it was trained with, see
-    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.twin`: its error is
+    `EmulatorRecipe.over`. The twin is the simulator with other substeps, see `nmpm.sim.predictability`: its error is
     an estimate of the simulator's own.
 
     Args:

@@ -13,7 +13,7 @@ from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject, simulate_beside
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset
-from nmpm.sim.twin import twin_of
+from nmpm.sim.predictability import twin_of
 
 MAX_DEVIATION = 0.05
 """Share by which height, occupied cells and crowding may differ from the simulator's."""

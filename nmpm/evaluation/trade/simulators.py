@@ -15,8 +15,8 @@ from nmpm.evaluation.trade.choice import Choice, Kind, Prediction, Rollout, requ
 from nmpm.evaluation.trade.errors import energy_gain
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.sim import Preset
-from nmpm.sim.initial_state import InitialState
-from nmpm.sim.nudge import nudge
+from nmpm.sim.predictability import nudge
+from nmpm.sim.state import InitialState
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,9 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.arrays import Array
-from nmpm.sim.blocks import BlockRanges
+from nmpm.sim.blocks import BlockRanges, lattice
 from nmpm.sim.config import check
+from nmpm.sim.state import Array
 
 _ATTEMPTS = 10_000
 
@@ -85,8 +86,8 @@ class MpmBlockRanges(BlockRanges):
             )
         kinds = _draw_materials(number, materials, rng)
         blocks = [
-            _Block(low, lattice, rng.uniform(-self.speed, self.speed, len(box)), kind)
-            for low, lattice, kind in zip(lows, lattices, kinds, strict=True)
+            _Block(low, shape, rng.uniform(-self.speed, self.speed, len(box)), kind)
+            for low, shape, kind in zip(lows, lattices, kinds, strict=True)
         ]
         return self._fill(sorted(blocks, key=lambda block: block.material), spacing, materials, rng)
 
@@ -98,7 +99,7 @@ class MpmBlockRanges(BlockRanges):
             sizes = shares * rng.uniform(low, high)
             lattices = _block_sides(sizes, self.aspect, dim, rng)
             if low <= int(lattices.prod(axis=1).sum()) <= high:
-                return [tuple(map(int, lattice)) for lattice in lattices]
+                return [tuple(map(int, shape)) for shape in lattices]
         raise ConfigError(f"No blocks have {self.particles} particles together: widen blocks.particles.")
 
     def _place(
@@ -112,8 +113,8 @@ class MpmBlockRanges(BlockRanges):
         gap = self.gap
         box_low, box_high = np.array(box).T
         placed: list[tuple[Array, Array]] = []
-        for lattice in lattices:
-            side = spacing * np.array(lattice)
+        for shape in lattices:
+            side = spacing * np.array(shape)
             first, last = box_low + gap, box_high - gap - side
             if self.height is not None:
                 lowest, highest = self.height
@@ -133,12 +134,10 @@ class MpmBlockRanges(BlockRanges):
         positions, velocities = [], []
         counts = [0] * materials
         for block in blocks:
-            axes = [np.arange(number) for number in block.lattice]
-            nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(block.lattice))
-            shift = rng.uniform(-self.jitter, self.jitter, nodes.shape)
-            positions.append(block.low + spacing * (nodes + 0.5 + shift))
-            velocities.append(np.broadcast_to(block.velocity, nodes.shape))
-            counts[block.material] += len(nodes)
+            shift = rng.uniform(-self.jitter, self.jitter, (math.prod(block.lattice), len(block.lattice)))
+            positions.append(lattice(block.low, block.lattice, spacing, shift))
+            velocities.append(np.broadcast_to(block.velocity, shift.shape))
+            counts[block.material] += len(shift)
         extents = tuple((block.low, block.low + spacing * np.array(block.lattice)) for block in blocks)
         return DrawnBlocks(np.concatenate(positions), np.concatenate(velocities), tuple(counts), extents)
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.sim.arrays import Array
 from nmpm.sim.mpm.obstacle_field import slide
-from nmpm.sim.mpm.particles import MpmParticles
-from nmpm.sim.mpm.stepper import MpmStepper
+from nmpm.sim.mpm.stepper import MpmParticles, MpmStepper
+from nmpm.sim.state import Array
 
 
 class Stepper2d(MpmStepper):

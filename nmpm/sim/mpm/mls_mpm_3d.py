@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
-from nmpm.sim.arrays import Array
-from nmpm.sim.mpm.grid import MpmGrid, Walls
-from nmpm.sim.mpm.particles import MpmParticles
-from nmpm.sim.mpm.stepper import MpmStepper
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
+from nmpm.sim.state import Array
 
 
 class Stepper3d(MpmStepper):

@@ -18,28 +18,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
-from nmpm.sim.arrays import Array
+from nmpm.sim.state import Array
 
 Distance = Callable[[Array], NDArray[Any]]
 """From points (K, 2) to their signed distances (K,) from the obstacles, negative inside."""
 
 _LATTICE_PER_CELL = 4
 _PUSHES = 4
-
-
-class _Cells(Protocol):
-    @property
-    def low(self) -> Array: ...
-    @property
-    def size(self) -> float: ...
-    @property
-    def shape(self) -> tuple[int, ...]: ...
 
 
 @dataclass(frozen=True)
@@ -65,24 +56,16 @@ class ObstacleField:
     friction: float
 
     @classmethod
-    def sample(cls, grid: _Cells, distance: Distance, friction: float) -> ObstacleField:
-        """Sample obstacles, given by their signed distance, in a grid's box."""
-        spacing = grid.size / _LATTICE_PER_CELL
-        inner = [np.arange(_LATTICE_PER_CELL * cells + 1) for cells in grid.shape]
-        lattice = _sample(distance, grid.low, spacing, inner)
-        places = [np.arange(cells + 2) - 0.5 for cells in grid.shape]
-        at_nodes = _sample(distance, grid.low, grid.size, places)
-        near = np.argwhere(at_nodes < grid.size)
-        points = grid.low + grid.size * (near - 0.5)
-        return cls(
-            nodes=near,
-            normals=_normals(distance, points, spacing / 8),
-            low=np.asarray(grid.low, np.float64),
-            spacing=spacing,
-            lattice=lattice,
-            margin=lattice_margin(grid.size),
-            friction=friction,
-        )
+    def sample(
+        cls, distance: Distance, low: Array, size: float, shape: tuple[int, ...], friction: float
+    ) -> ObstacleField:
+        """Sample obstacles, given by their signed distance, on cells of a size and number from the box's corner on."""
+        spacing = size / _LATTICE_PER_CELL
+        lattice = _sample(distance, low, spacing, [np.arange(_LATTICE_PER_CELL * cells + 1) for cells in shape])
+        at_nodes = _sample(distance, low, size, [np.arange(cells + 2) - 0.5 for cells in shape])
+        near = np.argwhere(at_nodes < size)
+        normals = _normals(distance, low + size * (near - 0.5), spacing / 8)
+        return cls(near, normals, np.asarray(low, np.float64), spacing, lattice, lattice_margin(size), friction)
 
     def depth(self, position: Array) -> Array:
         """(N,) how much nearer to an obstacle than the margin particles (N, 2) are, in length; 0 where they are not."""
@@ -120,8 +103,8 @@ def lattice_margin(size: float) -> float:
     return size / _LATTICE_PER_CELL * math.sqrt(0.5)
 
 
-def _sample(distance: Distance, low: Array, spacing: float, places: list[NDArray[Any]]) -> Array:
-    points = low + spacing * np.stack(np.meshgrid(*places, indexing="ij"), axis=-1)
+def _sample(distance: Distance, low: Array, spacing: float, indices: list[NDArray[Any]]) -> Array:
+    points = low + spacing * np.stack(np.meshgrid(*indices, indexing="ij"), axis=-1)
     return np.ascontiguousarray(distance(points.reshape(-1, 2)).reshape(points.shape[:2]), dtype=np.float64)
 
 

@@ -14,18 +14,15 @@ import numpy as np
 from nmpm._support.plain_data import from_plain
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval, Scene
+from nmpm.sim.blocks import draw_gravity
 from nmpm.sim.config import check
-from nmpm.sim.gravity import draw_gravity
-from nmpm.sim.initial_state import InitialState
 from nmpm.sim.mpm.blocks import MpmBlockRanges
-from nmpm.sim.mpm.grid import MpmGrid, Walls
-from nmpm.sim.mpm.materials import MATERIALS, Material, materials_from_section
+from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
-from nmpm.sim.mpm.particles import MpmParticles
 from nmpm.sim.mpm.ramps import Ramp, RampRanges, distance_to_ramps
-from nmpm.sim.mpm.simulate import check_particles, record_frames
+from nmpm.sim.mpm.solids import Goop, Sand
 from nmpm.sim.mpm.stability import (
     CFL_LIMIT,
     fastest_speed,
@@ -33,9 +30,13 @@ from nmpm.sim.mpm.stability import (
     longest_travel_substep,
     longest_wave_substep,
 )
-from nmpm.sim.mpm.stepper import REVISION, MpmStepper
+from nmpm.sim.mpm.stepper import REVISION, MpmGrid, MpmParticles, MpmStepper, Walls
+from nmpm.sim.mpm.water import Water
 from nmpm.sim.preset import BOUNDARY, Preset
-from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, record_frames
+
+MATERIALS: dict[str, type[Material]] = {kind.name: kind for kind in (Water, Sand, Goop)}
+"""The constitutive models by name; a new one is added here."""
 
 _ARRANGEMENTS = 20
 _STEPPERS: dict[int, type[MpmStepper]] = {2: Stepper2d, 3: Stepper3d}
@@ -86,8 +87,8 @@ class MpmPreset(Preset):
         self._check_positive("cells", "spacing")
         self._check_whole("cells")
         check(self.wall_friction >= 0, f"wall_friction = {self.wall_friction} must not be negative.")
-        known = [kind.value for kind in Walls]
-        check(self.walls in known, f"walls = {self.walls} is not one of {', '.join(map(repr, known))}.")
+        kinds = [kind.value for kind in Walls]
+        check(self.walls in kinds, f"walls = {self.walls} is not one of {', '.join(map(repr, kinds))}.")
         check(bool(self.materials), f"materials is empty; known are {', '.join(MATERIALS)}.")
         self._check_axes()
         self._check_dimension()
@@ -136,7 +137,7 @@ class MpmPreset(Preset):
         """How far particles can get: the box, and a cell and a half beyond it where walls hold what touches them."""
         layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
         ends = ((low - layer, high + layer) for low, high in self.box)
-        return tuple(_snapped(own, edges) for own, edges in zip(ends, self.domain, strict=True))
+        return tuple(_snap(pair, edges) for pair, edges in zip(ends, self.domain, strict=True))
 
     @property
     def particle_volume(self) -> float:
@@ -221,14 +222,20 @@ class MpmPreset(Preset):
         raise reason
 
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
-        check_particles(start.position, start.velocity, self.reach)
+        start.check_particles(self.reach)
         counts, ramps = self._counts_of(start), _ramps_of(start)
         gravity = self.gravity if start.gravity is None else start.gravity
         groups = tuple(zip(self.materials, counts, strict=True))
         particles = MpmParticles(start.position, start.velocity, groups, self.particle_volume)
         stepper = _STEPPERS[self.dim](self._grid(gravity, ramps), self.frame_dt / self.substeps)
+        stepper.enclose(particles)
+
+        def advance(frame: int) -> Array:
+            stepper.advance_frame(particles, self.substeps, frame)
+            return particles.position
+
         static = np.concatenate([np.empty((0, self.dim)), *(ramp.particles(self.spacing) for ramp in ramps)])
-        position = record_frames(stepper, particles, static, frames, self.substeps, progress)
+        position = record_frames(particles.position, static, frames, advance, progress)
         types = [*(material.particle_type for material in self.materials), BOUNDARY]
         particle_type = np.repeat(types, [*counts, len(static)]).astype(np.int64)
         attributes: dict[str, Any] = {"held_back": stepper.held_back}
@@ -252,7 +259,8 @@ class MpmPreset(Preset):
         grid = MpmGrid(low, self.cell_size, shape, self.wall_friction, pull, Walls(self.walls))
         if not ramps:
             return grid
-        obstacles = ObstacleField.sample(grid, partial(distance_to_ramps, ramps), self.wall_friction)
+        distance = partial(distance_to_ramps, ramps)
+        obstacles = ObstacleField.sample(distance, low, self.cell_size, shape, self.wall_friction)
         return dataclasses.replace(grid, obstacles=obstacles)
 
     @property
@@ -284,8 +292,16 @@ class MpmPreset(Preset):
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> MpmPreset:
-        read = {"materials": materials_from_section(plain["materials"])} if "materials" in plain else {}
-        return from_plain(cls, {**plain, **read}, "the preset")
+        materials = {"materials": _read_materials(plain["materials"])} if "materials" in plain else {}
+        return from_plain(cls, {**plain, **materials}, "the preset")
+
+
+def _read_materials(section: Any) -> tuple[Material, ...]:
+    """The materials of a preset's section, which maps their names to parameters."""
+    check(isinstance(section, Mapping), "materials must map names to parameters.")
+    unknown = sorted(set(section) - set(MATERIALS))
+    check(not unknown, f"Unknown material {', '.join(map(str, unknown))}; known are {', '.join(MATERIALS)}.")
+    return tuple(from_plain(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())
 
 
 def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:
@@ -295,7 +311,7 @@ def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:
     return ramps
 
 
-def _snapped(ends: Interval, edges: Interval) -> Interval:
+def _snap(ends: Interval, edges: Interval) -> Interval:
     """The ends, those that are an edge of the domain but for rounding exactly so: a gap would be a wall layer."""
     low, high = (edge if math.isclose(end, edge, abs_tol=1e-9) else end for end, edge in zip(ends, edges, strict=True))
     return low, high

@@ -11,9 +11,8 @@ import numpy as np
 
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.arrays import Array
 from nmpm.sim.config import check
-from nmpm.sim.initial_state import Obstacle
+from nmpm.sim.state import Array, Obstacle
 
 _RESTARTS = 20
 _ATTEMPTS = 500

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from nmpm.sim.mpm.materials import Material
+from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.obstacle_field import lattice_margin
 
 CFL_LIMIT = 0.9

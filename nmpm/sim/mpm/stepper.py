@@ -4,24 +4,101 @@ It scatters mass and momentum from the particles to a grid, with the stress as p
 "A moving least squares material point method with displacement discontinuity and two-way rigid body coupling", 2018),
 applies gravity and the walls at the grid's nodes, and gathers velocity and its gradient back (APIC: Jiang et al., "The
 affine particle-in-cell method", 2015). Kernels are quadratic B-splines.
+
+Nodes are the centres of square cells of size h that fill the box, and of one more cell around it, so that a particle in
+cell i feels the nodes i, i + 1 and i + 2, counted from the outer cell. The wall acts at the centres of the outer and of
+the first inner cells. A particle's velocity towards the wall then falls with the square of its distance from the box's
+side, and it cannot cross. Walls that hold on to material act at the centres of the second inner cells as well, where
+particles then stop; the box's sides are a cell further out.
 """
 
 from __future__ import annotations
 
 import abc
+import enum
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from nmpm.errors import DataError
-from nmpm.sim.arrays import Array
-from nmpm.sim.mpm.grid import MpmGrid, Walls
-from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.errors import DataError, UnstableError
+from nmpm.sim.mpm.material import Material
+from nmpm.sim.mpm.obstacle_field import ObstacleField
+from nmpm.sim.state import Array
 
 REVISION = 1
 """Increased whenever the same preset and seed give other numbers."""
 
 # Distance from the box's sides, in cells, at which a particle is clamped. Float32 can still tell it from the side.
 _MARGIN = 1e-4
+
+
+class Walls(enum.Enum):
+    """What the box's sides do with material that moves away from them."""
+
+    SEPARATE = "separate"
+    """Let it go: they push and brake, and never pull."""
+
+    SLIP = "slip"
+    """Hold it, so that it only slides along."""
+
+    OPEN_CORNERS = "slip, open corners"
+    """Hold it; but at the very corner, the first node of both walls, along the first axis alone, so that material that
+    slides down a side is not stopped a cell above the floor. The solver of DeepMind's recorded water does so."""
+
+
+@dataclass(frozen=True)
+class MpmGrid:
+    """Square cells, cubes in three dimensions, that fill a box.
+
+    Args:
+        low: (D,) lower corner of the box, in length.
+        size: Side of a cell, in length.
+        shape: Cells along each axis.
+        friction: Coulomb friction of the walls.
+        gravity: (D,) acceleration, in length per second squared.
+        walls: How the box's sides treat material.
+        obstacles: Within the box; None without.
+    """
+
+    low: Array
+    size: float
+    shape: tuple[int, ...]
+    friction: float
+    gravity: Array
+    walls: Walls = Walls.SEPARATE
+    obstacles: ObstacleField | None = None
+
+
+class MpmParticles:
+    """N moving particles in D dimensions, sorted by material; a substep changes them in place.
+
+    Args:
+        position: (N, D) in length.
+        velocity: (N, D) in length per second.
+        groups: Material and number of particles of each group, in the particles' order.
+        volume: Area of a particle at rest, or volume in three dimensions.
+    """
+
+    def __init__(
+        self, position: NDArray[Any], velocity: NDArray[Any], groups: tuple[tuple[Material, int], ...], volume: float
+    ) -> None:
+        count, dim = position.shape
+        numbers = [number for _, number in groups]
+        self.position = np.array(position, dtype=np.float64, order="C")
+        self.velocity = np.array(velocity, dtype=np.float64, order="C")
+        self.gradient: Array = np.zeros((count, dim, dim))
+        # As wide as the widest material's; the other materials do not use the last columns.
+        rests = [material.rest(dim) for material, _ in groups]
+        padded = [rest + (0.0,) * (max(map(len, rests)) - len(rest)) for rest in rests]
+        self.strain: Array = np.repeat(np.array(padded), numbers, axis=0)
+        self.stress: Array = np.zeros((count, dim * (dim + 1) // 2))
+        self.volume = volume
+        self.mass: Array = np.repeat([material.density * volume for material, _ in groups], numbers)
+        ends = np.cumsum([0, *numbers])
+        self.parts = tuple((m, slice(a, b)) for (m, _), a, b in zip(groups, ends[:-1], ends[1:], strict=True))
+        """Each material with the slice of its particles."""
 
 
 class MpmStepper(abc.ABC):
@@ -85,6 +162,21 @@ class MpmStepper(abc.ABC):
             self.pushed_out += grid.obstacles.push_out(
                 before, particles.position, particles.velocity, self._lower, self._upper
             )
+
+    def advance_frame(self, particles: MpmParticles, substeps: int, frame: int) -> None:
+        """The substeps of a frame, in place.
+
+        Raises:
+            UnstableError: if the state is no longer finite; the message names frame and substep.
+        """
+        for substep in range(substeps):
+            try:
+                self.step(particles)
+            except FloatingPointError as error:
+                raise UnstableError(
+                    f"{error} after substep {substep + 1} of {substeps} of frame {frame}; take more substeps, slower "
+                    "particles or a softer material."
+                ) from error
 
     @abc.abstractmethod
     def _scatter(self, particles: MpmParticles) -> None:

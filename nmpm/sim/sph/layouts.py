@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.arrays import Array
-from nmpm.sim.blocks import BlockRanges
+from nmpm.sim.blocks import BlockRanges, lattice
 from nmpm.sim.config import check
-from nmpm.sim.sph.obstacles import PolygonObstacle
-from nmpm.sim.sph.relaxation import relax
+from nmpm.sim.sph import sums
+from nmpm.sim.sph.boundary import PolygonObstacle, SolidBoundary
+from nmpm.sim.sph.neighbours import CellGrid, PairFinder
+from nmpm.sim.sph.sums import SUPPORT, Pairs, WallPairs
+from nmpm.sim.state import Array
 
 Box = tuple[Interval, Interval]
 
@@ -86,20 +88,20 @@ class Column(FluidLayout):
     def coarsened(self, factor: int) -> Self:  # noqa: ARG002  # (its size is given in length)
         return self
 
-    def lattice(self, spacing: float) -> tuple[int, int]:
+    def shape(self, spacing: float) -> tuple[int, int]:
         """Particles along x and y."""
         return round(self.width / spacing), round(self.height / spacing)
 
     def max_particles(self, spacing: float) -> int:
-        return math.prod(self.lattice(spacing))
+        return math.prod(self.shape(spacing))
 
     def draw(
         self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
     ) -> tuple[Array, Array]:
-        shape = self.lattice(spacing)
+        shape = self.shape(spacing)
         low = np.array([axis[0] for axis in box])
         high = low + spacing * np.array(shape)
-        displaced = _lattice(low, shape, spacing) + rng.normal(scale=self.noise * spacing, size=(math.prod(shape), 2))
+        displaced = lattice(low, shape, spacing) + rng.normal(scale=self.noise * spacing, size=(math.prod(shape), 2))
         column = ((low[0], high[0]), (low[1], high[1]))
         position = relax(displaced, column, spacing, self.relaxation)
         free = _clear_of(position, obstacles, spacing)
@@ -122,7 +124,7 @@ class FluidBlocks(BlockRanges, FluidLayout):
             raise ConfigError(f"No room for blocks.particles = {list(self.particles)} in {number} blocks within {box}.")
         position, velocity = [], []
         for low, shape in blocks:
-            points = _lattice(low, shape, spacing)
+            points = lattice(low, shape, spacing)
             points += spacing * rng.uniform(-self.jitter, self.jitter, points.shape)
             position.append(points[_clear_of(points, obstacles, spacing)])
             velocity.append(np.broadcast_to(rng.uniform(-self.speed, self.speed, 2), position[-1].shape))
@@ -166,6 +168,57 @@ def _clear_of(points: Array, obstacles: tuple[PolygonObstacle, ...], spacing: fl
     return free
 
 
-def _lattice(low: Array, shape: tuple[int, int], spacing: float) -> Array:
-    nodes = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-    return np.asarray(low + spacing * (nodes + 0.5))
+# Way along the gradient of particle concentration in a sweep, in spacings squared, and its limit in spacings.
+_STEP = 0.1
+_LIMIT = 0.1
+
+
+def relax(position: Array, box: tuple[tuple[float, float], tuple[float, float]], spacing: float, sweeps: int) -> Array:
+    """Move particles, sweep by sweep, from where they are dense to where they are not.
+
+    A sweep shifts each by −D ∇C, where C is the concentration Σ V W (Lind, Xu, Stansby & Rogers 2012, equation 24),
+    which is what a constant background pressure does in Adami, Hu & Adams (2013).
+
+    Args:
+        position: (N, 2); those outside of the box are moved to its sides first.
+        box: (lower, upper) along x and y, in length, with dummy particles around it.
+        spacing: Of the particles, in length.
+        sweeps: How many.
+    """
+    boundary = SolidBoundary(box, (), spacing)
+    grid = CellGrid.covering(boundary.position.min(0), boundary.position.max(0), SUPPORT * spacing)
+    finder, wall_finder = PairFinder(grid), PairFinder(grid)
+    order, wall_starts = grid.sort_by_cell(*np.ascontiguousarray(boundary.position.T))
+    wall_x, wall_y = np.ascontiguousarray(boundary.position[order].T)
+    x, y = np.ascontiguousarray(position.T)
+    identity, still = np.arange(len(x)), np.zeros_like(x)
+    for _ in range(sweeps):
+        boundary.clamp(x, y, still, still)
+        order, starts = grid.sort_by_cell(x, y)
+        x, y, identity = x[order], y[order], identity[order]
+        table = np.stack([x, y])
+        first, second = finder.pairs_within(x, y, starts)
+        pairs = Pairs(first, second, *np.empty((4, len(first))))
+        sums.pair_geometry(table, pairs, spacing)
+        wet, walls = wall_finder.pairs_between(x, y, wall_x, wall_y, wall_starts)
+        wall_pairs = WallPairs(wet, walls, *np.empty((4, len(wet))))
+        sums.wall_geometry(table, wall_x, wall_y, wall_pairs, spacing)
+        shift = _concentration_gradient(pairs, wall_pairs, len(x), spacing)
+        shift *= -_STEP * spacing**2
+        shift *= np.minimum(1.0, _LIMIT * spacing / np.maximum(np.hypot(*shift), 1e-30))
+        x, y = x + shift[0], y + shift[1]
+    boundary.clamp(x, y, still, still)
+    spread = np.empty((len(x), 2))
+    spread[identity] = np.stack([x, y], -1)
+    return spread
+
+
+def _concentration_gradient(pairs: Pairs, walls: WallPairs, count: int, spacing: float) -> Array:
+    """(2, N) gradient of the concentration, from pairs of particles and from pairs with the walls."""
+    area = spacing**2
+    gradient = []
+    for d, wall_d in ((pairs.dx, walls.dx), (pairs.dy, walls.dy)):
+        weights = pairs.f * d * area
+        inner = np.bincount(pairs.first, weights, count) - np.bincount(pairs.second, weights, count)
+        gradient.append(inner + np.bincount(walls.first, walls.f * wall_d * area, count))
+    return np.stack(gradient)

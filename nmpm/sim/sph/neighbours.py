@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
-from nmpm.sim.arrays import Array
+from nmpm.sim.state import Array
 
 Indices = NDArray[np.uint32]
 Pairs = tuple[Indices, Indices]

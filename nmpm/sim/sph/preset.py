@@ -13,17 +13,13 @@ import numpy as np
 from nmpm._support.plain_data import from_plain
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
+from nmpm.sim.blocks import draw_gravity
 from nmpm.sim.config import check
-from nmpm.sim.gravity import draw_gravity
-from nmpm.sim.initial_state import InitialState
 from nmpm.sim.preset import BOUNDARY, Preset
-from nmpm.sim.sph.fluid import Fluid, SphParticles
+from nmpm.sim.sph.boundary import ObstacleRanges, PolygonObstacle, SolidBoundary, box_particles
 from nmpm.sim.sph.layouts import Column, FluidBlocks, FluidLayout
-from nmpm.sim.sph.obstacles import ObstacleRanges, PolygonObstacle
-from nmpm.sim.sph.simulate import check_particles, record_frames
-from nmpm.sim.sph.walls import SolidBoundary, box_particles
-from nmpm.sim.sph.wcsph import REVISION, SphStepper
-from nmpm.sim.trajectory import Progress, SimulatedTrajectory
+from nmpm.sim.sph.wcsph import REVISION, Fluid, SphParticles, SphStepper
+from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, record_frames
 
 WATER = 5
 """Type id of the particles that flow, as in DeepMind's scenes."""
@@ -81,7 +77,7 @@ class SphPreset(Preset):
         check(left < right and bottom < top, f"box = {self.box} needs (lower, upper) along each axis.")
         check((self.column is None) != (self.blocks is None), "give either column or blocks, as the initial state.")
         if self.column is not None:
-            columns, rows = self.column.lattice(self.spacing)
+            columns, rows = self.column.shape(self.spacing)
             fits = columns * self.spacing <= right - left + 1e-9 and rows * self.spacing <= top - bottom + 1e-9
             check(fits and columns * rows > 0, f"column = {self.column} does not fit in box = {self.box}.")
         for cause, least in self._substep_bounds.items():
@@ -170,17 +166,24 @@ class SphPreset(Preset):
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
         """As `Preset.simulate_from`; densities start at rest, and accelerations follow from the state."""
         obstacles = _polygons_of(start)
-        check_particles(start.position, start.velocity, self.box, obstacles)
+        start.check_particles(self.box, obstacles)
         if start.counts not in ((), (len(start.position),)):
             raise DataError(f"Counts {start.counts} are not those of {len(start.position)} particles of one fluid.")
         gravity = np.array(self.gravity if start.gravity is None else start.gravity)
         boundary = SolidBoundary(self.box, obstacles, self.spacing)
         particles = SphParticles(start.position, start.velocity, self.fluid.density)
         stepper = SphStepper(self.fluid, boundary, self.spacing, gravity, self.frame_dt / self.substeps)
-        position, deviation = record_frames(stepper, particles, frames, self.substeps, progress)
-        static = position.shape[1] - len(start.position)
-        particle_type = np.repeat([WATER, BOUNDARY], [len(start.position), static]).astype(np.int64)
-        attributes = {"gravity": gravity, "held_back": stepper.held_back, "density_deviation": deviation}
+        stepper.initialise(particles)
+        deviations = [0.0]
+
+        def advance(frame: int) -> Array:
+            deviations.append(stepper.advance_frame(particles, self.substeps, frame))
+            return particles.position
+
+        walls = boundary.position[boundary.visible]
+        position = record_frames(particles.position, walls, frames, advance, progress)
+        particle_type = np.repeat([WATER, BOUNDARY], [len(start.position), len(walls)]).astype(np.int64)
+        attributes = {"gravity": gravity, "held_back": stepper.held_back, "density_deviation": max(deviations)}
         return SimulatedTrajectory(position, particle_type, attributes)
 
     @property

@@ -1,27 +1,85 @@
-"""The sums over pairs of a weakly compressible fluid's step, compiled.
+"""The sums over pairs of a weakly compressible fluid's step, compiled, and the kernel that weights them.
 
-h is the smoothing length and equals the particles' spacing; m is a particle's mass, V = m / ρ its area, W the kernel
-and F = W′(r) / r, so that ∇W = F (x_i − x_j). The F of a pair serves two sums, so it is kept.
+The kernel is the quintic spline (Morris, Fox & Zhu 1997). With q = r / h it is
+w(q) = (3 − q)⁵₊ − 6 (2 − q)⁵₊ + 15 (1 − q)⁵₊, W(r) = 7 / (478 π h²) · w(q). It is zero from `SUPPORT` smoothing lengths
+on, its integral over the plane is one, and it has four continuous derivatives.
+
+h is the smoothing length and equals the particles' spacing; m is a particle's mass, V = m / ρ its area and
+F = W′(r) / r, so that ∇W = F (x_i − x_j). The F of a pair serves two sums, so it is kept. Tables hold a row each of the
+particles' x, y, velocity along x and y, density, and acceleration along x and y.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from nmpm._support.jit import jit
-from nmpm.sim.arrays import Array
-from nmpm.sim.sph.kernel import NORM, slope, weight
 from nmpm.sim.sph.neighbours import Indices
+from nmpm.sim.state import Array
+
+SUPPORT = 3.0
+"""Reach of the kernel, in smoothing lengths."""
+
+NORM = 7.0 / (478.0 * math.pi)
+"""W = NORM / h² · w(q)."""
 
 # Particles on the same spot have no direction to push each other in: a tiny distance, squared, keeps F finite.
 _SAME_SPOT = 1e-24
 
 
+class Pairs(NamedTuple):
+    """K pairs of fluid particles, and what `pair_geometry` and `expansion` write of each; arrays of shape (K,).
+
+    Args:
+        first: Index of the first particle.
+        second: Index of the second one.
+        dx: Difference of position along x, first minus second.
+        dy: Likewise along y.
+        f: F.
+        drag: F v · x / (r² + 0.01 h²), which viscosity needs.
+    """
+
+    first: Indices
+    second: Indices
+    dx: Array
+    dy: Array
+    f: Array
+    drag: Array
+
+
+class WallPairs(NamedTuple):
+    """K pairs of a fluid and a wall particle, and what `wall_geometry` writes of each; as `Pairs`, with W as `w`."""
+
+    first: Indices
+    second: Indices
+    dx: Array
+    dy: Array
+    f: Array
+    w: Array
+
+
 @jit
-def pair_geometry(
-    x: Array, y: Array, first: Indices, second: Indices, h: float, dx: Array, dy: Array, f: Array
-) -> None:
-    """Difference of position of each pair, first minus second, and F."""
+def weight(q: float) -> float:
+    """The spline w at q ≥ 0, not normalised."""
+    outer, middle, inner = max(0.0, 3.0 - q), max(0.0, 2.0 - q), max(0.0, 1.0 - q)
+    outer2, middle2, inner2 = outer * outer, middle * middle, inner * inner
+    return outer2 * outer2 * outer - 6.0 * (middle2 * middle2 * middle) + 15.0 * (inner2 * inner2 * inner)
+
+
+@jit
+def slope(q: float) -> float:
+    """Its derivative dw / dq at q ≥ 0."""
+    outer, middle, inner = max(0.0, 3.0 - q), max(0.0, 2.0 - q), max(0.0, 1.0 - q)
+    outer2, middle2, inner2 = outer * outer, middle * middle, inner * inner
+    return -5.0 * (outer2 * outer2 - 6.0 * (middle2 * middle2) + 15.0 * (inner2 * inner2))
+
+
+@jit
+def pair_geometry(table: Array, pairs: Pairs, h: float) -> None:
+    """Write difference of position and F of each pair."""
+    x, y = table[0], table[1]
+    first, second, dx, dy, f = pairs.first, pairs.second, pairs.dx, pairs.dy, pairs.f
     inverse = 1.0 / h
     scale = NORM * inverse**3
     for k in range(first.shape[0]):
@@ -34,20 +92,10 @@ def pair_geometry(
 
 
 @jit
-def wall_geometry(
-    x: Array,
-    y: Array,
-    wall_x: Array,
-    wall_y: Array,
-    first: Indices,
-    second: Indices,
-    h: float,
-    dx: Array,
-    dy: Array,
-    f: Array,
-    w: Array,
-) -> None:
-    """The same for pairs of a particle and a wall particle, and W."""
+def wall_geometry(table: Array, wall_x: Array, wall_y: Array, pairs: WallPairs, h: float) -> None:
+    """Write difference of position, F and W of each pair with a wall particle."""
+    x, y = table[0], table[1]
+    first, second, dx, dy, f, w = pairs
     inverse = 1.0 / h
     scale, norm = NORM * inverse**3, NORM * inverse**2
     for k in range(first.shape[0]):
@@ -59,28 +107,16 @@ def wall_geometry(
 
 @jit
 def expansion(
-    first: Indices,
-    second: Indices,
-    dx: Array,
-    dy: Array,
-    f: Array,
-    vx: Array,
-    vy: Array,
-    density: Array,
-    mass: float,
-    diffusion: float,
-    layering: Array,
-    soft: float,
-    rate: Array,
-    drag: Array,
+    pairs: Pairs, table: Array, mass: float, diffusion: float, layering: Array, soft: float, rate: Array
 ) -> None:
     """Adds Σ V_j F v_ij · x_ij, the rate at which density grows per density (Monaghan 2005), to `rate`.
 
     To that comes diffusion of density, Σ V_j F `diffusion` (ρ_ij − ρ^H_ij), where ρ^H is the density of water at rest,
-    whose gradient is `layering` (Fourtakas, Dominguez, Vacondio & Rogers 2019).
-
-    `drag` becomes F v_ij · x_ij / (r² + soft) of each pair, which viscosity needs; `soft` stands for 0.01 h².
+    whose gradient is `layering` (Fourtakas, Dominguez, Vacondio & Rogers 2019). Writes the pairs' `drag`, with `soft`
+    for 0.01 h².
     """
+    first, second, dx, dy, f, drag = pairs
+    vx, vy, density = table[2], table[3], table[4]
     volume = mass / density
     for k in range(first.shape[0]):
         i, j = first[k], second[k]
@@ -95,44 +131,25 @@ def expansion(
 
 
 @jit
-def wall_expansion(
-    first: Indices,
-    second: Indices,
-    dx: Array,
-    dy: Array,
-    f: Array,
-    vx: Array,
-    vy: Array,
-    wall_volume: Array,
-    rate: Array,
-) -> None:
+def wall_expansion(pairs: WallPairs, table: Array, wall_volume: Array, rate: Array) -> None:
     """The walls' part of `expansion`: they stand still."""
+    first, second, dx, dy, f = pairs.first, pairs.second, pairs.dx, pairs.dy, pairs.f
+    vx, vy = table[2], table[3]
     for k in range(first.shape[0]):
         i, j = first[k], second[k]
         rate[i] += wall_volume[j] * f[k] * (vx[i] * dx[k] + vy[i] * dy[k])
 
 
 @jit
-def push(
-    first: Indices,
-    second: Indices,
-    dx: Array,
-    dy: Array,
-    f: Array,
-    drag: Array,
-    density: Array,
-    pressure: Array,
-    mass: float,
-    viscosity: float,
-    ax: Array,
-    ay: Array,
-) -> None:
-    """Adds the accelerations of pressure (Adami et al. 2012, equations 6 and 7) and viscosity to ax and ay.
+def push(pairs: Pairs, table: Array, pressure: Array, mass: float, viscosity: float) -> None:
+    """Adds the accelerations of pressure (Adami et al. 2012, equations 6 and 7) and viscosity.
 
     Viscosity is Monaghan's (2005, equation 4.2), whether pairs approach or part; `viscosity` stands for
     α h c plus eight times the kinematic viscosity. Both act along the line between two particles, so that momentum and
     angular momentum are kept.
     """
+    first, second, dx, dy, f, drag = pairs
+    density, ax, ay = table[4], table[5], table[6]
     areas = 1.0 / (density * density)
     for k in range(first.shape[0]):
         i, j = first[k], second[k]
@@ -146,23 +163,13 @@ def push(
 
 
 @jit
-def wall_averages(
-    first: Indices,
-    second: Indices,
-    dx: Array,
-    dy: Array,
-    w: Array,
-    vx: Array,
-    vy: Array,
-    density: Array,
-    pressure: Array,
-    gravity: Array,
-    wall: Array,
-) -> None:
+def wall_averages(pairs: WallPairs, table: Array, pressure: Array, gravity: Array, wall: Array) -> None:
     """Pressure and velocity of the walls, continued from the fluid (Adami et al. 2012, equations 22, 23 and 27).
 
     Rows of `wall` become pressure, velocity along x and y, and the sum of the weights; 0 where no fluid is near.
     """
+    first, second, dx, dy, w = pairs.first, pairs.second, pairs.dx, pairs.dy, pairs.w
+    vx, vy, density = table[2], table[3], table[4]
     wall[:] = 0.0
     for k in range(first.shape[0]):
         i, j = first[k], second[k]
@@ -179,23 +186,11 @@ def wall_averages(
 
 @jit
 def wall_push(
-    first: Indices,
-    second: Indices,
-    dx: Array,
-    dy: Array,
-    f: Array,
-    vx: Array,
-    vy: Array,
-    density: Array,
-    pressure: Array,
-    wall: Array,
-    wall_density: Array,
-    mass: float,
-    viscosity: float,
-    ax: Array,
-    ay: Array,
+    pairs: WallPairs, table: Array, pressure: Array, wall: Array, wall_density: Array, mass: float, viscosity: float
 ) -> None:
     """Adds the walls' pressure and, with the dynamic viscosity, their no-slip drag (Adami et al. 2012, equation 8)."""
+    first, second, dx, dy, f = pairs.first, pairs.second, pairs.dx, pairs.dy, pairs.f
+    vx, vy, density, ax, ay = table[2], table[3], table[4], table[5], table[6]
     for k in range(first.shape[0]):
         i, j = first[k], second[k]
         ri, rj = density[i], wall_density[j]

@@ -17,15 +17,19 @@ margin beyond the kernel's reach, and listed anew once a particle has moved by h
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
-from nmpm.sim.arrays import Array
+from nmpm.errors import UnstableError
+from nmpm.sim.config import check
 from nmpm.sim.sph import sums
-from nmpm.sim.sph.fluid import Fluid, SphParticles
-from nmpm.sim.sph.kernel import SUPPORT
+from nmpm.sim.sph.boundary import SolidBoundary
 from nmpm.sim.sph.neighbours import CellGrid, PairFinder
-from nmpm.sim.sph.walls import SolidBoundary
+from nmpm.sim.sph.sums import SUPPORT, Pairs, WallPairs
+from nmpm.sim.state import Array
 
 REVISION = 1
 """Increased whenever the same preset and seed give other numbers."""
@@ -38,6 +42,84 @@ _SPRAY = round(np.pi * (SUPPORT + _SKIN) ** 2 / 3)
 
 # Particles that sound passes while the excess of spray's density falls to 1 / e.
 _FADING = 10.0
+
+DENSITY_LIMIT = 0.5
+"""Largest deviation of a particle's density from that at rest, as a part of it; beyond, the run is unstable."""
+
+
+@dataclass(frozen=True)
+class Fluid:
+    """Parameters of a weakly compressible fluid.
+
+    Args:
+        density: At rest, in kg / m².
+        speed_of_sound: In m / s; ten times the fastest flow keeps density within one per cent.
+        exponent: Of Tait's equation, p = ρ₀ c² / γ ((ρ / ρ₀)^γ − 1).
+        alpha: Artificial viscosity; it amounts to a kinematic viscosity of α h c / 8.
+        viscosity: Dynamic, in Pa s, which also brakes the fluid at walls; 0 lets it slip.
+        diffusion: Of density, δ, which smooths what is uneven from particle to particle; 0.1 is usual.
+
+    Raises:
+        ConfigError: if a number is out of range.
+    """
+
+    density: float
+    speed_of_sound: float
+    exponent: float
+    alpha: float
+    viscosity: float
+    diffusion: float
+
+    def __post_init__(self) -> None:
+        for key in ("density", "speed_of_sound", "exponent"):
+            check(getattr(self, key) > 0, f"{key} = {getattr(self, key)} must be positive.")
+        for key in ("alpha", "viscosity", "diffusion"):
+            check(getattr(self, key) >= 0, f"{key} = {getattr(self, key)} must not be negative.")
+
+    def kinematic_viscosity(self, spacing: float) -> float:
+        """Artificial and physical viscosity together, in m² / s."""
+        return self.alpha * spacing * self.speed_of_sound / 8 + self.viscosity / self.density
+
+
+class SphParticles:
+    """N moving particles; they are sorted by cell now and then, and given back in the first order.
+
+    Args:
+        position: (N, 2) in length.
+        velocity: (N, 2) in length per second.
+        density: Of all particles, at the start.
+    """
+
+    def __init__(self, position: NDArray[np.floating], velocity: NDArray[np.floating], density: float) -> None:
+        self.table: Array = np.zeros((7, len(position)))
+        self.table[0:2], self.table[2:4], self.table[4] = position.T, velocity.T, density
+        self.identity: NDArray[np.int64] = np.arange(len(position))
+        """(N,) index that each particle had at the start."""
+
+    def sort(self, order: NDArray[np.int64]) -> None:
+        """Reorder the particles."""
+        self.table[:] = self.table[:, order]
+        self.identity = self.identity[order]
+
+    @property
+    def position(self) -> Array:
+        """(N, 2) in the first order."""
+        return self._in_first_order(slice(0, 2))
+
+    @property
+    def velocity(self) -> Array:
+        """(N, 2) in the first order."""
+        return self._in_first_order(slice(2, 4))
+
+    @property
+    def density(self) -> Array:
+        """(N,) in the first order."""
+        return self._in_first_order(slice(4, 5))[:, 0]
+
+    def _in_first_order(self, rows: slice) -> Array:
+        ordered = np.empty((self.table.shape[1], rows.stop - rows.start))
+        ordered[self.identity] = self.table[rows].T
+        return ordered
 
 
 class SphStepper:
@@ -63,7 +145,6 @@ class SphStepper:
         self._grid, self._finder, self._wall_finder = grid, PairFinder(grid), PairFinder(grid)
         self._wall = np.zeros((4, len(position)))
         self._wall_density = np.full(len(position), fluid.density)
-        self._memory, self._wall_memory = np.empty((4, 0)), np.empty((4, 0))
         self._listed_at = np.empty((2, 0))
         self._spray = np.empty(0, np.int64)
 
@@ -91,6 +172,32 @@ class SphStepper:
         self._update_forces(particles, self.dt)
         _kick(particles.table, 0.5 * self.dt)
 
+    def advance_frame(self, particles: SphParticles, substeps: int, frame: int) -> float:
+        """The steps of a frame, in place; returns the largest deviation of density at its end.
+
+        Raises:
+            UnstableError: if the simulation becomes unstable; the message names the frame.
+        """
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # overflow is found below
+                for _ in range(substeps):
+                    self.step(particles)
+        except FloatingPointError as error:
+            raise UnstableError(f"{error} in frame {frame}; take more substeps or a higher speed of sound.") from error
+        rest, sound = self.fluid.density, self.fluid.speed_of_sound
+        deviation = float(np.abs(particles.density / rest - 1).max())
+        fastest = float(np.hypot(*particles.velocity.T).max())
+        if not (deviation <= DENSITY_LIMIT and fastest <= sound):
+            raise UnstableError(
+                f"The simulation has blown up in frame {frame}: density deviates by {deviation:.0%} (limit"
+                f" {DENSITY_LIMIT:.0%}), the fastest particle moves at {fastest:.3g} m/s (sound: {sound:.3g}). Take"
+                " more substeps, a higher speed of sound or more viscosity, or leave this seed out."
+            )
+        outside = self.boundary.count_outside(particles.position)
+        if outside:
+            raise UnstableError(f"{outside} particles are outside of the box or in an obstacle in frame {frame}.")
+        return deviation
+
     def pressure(self, particles: SphParticles) -> Array:
         """(N,) in the first order."""
         return _pressure(particles.density, self.fluid.density, self.fluid.speed_of_sound, self.fluid.exponent)
@@ -104,46 +211,33 @@ class SphStepper:
         particles.sort(order)
         x, y = particles.table[:2]
         self._listed_at = particles.table[:2].copy()
-        self._pairs = self._finder.pairs_within(x, y, starts)
-        self._wall_pairs = self._wall_finder.pairs_between(x, y, self._wall_x, self._wall_y, self._wall_starts)
-        neighbours = sum(np.bincount(side, minlength=len(x)) for side in (*self._pairs, self._wall_pairs[0]))
+        first, second = self._finder.pairs_within(x, y, starts)
+        wet, walls = self._wall_finder.pairs_between(x, y, self._wall_x, self._wall_y, self._wall_starts)
+        self._pairs = Pairs(first, second, *np.empty((4, len(first))))
+        self._wall_pairs = WallPairs(wet, walls, *np.empty((4, len(wet))))
+        neighbours = sum(np.bincount(side, minlength=len(x)) for side in (first, second, wet))
         self._spray = np.flatnonzero(neighbours < _SPRAY)
-        self._memory = _with_capacity(self._memory, len(self._pairs[0]))
-        self._wall_memory = _with_capacity(self._wall_memory, len(self._wall_pairs[0]))
 
     def _update_forces(self, particles: SphParticles, dt: float) -> None:
         """Density after dt, then accelerations."""
         fluid, h = self.fluid, self.spacing
         rest, sound = fluid.density, fluid.speed_of_sound
-        x, y, vx, vy, density, ax, ay = particles.table
-        pairs, walls = self._pairs, self._wall_pairs
-        dx, dy, f, drag = self._memory[:, : len(pairs[0])]
-        wall_dx, wall_dy, wall_f, wall_w = self._wall_memory[:, : len(walls[0])]
-        sums.pair_geometry(x, y, *pairs, h, dx, dy, f)
-        sums.wall_geometry(x, y, self._wall_x, self._wall_y, *walls, h, wall_dx, wall_dy, wall_f, wall_w)
-        rate = np.zeros_like(density)
-        sums.expansion(
-            *pairs, dx, dy, f, vx, vy, density, self.mass,
-            2 * fluid.diffusion * h * sound / rest, rest / sound**2 * self.gravity, 0.01 * h * h, rate, drag,
-        )  # fmt: skip
-        sums.wall_expansion(*walls, wall_dx, wall_dy, wall_f, vx, vy, self.mass / self._wall_density, rate)
+        table, pairs, walls = particles.table, self._pairs, self._wall_pairs
+        density = table[4]
+        sums.pair_geometry(table, pairs, h)
+        sums.wall_geometry(table, self._wall_x, self._wall_y, walls, h)
+        rate, diffusion = np.zeros_like(density), 2 * fluid.diffusion * h * sound / rest
+        sums.expansion(pairs, table, self.mass, diffusion, rest / sound**2 * self.gravity, 0.01 * h * h, rate)
+        sums.wall_expansion(walls, table, self.mass / self._wall_density, rate)
         density *= 1.0 + dt * rate
         kept = np.exp(-dt * sound / (_FADING * h))
         density[self._spray] = rest + kept * np.maximum(density[self._spray] - rest, 0.0)
         pressure = _pressure(density, rest, sound, fluid.exponent)
-        sums.wall_averages(*walls, wall_dx, wall_dy, wall_w, vx, vy, density, pressure, self.gravity, self._wall)
+        sums.wall_averages(walls, table, pressure, self.gravity, self._wall)
         self._wall_density = _density(self._wall[0], rest, sound, fluid.exponent)
-        ax[:], ay[:] = self.gravity[0], self.gravity[1]
-        viscosity = 8 * fluid.kinematic_viscosity(h)
-        sums.push(*pairs, dx, dy, f, drag, density, pressure, self.mass, viscosity, ax, ay)
-        sums.wall_push(
-            *walls, wall_dx, wall_dy, wall_f, vx, vy, density, pressure,
-            self._wall, self._wall_density, self.mass, fluid.viscosity, ax, ay,
-        )  # fmt: skip
-
-
-def _with_capacity(memory: Array, count: int) -> Array:
-    return memory if memory.shape[1] >= count else np.empty((memory.shape[0], count + count // 4))
+        table[5:7] = self.gravity[:, None]
+        sums.push(pairs, table, pressure, self.mass, 8 * fluid.kinematic_viscosity(h))
+        sums.wall_push(walls, table, pressure, self._wall, self._wall_density, self.mass, fluid.viscosity)
 
 
 def _pressure(density: Array, rest: float, sound: float, exponent: float) -> Array:

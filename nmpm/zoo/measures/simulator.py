@@ -21,8 +21,7 @@ from nmpm.errors import UnstableError
 from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.sim import InitialState, Preset
-from nmpm.sim.nudge import nudge
-from nmpm.sim.twin import twin_of
+from nmpm.sim.predictability import nudge, twin_of
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.scenes import simulation_of, track_test_scenes
 

@@ -23,7 +23,7 @@ from nmpm.evaluation.stress.subject import simulate_beside, simulate_scenes, sim
 from nmpm.evaluation.stress.trace import Trace, energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
 from nmpm.processors import Pointwise
 from nmpm.sim import MpmPreset, load_preset
-from nmpm.sim.twin import twin_of
+from nmpm.sim.predictability import twin_of
 
 TINY = Size(
     scenes=1,

@@ -27,7 +27,7 @@ from nmpm.evaluation.trade.trivial import TrivialChoice
 from nmpm.scene import Scene
 from nmpm.sim import load_preset
 from nmpm.sim.sph.preset import SphPreset
-from nmpm.sim.trajectory import SimulatedTrajectory
+from nmpm.sim.state import SimulatedTrajectory
 from tests.evaluation.trade.made_up import tiny_emulator, tiny_scenes, tiny_sweep
 
 

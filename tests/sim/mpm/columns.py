@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from nmpm.sim.mpm.grid import MpmGrid, Walls
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
-from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, Walls
 
 GRAVITY = np.array([0.0, -9.81])
 

@@ -8,7 +8,8 @@ import pytest
 
 from nmpm.errors import ConfigError
 from nmpm.sim import InitialState, load_preset, preset_from_dict
-from nmpm.sim.mpm.materials import Sand, Water
+from nmpm.sim.mpm.solids import Sand
+from nmpm.sim.mpm.water import Water
 
 # What DeepMind's water was made with, as far as its recordings tell.
 WATERDROP = dataclasses.replace(

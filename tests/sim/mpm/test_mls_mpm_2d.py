@@ -3,10 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.sim.mpm.grid import MpmGrid
-from nmpm.sim.mpm.materials import Goop
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
-from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.sim.mpm.solids import Goop
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles
 
 GOOP = Goop(density=1000.0, young=4e5, poisson=0.4, yield_stress=200.0, viscosity=60.0)
 LOW, SIZE, CELLS = 0.1, 0.025, 32

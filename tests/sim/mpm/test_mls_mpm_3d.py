@@ -5,11 +5,10 @@ import pytest
 
 from nmpm.errors import ConfigError
 from nmpm.sim import InitialState, load_preset, preset_from_dict
-from nmpm.sim.mpm.grid import MpmGrid, Walls
-from nmpm.sim.mpm.materials import Water
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
-from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, Walls
+from nmpm.sim.mpm.water import Water
 
 WATER = Water(density=1000.0, bulk_modulus=7.0e4)
 SIZE = 0.05

@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import DataError
-from nmpm.sim.mpm.grid import MpmGrid, Walls
-from nmpm.sim.mpm.materials import Goop, Sand, Water
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
-from nmpm.sim.mpm.particles import MpmParticles
+from nmpm.sim.mpm.solids import Goop, Sand
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, Walls
+from nmpm.sim.mpm.water import Water
 
 SIZE, CELLS, DT = 0.0125, 48, 2e-4
 WATER = Water(density=1000.0, bulk_modulus=7e4)
@@ -33,7 +33,7 @@ def strip(centre, angle, length, thickness):
 
 def stepper(distance, friction=0.3, gravity=(0.0, -9.81), walls=Walls.SEPARATE, dt=DT):
     bare = MpmGrid(np.zeros(2), SIZE, (CELLS, CELLS), friction, np.array(gravity), walls)
-    field = ObstacleField.sample(bare, distance, friction)
+    field = ObstacleField.sample(distance, bare.low, SIZE, bare.shape, friction)
     return Stepper2d(MpmGrid(bare.low, SIZE, bare.shape, friction, bare.gravity, walls, field), dt)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from columns import at_rest, lattice, run, tank
 
-from nmpm.sim.mpm.materials import Sand
+from nmpm.sim.mpm.solids import Sand
 
 SIZE = 0.0125
 ANGLES = (20.0, 30.0, 40.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from columns import at_rest, lattice, run, tank
 
-from nmpm.sim.mpm.materials import Water
+from nmpm.sim.mpm.water import Water
 
 WATER = Water(density=1000.0, bulk_modulus=7e4)
 WEIGHT = 1000.0 * 9.81

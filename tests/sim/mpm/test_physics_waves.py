@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from columns import at_rest, lattice, tank
 
-from nmpm.sim.mpm.grid import Walls
-from nmpm.sim.mpm.materials import Goop, Water
+from nmpm.sim.mpm.solids import Goop
+from nmpm.sim.mpm.stepper import Walls
+from nmpm.sim.mpm.water import Water
 
 WATER = Water(density=1000.0, bulk_modulus=7e4)
 JELLY = Goop(density=1000.0, young=4e5, poisson=0.3, yield_stress=1e9, viscosity=1e9)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nmpm.sim import InitialState, load_preset
-from nmpm.sim.sph.walls import SolidBoundary
+from nmpm.sim.sph.boundary import SolidBoundary
 
 FRAMES = 60
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from nmpm.sim.sph.kernel import NORM, SUPPORT, slope, weight
+from nmpm.sim.sph.sums import NORM, SUPPORT, slope, weight
 
 
 def test_integrates_to_one_over_the_plane():

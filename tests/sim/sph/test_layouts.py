@@ -5,9 +5,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
-from nmpm.sim.sph.layouts import Column, FluidBlocks
-from nmpm.sim.sph.obstacles import ObstacleRanges
-from nmpm.sim.sph.relaxation import relax
+from nmpm.sim.sph.boundary import ObstacleRanges
+from nmpm.sim.sph.layouts import Column, FluidBlocks, relax
 
 BOX = ((0.1, 0.9), (0.2, 0.8))
 COLUMN = Column(width=0.3, height=0.2, noise=0.25, relaxation=100)

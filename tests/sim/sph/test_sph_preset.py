@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import InitialState, load_preset, preset_from_dict
-from nmpm.sim.sph.obstacles import PolygonObstacle
+from nmpm.sim.sph.boundary import PolygonObstacle
 
 DAM, WBC = load_preset("dambreak2d"), load_preset("wbcsph")
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from nmpm.sim.sph.walls import LAYERS, PolygonObstacle, SolidBoundary, box_particles, obstacle_particles
+from nmpm.sim.sph.boundary import LAYERS, PolygonObstacle, SolidBoundary, box_particles, obstacle_particles
 
 SQUARE = PolygonObstacle(np.array([[0.4, 0.4], [0.6, 0.4], [0.6, 0.6], [0.4, 0.6]]))
 RAMP = PolygonObstacle(np.array([[0.3, 0.2], [0.8, 0.3], [0.7, 0.7]]))

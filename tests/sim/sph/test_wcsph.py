@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from nmpm.errors import ConfigError
-from nmpm.sim.sph.fluid import Fluid, SphParticles
-from nmpm.sim.sph.walls import SolidBoundary
-from nmpm.sim.sph.wcsph import SphStepper
+from nmpm.sim.sph.boundary import SolidBoundary
+from nmpm.sim.sph.wcsph import Fluid, SphParticles, SphStepper
 
 H = 0.02
 WATER = Fluid(density=1000.0, speed_of_sound=20.0, exponent=7.0, alpha=0.1, viscosity=0.0, diffusion=0.0)

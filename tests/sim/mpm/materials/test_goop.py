@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
-from nmpm.sim.mpm.materials import Goop
+from nmpm.sim.mpm.solids import Goop
 
 GOOP = Goop(density=1000.0, young=4e5, poisson=0.4, yield_stress=200.0, viscosity=60.0)
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
-from nmpm.sim.mpm.materials import Sand
+from nmpm.sim.mpm.solids import Sand
 
 SAND = Sand(density=1000.0, young=3.5e5, poisson=0.3, friction_angle=30.0)
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
-from nmpm.sim.mpm.materials import Water
+from nmpm.sim.mpm.water import Water
 
 WATER = Water(density=1000.0, bulk_modulus=7e4)
 

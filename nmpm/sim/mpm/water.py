@@ -24,8 +24,8 @@ from typing import ClassVar
 
 from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
-from nmpm.sim.arrays import Array
-from nmpm.sim.mpm.materials.base import Material
+from nmpm.sim.mpm.material import Material
+from nmpm.sim.state import Array
 
 # Of the volume at rest: smaller, Tait's pressure would overflow. Stable simulations stay far above it.
 _LEAST_VOLUME = 0.1

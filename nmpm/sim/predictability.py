@@ -1,13 +1,27 @@
-"""Initial states that differ by less than anyone can measure: what a simulator cannot predict about itself."""
+"""What a simulator cannot predict about itself: other time steps, and initial states that hardly differ."""
 
 from __future__ import annotations
 
 import dataclasses
+from contextlib import suppress
 
 import numpy as np
 
-from nmpm.sim.initial_state import InitialState
+from nmpm.errors import ConfigError
 from nmpm.sim.preset import Preset
+from nmpm.sim.state import InitialState
+
+
+def twin_of(preset: Preset) -> Preset:
+    """The twin: the simulator with half as many substeps; with the fewest that the solver accepts if that is more.
+
+    Where it accepts no fewer, with twice as many. The distance of the two estimates the simulator's own error.
+    """
+    for substeps in (-(-preset.substeps // 2), preset.stable_substeps):
+        if substeps < preset.substeps:
+            with suppress(ConfigError):
+                return dataclasses.replace(preset, substeps=substeps)
+    return dataclasses.replace(preset, substeps=2 * preset.substeps)
 
 
 def nudge(preset: Preset, start: InitialState, share: float, seed: int) -> InitialState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from typing import ClassVar
 
-from nmpm.sim.arrays import Array
+from nmpm.sim.state import Array
 
 
 class Material(abc.ABC):

@@ -1,6 +1,0 @@
-"""The array type of the simulators."""
-
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]

@@ -1,0 +1,118 @@
+"""What a simulation starts from, what it returns, and the loop over frames that all solvers share."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.errors import DataError
+from nmpm.scene import Interval
+
+Array = NDArray[np.float64]
+"""The array type of the simulators."""
+
+Progress = Callable[[int], object]
+"""Called after each frame with the number of frames done."""
+
+
+class Obstacle(abc.ABC):
+    """A body within the box that does not move."""
+
+    @abc.abstractmethod
+    def distance(self, points: Array) -> Array:
+        """(K,) signed distance of points (K, D) from the surface, negative inside."""
+
+    @abc.abstractmethod
+    def moved(self, shift: Array) -> Self:
+        """The same body shifted by (D,), in length."""
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Everything that a simulation needs beside its preset, for N particles in D dimensions.
+
+    Material starts without strain: stress-free in the material point method, at rest density in SPH. A state taken
+    from the middle of a trajectory therefore continues it without the pressure that it had there.
+
+    Args:
+        position: (N, D) in length.
+        velocity: (N, D) in length per second.
+        gravity: (D,) acceleration, in length per second squared; the preset's if None.
+        counts: Particles of each of the preset's materials, which `position` holds one after the other; all are of
+            the first if empty.
+        obstacles: Of the kind that the preset itself draws.
+    """
+
+    position: NDArray[Any]
+    velocity: NDArray[Any]
+    gravity: tuple[float, ...] | None = None
+    counts: tuple[int, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
+
+    def check_particles(self, reach: tuple[Interval, ...], obstacles: tuple[Obstacle, ...] = ()) -> None:
+        """Check the arrays' shapes, and that there are particles, finite, within `reach` and in no obstacle.
+
+        Raises:
+            DataError: if they are not.
+        """
+        position, velocity = self.position, self.velocity
+        if position.ndim != 2 or position.shape[1] != len(reach) or velocity.shape != position.shape:
+            raise DataError(
+                f"Positions {position.shape} and velocities {velocity.shape} must both have shape (N, {len(reach)})."
+            )
+        if not len(position):
+            raise DataError("There is no particle to simulate: give the position of one at least.")
+        low, high = np.array(reach).T
+        valid = np.all((low <= position) & (position <= high) & np.isfinite(velocity), axis=1)
+        for obstacle in obstacles:
+            valid[valid] &= obstacle.distance(position[valid]) >= 0
+        if not valid.all():
+            worst = int(np.argmin(valid))
+            raise DataError(
+                f"Particle {worst} at {position[worst].tolist()} with velocity {velocity[worst].tolist()} is not"
+                f" finite, not within {reach} or in an obstacle."
+            )
+
+
+@dataclass(frozen=True)
+class SimulatedTrajectory:
+    """T frames of N particles, made by a reference simulator.
+
+    Args:
+        position: (T, N, D) float32, in length; the first frame is the initial state. Static particles are in every
+            frame.
+        particle_type: (N,) int64, DeepMind's type ids.
+        attributes: The seed, gravity (D,) where it varies, and the simulator's counts of events that should not
+            happen.
+    """
+
+    position: NDArray[np.float32]
+    particle_type: NDArray[np.int64]
+    attributes: dict[str, Any]
+
+
+def record_frames(
+    first: Array, static: Array, frames: int, advance: Callable[[int], Array], progress: Progress | None
+) -> NDArray[np.float32]:
+    """Positions of `frames` + 1 frames, static particles after the N moving ones: (frames + 1, N + M, D).
+
+    Args:
+        first: (N, D) positions of the first frame.
+        static: (M, D) positions of particles that never move.
+        frames: Frames to simulate.
+        advance: Simulates the frame of the given index, from 1, and returns its positions (N, D).
+        progress: Called after each frame.
+    """
+    moving, dim = first.shape
+    recorded = np.empty((frames + 1, moving + len(static), dim), np.float32)
+    recorded[0, :moving], recorded[:, moving:] = first, static
+    for frame in range(1, frames + 1):
+        recorded[frame, :moving] = advance(frame)
+        if progress is not None:
+            progress(frame)
+    return recorded
