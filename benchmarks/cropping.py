@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.loading.window_plan import WindowPlan
-from nmpm.emulator.windows.axis import READ, Axis
+from nmpm.emulator.runtimes.grid_crops import Axis
 from nmpm.zoo import Zoo
 
 BATCHES = 50
@@ -77,7 +77,7 @@ def share_of(boxes: NDArray[np.int64], axes: list[Axis]) -> float:
     """Mean over batches of the cells of a crop that suits all windows of the batch, over those of the grid."""
     lengths = []
     for axis, own in zip(axes, np.moveaxis(boxes, -1, 0), strict=True):
-        needed = own[..., 1] - own[..., 0] + 1 + 2 * READ + 2 * axis.radius
+        needed = own[..., 1] - own[..., 0] + 1 + 2 * axis.halo
         aligned = -(-needed.max(-1) // axis.alignment) * axis.alignment
         lengths.append(np.minimum(aligned, axis.cells) / axis.cells)
     return float(np.prod(lengths, axis=0).mean())

@@ -29,7 +29,9 @@ BUNDLES = 4
 
 def make_forms(model: Pretrained, device: torch.device) -> dict[str, Emulator]:
     """The emulator by each runtime of the device that takes it."""
-    fitting = [name for name in GRAPHS if device.type == "cuda" and not find_runtime(name).obstacle(model.emulator)]
+    fitting = [
+        name for name in GRAPHS if device.type == "cuda" and not find_runtime(name).unsupported_reason(model.emulator)
+    ]
     return {"eager": model.emulator, **{name: model.optimized(name).emulator for name in fitting}}
 
 

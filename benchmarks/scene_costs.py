@@ -4,7 +4,7 @@ python benchmarks/scene_costs.py --threads 1 --json scene_costs.json --figure be
 python benchmarks/scene_costs.py --sweeps rest errors --cases goop
 python benchmarks/scene_costs.py --redraw scene_costs.json --figure benchmarks/scene_costs.png
 
-"On" is what rollouts do by themselves: kernels, windows around the particles, no calls for what is at rest. "Off" are
+"On" is what rollouts do by themselves: kernels, no calls for what is at rest. "Off" are
 tensor operations on the whole grid, bundle after bundle. CPU time in ms, median (quartiles). Water or goop lies in a
 corner; its sides are the same part of the box's. The channel is waterramps' model on a box of 8:1; where times are
 measured, waterdrop3d's network is untrained, which costs as much. Errors are those of zoo models, the channel's on
@@ -95,11 +95,11 @@ def finer(emulator: Emulator, share: float, count: int) -> Emulator:
 @torch.no_grad()
 def time_call(emulator: Emulator, state: Particles, rounds: int) -> Row:
     """CPU seconds of a call, on and off."""
-    whole, context = emulator.with_windows(None), emulator.context(state)
+    context = emulator.context(state)
 
     def without() -> None:
         with using("native"):
-            whole(state, context)
+            emulator(state, context)
 
     actions = {"on": lambda: emulator(state, context), "off": without}
     return {"particles": state.position.shape[1], **time_alternating(actions, rounds, clock_for(emulator.device), 2)}
@@ -108,10 +108,9 @@ def time_call(emulator: Emulator, state: Particles, rounds: int) -> Row:
 @torch.no_grad()
 def roll_out_plainly(emulator: Emulator, particles: Particles, bundles: int) -> list[Bundle]:
     """A rollout with everything off."""
-    whole = emulator.with_windows(None)
     with using("native"):
-        context = whole.context(particles)
-        return [bundle for bundle, _ in roll_on(lambda state: whole(state, context), particles, bundles)]
+        context = emulator.context(particles)
+        return [bundle for bundle, _ in roll_on(lambda state: emulator(state, context), particles, bundles)]
 
 
 @torch.no_grad()

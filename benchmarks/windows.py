@@ -1,10 +1,10 @@
-"""Cost against the occupied share of the grid: a call with the network on windows, and on the whole grid, alternating.
+"""Cost against the occupied share of the grid: a call with the runtime windows, and with eager, alternating.
 
 python benchmarks/windows.py                                      three networks, three grids, 5 to 100% occupied
 python benchmarks/windows.py --networks waterramps --grids 256x256 --shares 0.15 --precision bfloat16
 
 Water lies in a corner; its width and height are the same part of the box's. CPU time, one scene. "cells" is the part of
-the grid's cells that the windows have, halos included; 1 where the whole grid was chosen.
+the grid's cells that the network computed, halos included; 1 where the whole grid was chosen.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ import torch
 from timing import Spread, clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
 from nmpm.emulator import Emulator
-from nmpm.emulator.steps import TensorSteps
-from nmpm.emulator.windows import choose_windows
 from nmpm.particles import Particles
 from nmpm.processors import Patched, Processor, UNet
 from nmpm.zoo import Zoo
@@ -31,8 +29,8 @@ NETWORKS: dict[str, Processor | None] = {
     "shallow": UNet(width=32, depth=1, perceptron=(32,)),
 }
 """The zoo's, a U-Net of depth 3; untrained ones."""
-COLUMNS = ("network", "radius", "grid", "occupied", "cells", "network, ms", "windows", "", "call, ms", "windows", "")
-WIDTHS = (11, 8, 9, 10, 7, 13, 9, 7, 10, 9, 7)
+COLUMNS = ("network", "radius", "grid", "occupied", "cells", "call, ms", "windows", "")
+WIDTHS = (11, 8, 9, 10, 7, 10, 9, 7)
 
 
 def build_emulator(network: str, shape: tuple[int, ...], precision: str) -> Emulator:
@@ -75,31 +73,21 @@ def fill(emulator: Emulator, share: float) -> Particles:
 
 @torch.inference_mode()
 def measure(emulator: Emulator, state: Particles, rounds: int) -> dict[str, Any]:
-    """Seconds of the network and of a call, on windows and on the whole grid, and the cells of the windows."""
-    whole, context, network = emulator.with_windows(None), emulator.context(state), emulator.processor
-    _, _, _, grid_state = TensorSteps(emulator).rasterise(state, context.solid)
-    inputs = emulator.normalise(grid_state).to(emulator.network_precision)
-    chosen = []
-
-    def predict() -> object:
-        coverage = choose_windows(emulator.windows, network, emulator.recipe, grid_state)
-        chosen[:] = [coverage]
-        return network(inputs) if coverage is None else coverage.predict(network, inputs)
-
-    networks = {"network_whole": lambda: network(inputs), "network_windows": predict}
-    calls = {"call_whole": lambda: whole(state, context), "call_windows": lambda: emulator(state, context)}
-    clock = clock_for(torch.device("cpu"))
-    seconds = time_alternating(networks, rounds, clock) | time_alternating(calls, rounds, clock)
-    cells = 1.0 if chosen[0] is None else chosen[0].cells / emulator.grid.size
-    return {"cells": cells, **{name: Spread.of(values) for name, values in seconds.items()}}
+    """Seconds of a call on windows and on the whole grid, and the share of the grid's cells that windows computed."""
+    parts, context, cells = emulator.with_runtime("windows"), emulator.context(state), []
+    hook = emulator.processor.register_forward_pre_hook(lambda _, inputs: cells.append(inputs[0][:, 0].numel()))
+    parts(state, context)
+    hook.remove()
+    calls = {"call_whole": lambda: emulator(state, context), "call_windows": lambda: parts(state, context)}
+    seconds = time_alternating(calls, rounds, clock_for(torch.device("cpu")))
+    return {"cells": sum(cells) / emulator.grid.size, **{name: Spread.of(values) for name, values in seconds.items()}}
 
 
 def format_row(row: dict[str, Any]) -> str:
     """A line of the table."""
     times = [str(row[name]) for name in ("network", "radius", "grid")] + [f"{row['share']:.0%}", f"{row['cells']:.2f}"]
-    for part in ("network", "call"):
-        whole, windows = (row[f"{part}_{where}"].median for where in ("whole", "windows"))
-        times += [f"{1e3 * whole:.1f}", f"{1e3 * windows:.1f}", f"{whole / windows:.2f}x"]
+    whole, windows = (row[f"call_{where}"].median for where in ("whole", "windows"))
+    times += [f"{1e3 * whole:.1f}", f"{1e3 * windows:.1f}", f"{whole / windows:.2f}x"]
     return "".join(f"{text:>{width}}" for text, width in zip(times, WIDTHS, strict=True)) + "\n"
 
 

@@ -61,9 +61,9 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runtime",
         default="eager",
-        help="what computes the network: eager (torch, default), openvino (CPU, nmpm[openvino]), cuda-graph (GPU,"
-        " one scene in a fifth of the time), triton (GPU, not tried on one yet), or auto for the fastest that runs here"
-        " but triton",
+        help="what computes the network: eager (torch, default), openvino (CPU, nmpm[openvino]), windows (for"
+        " large scenes that are mostly empty), cuda-graph (GPU, one scene in a fifth of the time), triton (GPU, not"
+        " tried on one yet), or auto for the fastest of eager, openvino and cuda-graph here",
     )
 
 

@@ -5,7 +5,7 @@ from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.model import NETWORK_PRECISIONS, Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.rollouts import Rollout, predict_rollout, rollout, stream, stream_rollout, unroll
-from nmpm.emulator.windows import Windows
+from nmpm.emulator.runtimes import Windows
 
 __all__ = [
     "NETWORK_PRECISIONS",

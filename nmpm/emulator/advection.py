@@ -25,9 +25,8 @@ from nmpm.emulator.constraints import (
 )
 from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.crowding import Crowding
-from nmpm.emulator.departure import Departure
+from nmpm.emulator.departure import BundleStart
 from nmpm.emulator.support import Support
-from nmpm.emulator.windows.reads import check_reads
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
@@ -85,7 +84,7 @@ class Advection:
     bounds: Tensor
     walls: Tensor
 
-    def free_path(self, start: Departure) -> Tensor:
+    def free_path(self, start: BundleStart) -> Tensor:
         """(B, m, N, D) positions by the network's velocities alone, within the bounds.
 
         Raises:
@@ -93,7 +92,7 @@ class Advection:
         """
         return self._check_bounds(start, self._free(self._take_off(start)))
 
-    def constrained_path(self, start: Departure, solid: Tensor, budget: Tensor | None) -> Tensor:
+    def constrained_path(self, start: BundleStart, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
 
         Args:
@@ -103,18 +102,15 @@ class Advection:
 
         Raises:
             DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
-            UncoveredReadError: if a particle reads the output where it must not.
         """
         flight = self._take_off(start)
         path = self._free(flight) if budget is None else self._within_energy(flight, budget)
-        if start.readable is not None:
-            check_reads(start.cells, path, start.mask, start.readable, self.grid)
         path = self._clear_of_obstacles(start, path, solid)
         if self.constraints.rest_speed:
             path = self._bring_to_rest(start, path, solid)
         return self._check_bounds(start, path)
 
-    def uncrowded_path(self, start: Departure, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
+    def uncrowded_path(self, start: BundleStart, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """A constrained path (B, m, N, D) whose overfull cells at the end have been spread, evenly over its frames.
 
         Args:
@@ -138,7 +134,7 @@ class Advection:
             spread = torch.where(blocked, path, spread)
         return spread if budget is None else self._afford_spread(start, path, spread, budget)
 
-    def _take_off(self, start: Departure) -> Flight:
+    def _take_off(self, start: BundleStart) -> Flight:
         """The velocities that particles keep, and their shares of their scene's mass."""
         fields = start.fields
         smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
@@ -226,14 +222,14 @@ class Advection:
             path.append(arrived)
         return torch.stack(path[1:], dim=1)
 
-    def _clear_of_obstacles(self, start: Departure, path: Tensor, solid: Tensor) -> Tensor:
+    def _clear_of_obstacles(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), clear of obstacles."""
         if not (self.constraints.solids and self.scene.obstacles):
             return path
         contact = Contact(obstacle_share(solid, self.walls), self.grid)
         return self._confine(contact.hold(start.cells, path, start.mask))
 
-    def _bring_to_rest(self, start: Departure, path: Tensor, solid: Tensor) -> Tensor:
+    def _bring_to_rest(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
         still = at_rest(start.cells, path, self.constraints.rest_speed, start.gravity)
         if can_branch(still) and not bool(still.any()):
@@ -244,7 +240,7 @@ class Advection:
         fallen = self._confine(support.fall(start.cells, start.gravity, path.shape[1]))
         return torch.where(still[:, None, :, None], torch.where(held, start.cells.unsqueeze(1), fallen), path)
 
-    def _afford_spread(self, start: Departure, path: Tensor, spread: Tensor, budget: Tensor) -> Tensor:
+    def _afford_spread(self, start: BundleStart, path: Tensor, spread: Tensor, budget: Tensor) -> Tensor:
         """The largest part of the way from path to spread (B, m, N, D) that no frame's energy (B,) forbids.
 
         The state after the bundle, which keeps the path's velocity, counts as a further frame.
@@ -255,7 +251,7 @@ class Advection:
         share = affordable_share(self._spread_energies(start, path, path), after, budget)[:, None, None, None]
         return torch.where(share < 1, path + share * (spread - path), spread)
 
-    def _spread_energies(self, start: Departure, path: Tensor, spread: Tensor) -> Tensor:
+    def _spread_energies(self, start: BundleStart, path: Tensor, spread: Tensor) -> Tensor:
         """(B, m + 1) energies of the frames of a spread path, and of its end with the velocity of the path's end."""
         share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
         before = path[:, -2] if path.shape[1] > 1 else start.cells
@@ -277,7 +273,7 @@ class Advection:
         ]
         return torch.stack(columns, dim=-1)
 
-    def _check_bounds(self, start: Departure, path: Tensor) -> Tensor:
+    def _check_bounds(self, start: BundleStart, path: Tensor) -> Tensor:
         if self.constraints.bounds == "error":
             check_within_bounds(path, start.mask, self.bounds, self.scene.periodic)
         return path

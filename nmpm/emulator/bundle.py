@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from nmpm.emulator.fused.views import Views
-from nmpm.emulator.windows.memory import Memory
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
@@ -45,20 +44,16 @@ class RolloutContext:
         solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
         budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
         surroundings: What the kernels have prepared of each scene's solids; None for nothing.
-        memory: What the network has predicted last, which is computed again only where it has seen something else; None
-            to compute everything in each call.
         views: What the kernels have converted to arrays; None to convert everything in each call.
     """
 
     solid: Tensor
     budget: Tensor | None
     surroundings: tuple[Surroundings, ...] | None = None
-    memory: Memory | None = None
     views: Views | None = None
 
     def scenes(self, chosen: list[int]) -> RolloutContext:
-        """That of some of the scenes, with a memory of their own."""
-        own = None if self.surroundings is None else tuple(self.surroundings[scene] for scene in chosen)
+        """The context of part of the batch."""
+        surroundings = None if self.surroundings is None else tuple(self.surroundings[scene] for scene in chosen)
         budget = None if self.budget is None else self.budget[chosen]
-        memory, views = None if self.memory is None else Memory(), None if self.views is None else Views()
-        return RolloutContext(self.solid[chosen], budget, own, memory, views)
+        return RolloutContext(self.solid[chosen], budget, surroundings, None if self.views is None else Views())

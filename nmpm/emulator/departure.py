@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Departure:
+class BundleStart:
     """The particles at the start of a bundle and the grids around them.
 
     Args:
@@ -21,7 +21,6 @@ class Departure:
         state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
         output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
         scale: (m, C, 1, ...), by which it is multiplied.
-        readable: (B, *S) bool, the cells that particles may be in when they read `output`; None for all cells.
     """
 
     cells: Tensor
@@ -32,7 +31,6 @@ class Departure:
     state: Tensor
     output: Tensor
     scale: Tensor
-    readable: Tensor | None = None
 
     @property
     def fields(self) -> Tensor:

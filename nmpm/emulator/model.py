@@ -27,7 +27,6 @@ from nmpm.emulator.fused.views import Views
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.emulator.steps import steps_for
-from nmpm.emulator.windows import Windows
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout
@@ -68,7 +67,6 @@ class Emulator(nn.Module):
         self._plan = make_plan(recipe)
         self.runtime: Runtime = Eager()
         self.thread_choice: ThreadChoice | None = None
-        self.windows: Windows | None = Windows()
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
@@ -157,17 +155,17 @@ class Emulator(nn.Module):
         other.processor.to(precision)
         return other
 
-    def with_runtime(self, name: str) -> Emulator:
-        """This emulator with its network computed by a runtime of `RUNTIMES`; weights are shared, not copied.
+    def with_runtime(self, runtime: str | Runtime) -> Emulator:
+        """This emulator with its network computed by a runtime, or one of `RUNTIMES` by name; weights are shared.
 
         Raises:
             ConfigError: if there is no such runtime, or it cannot run here; one that lacks an operation of the network
                 says so in the first call.
         """
         other = copy.copy(self)
-        other.runtime = find_runtime(name)
-        if obstacle := other.runtime.obstacle(self):
-            raise ConfigError(obstacle)
+        other.runtime = find_runtime(runtime) if isinstance(runtime, str) else runtime
+        if reason := other.runtime.unsupported_reason(self):
+            raise ConfigError(reason)
         return other
 
     def with_constraints(self, constraints: Constraints) -> Emulator:
@@ -192,12 +190,6 @@ class Emulator(nn.Module):
         bounds, walls = other.grid.bounds_in_cells(other.scene), wall_fraction(other.scene, other.grid)
         own = {"bounds": bounds.to(self.bounds), "walls": walls.to(self.walls)}
         other._buffers = {**self._buffers, **own}
-        return other
-
-    def with_windows(self, windows: Windows | None) -> Emulator:
-        """This emulator with other limits for windows; None: always the whole grid. Weights are shared, not copied."""
-        other = copy.copy(self)
-        other.windows = windows
         return other
 
     def unconstrained(self) -> Emulator:
@@ -225,7 +217,6 @@ class Emulator(nn.Module):
         for weight, own in zip(other.parameters(), self.parameters(), strict=True):
             weight.requires_grad_(own.requires_grad)
         other.runtime = copy.deepcopy(self.runtime)
-        other.windows = self.windows
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,29 +12,12 @@ from torch import Tensor
 
 from nmpm._support.collectives import normal_like
 from nmpm.emulator.bundle import Bundle, RolloutContext
-from nmpm.emulator.departure import Departure
-from nmpm.emulator.outputs import with_output
-from nmpm.emulator.windows.reads import check_reads
+from nmpm.emulator.departure import BundleStart
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator
     from nmpm.emulator.steps import TensorSteps
-
-
-@dataclass(frozen=True)
-class Flight:
-    """What the network's output has led to.
-
-    Args:
-        start: What the bundle starts from.
-        path: (B, m, N, D) positions in cells.
-        evolved: Evolving fields along it, (B, m, N) by name.
-    """
-
-    start: Departure
-    path: Tensor
-    evolved: Mapping[str, Tensor]
 
 
 def predict_bundle(emulator: Emulator, steps: TensorSteps, particles: Particles, context: RolloutContext) -> Bundle:
@@ -54,48 +36,25 @@ def predict_bundle(emulator: Emulator, steps: TensorSteps, particles: Particles,
         if emulator.training and emulator.recipe.grid_noise > 0:
             normalised = normalised + emulator.recipe.grid_noise * normal_like(normalised)
 
-    def fly(output: Tensor, readable: Tensor | None) -> Flight:
-        with _full_precision(device):
-            flows = _flows(emulator)
-            own, scale = output[:, :, :flows], emulator.output_scale[:, :flows]
-            start = Departure(cells, velocity, gravity, particles.material, particles.mask, state, own, scale, readable)
-            path = steps.path(start, context)
-            evolving = emulator.scene.evolving
-            return Flight(start, path, _evolve_fields(emulator, particles, start, path, output) if evolving else {})
-
-    flight = with_output(emulator, state, normalised, context, fly)
+    output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
     with _full_precision(device):
-        return _land(emulator, steps, flight, context, particles.position.dtype)
-
-
-def _land(
-    emulator: Emulator, steps: TensorSteps, flight: Flight, context: RolloutContext, precision: torch.dtype
-) -> Bundle:
-    start, path = flight.start, flight.path
-    step = path[:, -1] - (path[:, -2] if emulator.frames > 1 else start.cells)
-    if emulator.constraints.density_cap and not emulator.training:
-        # Spreading is no motion of the material: the velocity is that of the path without it.
-        path = steps.uncrowded(start, path, context)
-    velocity = emulator.grid.to_displacement(step.to(precision))
-    return Bundle(emulator.grid.to_length(path.to(precision)), velocity, flight.evolved)
-
-
-def _evolve_fields(
-    emulator: Emulator, particles: Particles, start: Departure, path: Tensor, output: Tensor
-) -> Mapping[str, Tensor]:
-    """The evolving fields along a path (B, m, N, D) in cells, (B, m, N) by name."""
-    if start.readable is not None:
-        check_reads(start.cells, path, start.mask, start.readable, emulator.grid)
-    flows = _flows(emulator)
-    places = torch.cat([start.cells.unsqueeze(1), path[:, :-1]], dim=1)
-    rates = output[:, :, flows:].to(emulator.precision) * emulator.output_scale[:, flows:]
-    gather = partial(emulator.advection.gather, material=particles.material)
-    return emulator.field_scales.evolve(particles, places, rates, gather)
-
-
-def _flows(emulator: Emulator) -> int:
-    """Number of the output channels that are velocities."""
-    return len(emulator.scene.materials) * emulator.scene.dim
+        velocities = len(emulator.scene.materials) * emulator.scene.dim  # channels of the output; then rates of fields
+        predicted, scale = output[:, :, :velocities], emulator.output_scale[:, :velocities]
+        start = BundleStart(cells, velocity, gravity, particles.material, particles.mask, state, predicted, scale)
+        path = steps.path(start, context)
+        fields: Mapping[str, Tensor] = {}
+        if emulator.scene.evolving:
+            rates = output[:, :, velocities:].to(emulator.precision) * emulator.output_scale[:, velocities:]
+            before = torch.cat([cells.unsqueeze(1), path[:, :-1]], dim=1)
+            gather = partial(emulator.advection.gather, material=particles.material)
+            fields = emulator.field_scales.evolve(particles, before, rates, gather)
+        step = path[:, -1] - (path[:, -2] if emulator.frames > 1 else cells)
+        if emulator.constraints.density_cap and not emulator.training:
+            # Spreading is no motion of the material: the velocity is that of the path without it.
+            path = steps.uncrowded(start, path, context)
+        precision = particles.position.dtype
+        last_velocity = emulator.grid.to_displacement(step.to(precision))
+        return Bundle(emulator.grid.to_length(path.to(precision)), last_velocity, fields)
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:

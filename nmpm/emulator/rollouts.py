@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -15,7 +14,6 @@ from nmpm.emulator.bundle import Bundle
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.periods import Periods
-from nmpm.emulator.windows import Memory
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -67,9 +65,8 @@ class _Calls:
     """
 
     def __init__(self, emulator: Emulator, particles: Particles) -> None:
-        context = emulator.context(particles)
+        self._context = self._own = emulator.context(particles)
         self._emulator, self._count = emulator, len(particles.position)
-        self._context = self._own = context if emulator.training else dataclasses.replace(context, memory=Memory())
         self._awake, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
 
     def predict(self, particles: Particles) -> Bundle:

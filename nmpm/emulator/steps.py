@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from nmpm.emulator.departure import Departure
+from nmpm.emulator.departure import BundleStart
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.prediction import predict_bundle
 from nmpm.emulator.rasterise import grid_state
@@ -62,18 +62,14 @@ class TensorSteps(Steps):
         state = grid_state(own.scene, own.grid, own.transfer, particles, cells, velocity, solid, own.field_scales)
         return cells, velocity, gravity, state
 
-    def path(self, start: Departure, context: RolloutContext) -> Tensor:
-        """(B, m, N, D) positions in cells, held to the emulator's constraints.
-
-        Raises:
-            UncoveredReadError: if a particle reads the network's output where it must not.
-        """
+    def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
+        """(B, m, N, D) positions in cells, which obey the emulator's constraints."""
         advection = self.emulator.advection
         if self.emulator.training:
             return advection.free_path(start)
         return advection.constrained_path(start, context.solid, context.budget)
 
-    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+    def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
         """The path (B, m, N, D) with its overfull cells spread, see `Advection.uncrowded_path`."""
         return self.emulator.advection.uncrowded_path(start, path, context.solid, context.budget)
 
@@ -120,7 +116,7 @@ class TrainingSteps(TensorSteps):
         )
         return cells, velocity, gravity, state
 
-    def path(self, start: Departure, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
+    def path(self, start: BundleStart, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
         from nmpm.emulator.fused.training import FreePath
 
         path: Tensor = FreePath.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.emulator.rollouts import rollout
-from nmpm.emulator.runtimes import RUNTIMES, Eager, check_runtime
+from nmpm.emulator.runtimes import RUNTIMES, Eager, Runtime, check_runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
@@ -25,19 +25,20 @@ _BUNDLES, _ROUNDS = 4, 3  # of the rollouts that are timed
 _LOG = logging.getLogger(__name__)
 
 
-def optimize(emulator: Emulator, runtime: str, make_example: Callable[[], Particles]) -> Emulator:
+def optimize(emulator: Emulator, runtime: str | Runtime, make_example: Callable[[], Particles]) -> Emulator:
     """The emulator with another runtime, compared with torch on an example.
 
     Args:
         emulator: In evaluation mode.
-        runtime: A name of `RUNTIMES`, or "auto".
+        runtime: One of `RUNTIMES`, or its name, or "auto".
         make_example: Makes a state on the emulator's device.
 
     Raises:
         ConfigError: if there is no such runtime, it cannot run the model here, or its results differ from torch's;
             "auto" leaves such a runtime out.
     """
-    check_runtime(runtime, (AUTO, *RUNTIMES))
+    if isinstance(runtime, str):
+        check_runtime(runtime, (AUTO, *RUNTIMES))
     if runtime != AUTO:
         return _checked(emulator, runtime, make_example)
     fitting = []
@@ -53,9 +54,9 @@ def optimize(emulator: Emulator, runtime: str, make_example: Callable[[], Partic
     return min(fitting, key=lambda faster: seconds[faster.runtime.name])
 
 
-def _checked(emulator: Emulator, name: str, make_example: Callable[[], Particles]) -> Emulator:
+def _checked(emulator: Emulator, runtime: str | Runtime, make_example: Callable[[], Particles]) -> Emulator:
     """The emulator with a runtime whose results are torch's."""
-    faster = emulator.with_runtime(name)
+    faster = emulator.with_runtime(runtime)
     if not isinstance(faster.runtime, Eager):
         _check_deviation(emulator.with_runtime("eager"), faster, make_example())
     return faster

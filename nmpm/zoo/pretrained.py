@@ -15,9 +15,10 @@ from torch import Tensor
 from nmpm._support.devices import find_device
 from nmpm._support.numbers import check_whole
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, Windows, differentiable_rollout, predict_rollout
+from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, differentiable_rollout, predict_rollout
 from nmpm.emulator.calibrated import with_usual_gravity
 from nmpm.emulator.rollouts import warn_of_start_outside
+from nmpm.emulator.runtimes import Runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -173,20 +174,17 @@ class Pretrained:
         """
         return dataclasses.replace(self, emulator=self.emulator.over(scene))
 
-    def with_windows(self, windows: Windows | None) -> Pretrained:
-        """The same model with other limits for windows around the particles; None: always the whole grid."""
-        return dataclasses.replace(self, emulator=self.emulator.with_windows(windows))
-
-    def optimized(self, runtime: str = AUTO, precision: str | None = None) -> Pretrained:
+    def optimized(self, runtime: str | Runtime = AUTO, precision: str | None = None) -> Pretrained:
         """The same model for inference alone, its network computed by a faster runtime than torch.
 
         One bundle of an example is compared with torch's. Programs are compiled in the first call for each batch and
         grid, in a second or two, for as many threads as torch then has. This model is left as it is.
 
         Args:
-            runtime: A name of `nmpm.emulator.runtimes.RUNTIMES`: "openvino" (CPU, needs `nmpm[openvino]`), "cuda-graph"
-                or "triton" (GPU), or "eager", torch itself; "auto" for the fastest here but "triton", which no GPU has
-                tried yet, as measured in short rollouts.
+            runtime: One of `nmpm.emulator.runtimes.RUNTIMES`, by name or made with options: "openvino" (CPU, needs
+                `nmpm[openvino]`), "windows" (large scenes that are mostly empty), "cuda-graph" or "triton" (GPU, not
+                tried on one yet), or "eager", torch itself; "auto" for the fastest of openvino, cuda-graph and eager
+                here, as measured in short rollouts.
             precision: As for `with_network`; the network's own if left out.
 
         Raises:

@@ -96,7 +96,7 @@ def triton(monkeypatch, device):
     if device.type != "cuda":
         if torch.cuda.is_available():
             pytest.skip("kernels are compiled for the GPU: --device cuda")
-        monkeypatch.setattr(Triton, "obstacle", lambda *_: "")
+        monkeypatch.setattr(Triton, "unsupported_reason", lambda *_: "")
         monkeypatch.setattr(cuda_graph, "record", run_again)
 
 

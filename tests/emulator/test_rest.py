@@ -7,7 +7,6 @@ from nmpm.emulator import Emulator, EmulatorRecipe, unroll
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.runtimes import Eager
-from nmpm.emulator.windows import Windows
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from tests.scenes import box, cloud
@@ -104,33 +103,7 @@ def two_piles(wraps: bool) -> tuple[Emulator, Particles]:
     particles.position[0] = 0.3 + 0.3 * torch.rand(200, 2, generator=torch.Generator().manual_seed(1))
     particles.position[0, 100:, 0] += 2.2
     particles.velocity[0, 100:, 0] = -0.035
-    return model.requires_grad_(False).with_windows(Windows(least_cells=1)), particles
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("wraps", [False, True])
-def test_the_network_runs_where_it_sees_a_change_and_nothing_that_would_move_is_frozen(wraps, monkeypatch):
-    for name in ("choice", "cover"):
-        monkeypatch.setattr(f"nmpm.emulator.windows.{name}.CALL_CELLS", 100)  # so that windows pay on a small grid
-    model, particles = two_piles(wraps)
-    cells: list[int] = []
-    model.processor.register_forward_hook(lambda _, inputs, __: cells.append(inputs[0][:, 0].numel()))
-
-    def positions(emulator: Emulator) -> torch.Tensor:
-        cells.clear()
-        return torch.stack([bundle.position[:, -1] for bundle in unroll(emulator, particles, 20)])
-
-    expected = positions(model.with_windows(None))
-    assert sum(cells) == 20 * 128 * 32
-    cells.clear()
-    windows = torch.stack([position[:, -1] for position in called_each_time(model, particles, 20)])
-    without_memory = sum(cells)
-    found = positions(model)
-    assert sum(cells) < 0.8 * without_memory
-    for one in (found, windows):
-        assert ((one - expected).abs().max() / model.grid.spacing[0]) < 1e-3
-    assert torch.equal(found[6, 0, :100], found[2, 0, :100])
-    assert (found[-1, 0, :100] - particles.position[0, :100]).abs().max() > 0.01  # woken by what arrived
+    return model.requires_grad_(False), particles
 
 
 def unroll_states(model: Emulator, particles: Particles, bundles: int):

@@ -116,7 +116,7 @@ def graphed(monkeypatch):
         return emulator.with_runtime("cuda-graph")
 
     recorded = turn.recorded = []
-    monkeypatch.setattr(CudaGraph, "obstacle", lambda *_: "")
+    monkeypatch.setattr(CudaGraph, "unsupported_reason", lambda *_: "")
     monkeypatch.setattr(cuda_graph, "record", record)
     return turn
 

@@ -14,7 +14,7 @@ from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.fused.arrays import check_materials, output_arrays
 from nmpm.emulator.fused.crowd import CrowdArrays, spread_scene
 from nmpm.emulator.fused.flight import land
-from nmpm.emulator.fused.path import SceneArrays, check_scene_reads, clear_of_obstacles, fly_scene, rest_scene
+from nmpm.emulator.fused.path import SceneArrays, clear_of_obstacles, fly_scene, rest_scene
 from nmpm.emulator.fused.plan import Array, Plan
 from nmpm.emulator.fused.rasterise import rasterise_scene
 from nmpm.emulator.fused.surroundings import Surroundings
@@ -70,7 +70,7 @@ def rasterise_batch(
 
 
 def fly_batch(
-    plan: Plan, start: Batch, output: Tensor, scale: Array, budget: Array | None, readable: Array | None,
+    plan: Plan, start: Batch, output: Tensor, scale: Array, budget: Array | None,
     known: Sequence[Surroundings],
 ) -> Array:  # fmt: skip
     """(B, m, N, D) positions in cells, as `Advection.constrained_path` gives them.
@@ -81,11 +81,9 @@ def fly_batch(
         output: (B, m, C, *S), what the network predicts.
         scale: (m C,), by which it is multiplied.
         budget: (B,) energy that no frame may exceed; None for no such limit.
-        readable: As in `nmpm.emulator.departure.Departure`.
         known: Of each scene.
 
     Raises:
-        UncoveredReadError: if a particle reads the output where it must not, see `Departure`.
         IndexError: if a particle's material is none of the scene's.
     """
     batch, count, dim = start.cells.shape
@@ -101,8 +99,6 @@ def fly_batch(
             start.state[scene], flows,
         )  # fmt: skip
         fly_scene(own, plan, None if budget is None else float(budget[scene]), path[scene], threads)
-        if readable is not None:
-            check_scene_reads(own, plan, readable[scene].reshape(-1), path[scene], threads)
         if plan.obstacles and plan.solids:
             clear_of_obstacles(own, plan, known[scene], path[scene], threads)
         if plan.rest_speed:

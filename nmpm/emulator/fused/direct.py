@@ -1,12 +1,10 @@
 """A bundle by the kernels, without gradients: arrays from the state to the positions.
 
-Only the network, and the choice of windows for it, take tensors: a dispatch of torch takes as long as a kernel does on
-a small scene.
+Only the network takes tensors: a dispatch of torch takes as long as a kernel does on a small scene.
 """
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +18,6 @@ from nmpm.emulator.fused.flight import last_velocity
 from nmpm.emulator.fused.plan import Array, Plan
 from nmpm.emulator.fused.surroundings import Surroundings, survey
 from nmpm.emulator.fused.views import Views
-from nmpm.emulator.outputs import with_output
 from nmpm.particles import Particles
 from nmpm.transfer.fused.state import normalise
 
@@ -34,8 +31,8 @@ def predict(emulator: Emulator, plan: Plan, particles: Particles, context: Rollo
     """The bundle of an emulator in evaluation mode, see `Emulator.predict`."""
     call = DirectCall(emulator, plan, context)
     start = call.rasterise(particles)
-    path = with_output(emulator, call.state(start), call.normalise(start), context, partial(call.path, start))
-    return call.finish(start, path)
+    output = emulator.runtime.fields(emulator.processor, call.normalise(start), emulator.network_precision)
+    return call.finish(start, call.path(start, output))
 
 
 class DirectCall:
@@ -69,15 +66,10 @@ class DirectCall:
         normalise(start.state.reshape(rows), low, high, mean, deviation, seen.reshape(rows))
         return to_grid(self._plan, seen)
 
-    def state(self, start: Batch) -> Tensor:
-        """(B, C_in, *S), the grid state."""
-        return to_grid(self._plan, start.state)
-
-    def path(self, start: Batch, output: Tensor, readable: Tensor | None) -> Array:
+    def path(self, start: Batch, output: Tensor) -> Array:
         """(B, m, N, D) positions in cells, held to the emulator's constraints but the density cap."""
         scale = self._statistic("output_scale")
-        may_read = None if readable is None else as_array(readable)
-        return fly_batch(self._plan, start, output, scale, self._budget, may_read, self._known)
+        return fly_batch(self._plan, start, output, scale, self._budget, self._known)
 
     def finish(self, start: Batch, path: Array) -> Bundle:
         """The bundle of a path, whose memory is used for it."""

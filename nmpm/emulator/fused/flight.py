@@ -14,7 +14,6 @@ from nmpm._support.jit import jit, jit_sum
 from nmpm.transfer.fused.gather import gather
 
 _BLOCK = 512  # particles: their places and velocities stay in the fastest cache
-_FAR = np.float32(1e9)  # cells; positions beyond, and those that are not finite, count as 0
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
@@ -76,22 +75,6 @@ def fly(
                 energies[frame] += energy(path[frame, begin:end], here, gravity, share[begin:end], ratio)
             before = here
     return energies
-
-
-@jit
-def leaves(cells: Any, path: Any, mask: Any, readable: Any, shape: Any, wraps: Any, low: Any, high: Any) -> Any:
-    """Whether a particle was in a cell that is not readable (size,) when a frame was interpolated there."""
-    for frame in range(len(path)):
-        for p in range(low, high):
-            node = 0
-            for d in range(cells.shape[1]):
-                x = path[frame - 1, p, d] if frame > 0 else cells[p, d]
-                cell = np.int64(np.floor(x)) if abs(x) < _FAR else 0
-                inside = cell % shape[d] if wraps[d] else min(max(cell, 0), shape[d] - 1)
-                node = node * shape[d] + inside
-            if mask[p] and not readable[node]:
-                return True
-    return False
 
 
 @jit

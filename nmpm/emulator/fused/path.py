@@ -11,12 +11,11 @@ import numpy as np
 from nmpm._support.parallel import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
 from nmpm.emulator.fused import contact
-from nmpm.emulator.fused.flight import first_excess, fly, leaves, weigh
+from nmpm.emulator.fused.flight import first_excess, fly, weigh
 from nmpm.emulator.fused.limit import propose, shorten
 from nmpm.emulator.fused.plan import Array, Plan
 from nmpm.emulator.fused.support import rest, support
 from nmpm.emulator.fused.surroundings import Surroundings
-from nmpm.emulator.windows.reads import UncoveredReadError
 
 _CHUNK = 2**14  # particles that a thread treats at once; sums do not depend on the number of threads
 _MAX_PIECES = 64
@@ -27,7 +26,7 @@ ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
 @dataclass(frozen=True)
 class SceneArrays:
-    """One scene of an `emulator.departure.Departure`; shapes as in `flight.fly`."""
+    """One scene of an `emulator.departure.BundleStart`; shapes as in `flight.fly`."""
 
     cells: Array
     velocity: Array
@@ -104,21 +103,6 @@ def _largest_root(square: float, slope: float, constant: float) -> tuple[float, 
     inner = slope * slope - 4 * square * constant
     moves = square > math.sqrt(_TINY)
     return (math.sqrt(max(inner, _TINY)) - slope) / (2 * square if moves else 1.0), moves and inner >= 0
-
-
-def check_scene_reads(start: SceneArrays, plan: Plan, readable: Array, path: Array, threads: int) -> None:
-    """Raise UncoveredReadError if a scene's path was interpolated from cells that must not be read.
-
-    Args:
-        start: Where the bundle starts.
-        plan: Of the emulator.
-        readable: (size,) bool.
-        path: (m, N, D) before contact and rest have changed it.
-        threads: How many work.
-    """
-    stray = partial(leaves, start.cells, path, start.mask, readable, plan.shape, plan.wraps)
-    if any(map_ranges(stray, split(len(start.cells), _CHUNK), threads)):
-        raise UncoveredReadError
 
 
 def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, threads: int) -> None:

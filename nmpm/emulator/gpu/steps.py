@@ -13,7 +13,7 @@ from nmpm.emulator.bundle import RolloutContext
 from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
 from nmpm.emulator.contact import SURFACE, obstacle_share
 from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
-from nmpm.emulator.departure import Departure
+from nmpm.emulator.departure import BundleStart
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.gpu import contact, crowding, flight, grid
 from nmpm.emulator.steps import TensorSteps
@@ -52,7 +52,7 @@ class TritonSteps(TensorSteps):
             parts.append(gravity.unsqueeze(1).expand(-1, *plan.shape, -1))
         return cells, velocity, gravity, torch.cat(parts, dim=-1).movedim(-1, 1)
 
-    def path(self, start: Departure, context: RolloutContext) -> Tensor:
+    def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
         plan, (tiles, batch), frames = self.plan, _programs(start.cells), start.output.shape[1]
         path = start.cells.new_empty(batch, frames + 1, start.cells.shape[1], 2)
         sums = path.new_empty(batch, frames, tiles, flight.SUMS.value)
@@ -64,7 +64,7 @@ class TritonSteps(TensorSteps):
             self._rest(start, path, share)
         return path[:, 1:]
 
-    def uncrowded(self, start: Departure, path: Tensor, context: RolloutContext) -> Tensor:
+    def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
         plan, (tiles, batch), frames = self.plan, _programs(start.cells), path.shape[1]
         weight, count = self._weight(start), path.shape[2]
         path = torch.cat([start.cells.unsqueeze(1), path], dim=1)
@@ -93,7 +93,7 @@ class TritonSteps(TensorSteps):
         low, high, _ = self.plan.limits
         return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
-    def _weight(self, start: Departure) -> Tensor:
+    def _weight(self, start: BundleStart) -> Tensor:
         """(B, N, 1) each particle's share of its scene's mass, 0 for padding."""
         return mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
 
@@ -102,7 +102,7 @@ class TritonSteps(TensorSteps):
         walls = self.emulator.walls
         return obstacle_share(context.solid, walls).contiguous() if self.plan.obstacles else walls
 
-    def _advance(self, start: Departure, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor) -> None:
+    def _advance(self, start: BundleStart, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor) -> None:
         plan, fields, (batch, frames, tiles, _) = self.plan, start.fields, sums.shape
         kept, of_grid, fall, keeps = plan.decoder
         state, carried = start.state.movedim(1, -1).contiguous(), torch.empty_like(start.cells)
@@ -125,7 +125,7 @@ class TritonSteps(TensorSteps):
             path, share, sums, free, way, lengths, frames, count, tiles, *self._limits, **known, TILES=_power(tiles)
         )
 
-    def _rest(self, start: Departure, path: Tensor, share: Tensor) -> None:
+    def _rest(self, start: BundleStart, path: Tensor, share: Tensor) -> None:
         plan, longest, batch = self.plan, max(self.plan.shape), len(path)
         held = start.mask.new_empty(batch, plan.size, dtype=torch.int8)
         (left, right), (down, up) = plan.floors

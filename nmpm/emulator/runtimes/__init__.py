@@ -14,12 +14,23 @@ from nmpm.emulator.runtimes.cuda_graph import CudaGraph
 from nmpm.emulator.runtimes.eager import Eager
 from nmpm.emulator.runtimes.openvino import OpenVINO
 from nmpm.emulator.runtimes.triton import Triton
+from nmpm.emulator.runtimes.windows import Windows
 from nmpm.errors import ConfigError
 
-__all__ = ["RUNTIMES", "CudaGraph", "Eager", "OpenVINO", "Runtime", "Triton", "check_runtime", "find_runtime"]
+__all__ = [
+    "RUNTIMES",
+    "CudaGraph",
+    "Eager",
+    "OpenVINO",
+    "Runtime",
+    "Triton",
+    "Windows",
+    "check_runtime",
+    "find_runtime",
+]
 
 RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType(
-    {kind.name: kind for kind in (CudaGraph, Triton, OpenVINO, Eager)}
+    {kind.name: kind for kind in (CudaGraph, Triton, OpenVINO, Windows, Eager)}
 )
 """Runtimes by name; the last one runs every network everywhere."""
 

@@ -26,11 +26,11 @@ class Runtime(ABC):
 
     name: ClassVar[str]
     fixed_shapes: ClassVar[bool] = True
-    """Whether another shape of the grid costs a compilation, so that `nmpm.emulator.windows` would not pay."""
+    """Whether another shape of the state or of the grid costs a compilation."""
     automatic: ClassVar[bool] = True
     """Whether `nmpm.zoo.optimization` tries it where the fastest is asked for."""
 
-    def obstacle(self, emulator: Emulator) -> str:  # noqa: ARG002 (none unless overridden)
+    def unsupported_reason(self, emulator: Emulator) -> str:  # noqa: ARG002 (none unless overridden)
         """Why this runtime cannot run the emulator here, with the mend; empty if nothing is known to prevent it."""
         return ""
 

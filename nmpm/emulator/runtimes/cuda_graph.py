@@ -39,7 +39,7 @@ class CudaGraph(Runtime):
     def __init__(self) -> None:
         self._programs: Programs[Recorded] = Programs()
 
-    def obstacle(self, emulator: Emulator) -> str:
+    def unsupported_reason(self, emulator: Emulator) -> str:
         if emulator.device.type != "cuda":
             return f"The runtime cuda-graph needs a CUDA GPU; the model is on {emulator.device}."
         if emulator.constraints.bounds == "error":
@@ -52,8 +52,8 @@ class CudaGraph(Runtime):
         return Eager().fields(network, grid, precision)
 
     def bundle(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        if obstacle := self.obstacle(emulator):
-            raise ConfigError(obstacle)
+        if reason := self.unsupported_reason(emulator):
+            raise ConfigError(reason)
         state = {name: value for name, value in vars(particles).items() if isinstance(value, Tensor)}
         inputs = [*state.values(), context.solid, *([] if context.budget is None else [context.budget])]
         refuse_gradients(self, emulator, *inputs)

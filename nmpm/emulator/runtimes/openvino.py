@@ -41,7 +41,7 @@ class OpenVINO(Runtime):
     def __init__(self) -> None:
         self._programs: Programs[_Program] = Programs()
 
-    def obstacle(self, emulator: Emulator) -> str:
+    def unsupported_reason(self, emulator: Emulator) -> str:
         if importlib.util.find_spec("openvino") is None:
             return _INSTALL
         if emulator.device.type != "cpu":

@@ -25,7 +25,7 @@ class Triton(CudaGraph):
     name: ClassVar[str] = "triton"
     automatic: ClassVar[bool] = False
 
-    def obstacle(self, emulator: Emulator) -> str:
+    def unsupported_reason(self, emulator: Emulator) -> str:
         scene, bounds = emulator.scene, emulator.constraints.bounds
         rules = {
             f"{scene.dim} dimensions": scene.dim != 2,
@@ -49,7 +49,7 @@ class Triton(CudaGraph):
         from nmpm.emulator.gpu.steps import TritonSteps
 
         if emulator._plan is None:
-            raise ConfigError(self.obstacle(emulator))
+            raise ConfigError(self.unsupported_reason(emulator))
         return predict_bundle(
             emulator, TritonSteps(emulator, emulator._plan), particles.map(Tensor.contiguous), context
         )
