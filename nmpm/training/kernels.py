@@ -17,8 +17,7 @@ from nmpm._support.jit import jit, jit_sum
 from nmpm._support.parallel import for_each
 from nmpm.emulator.fused.arrays import as_array, material_rows
 from nmpm.grid import Grid
-from nmpm.transfer.fused.adjoint import scatter_adjoint
-from nmpm.transfer.fused.scatter import scatter
+from nmpm.transfer.fused.scatter import scatter, scatter_adjoint
 
 ZERO = np.float32(0)
 _LINEAR = (0, 0)

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.transfer.fused.adjoint import gather_adjoint, scatter_adjoint
+from nmpm.transfer.fused.gather import gather_adjoint
+from nmpm.transfer.fused.scatter import scatter_adjoint
 
 ZERO, ONE = np.float32(0), np.float32(1)
 

@@ -1,7 +1,7 @@
-"""g2p: interpolation of velocities at particles.
+"""g2p: interpolation of velocities at particles, and its gradients for linear weights in 2-D.
 
-Blocks of particles are taken frame by frame, not frames particle by particle: the particles of a block do not depend
-on each other, so that the processor computes several at once. That is three times as fast.
+A block of particles is taken frame by frame, not a particle through its frames: particles of a block do not depend on
+each other, so the processor computes several at once, three times as fast.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil
+from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
 
 index = np.uint64
 """Of what is not negative: Numba checks signed indices for counting from the end, which costs a quarter of the time."""
@@ -19,7 +19,7 @@ index = np.uint64
 
 @jit
 def gather(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
-    """Interpolate each particle's own material's velocity.
+    """Interpolate the velocity of each particle's own material.
 
     Args:
         field: (size, C) with the velocities of all materials first, D columns each.
@@ -27,7 +27,7 @@ def gather(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps:
         cells: (N, D) positions.
         shape: Nodes along each axis, a tuple.
         wraps: Whether each is periodic, a tuple.
-        steps: As many integers as the kernel has nodes along an axis: 2 (linear) or 3 (quadratic).
+        steps: A tuple as long as the kernel has nodes along an axis: 2 (linear) or 3 (quadratic).
         out: (N, D), is filled.
     """
     if len(steps) == 3:
@@ -52,8 +52,8 @@ def _gather_linear_2d(field: Any, material: Any, cells: Any, shape: Any, wraps: 
         a, b = index(i0 * shape[1] + j0), index(i0 * shape[1] + j1)
         c, d = index(i1 * shape[1] + j0), index(i1 * shape[1] + j1)
         for k in range(2):
-            own = first + index(k)
-            out[p, k] = bilinear(field[a, own], field[b, own], field[c, own], field[d, own], x, y)
+            col = first + index(k)
+            out[p, k] = bilinear(field[a, col], field[b, col], field[c, col], field[d, col], x, y)
 
 
 @jit
@@ -99,3 +99,47 @@ def _gather_stencil(field: Any, material: Any, cells: Any, shape: Any, wraps: An
                         node, weight = node * shape[last] + layers[layer], np.float32(weight * along_z[layer])
                     for k in range(dim):
                         out[p, k] += weight * field[node, first + k]
+
+
+@jit
+def gather_adjoint(
+    field: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, grad_out: Any, grad_cells: Any,
+    grad_field: Any,
+) -> Any:  # fmt: skip
+    """Add the gradients of linear 2-D `gather` with respect to positions and field; arguments as there.
+
+    Args:
+        field: (size, C).
+        material: (N,).
+        mask: (N,) bool, False for padding, which gets and gives no gradient.
+        cells: (N, 2).
+        shape: Nodes along each axis.
+        wraps: Whether each is periodic.
+        grad_out: (N, 2) gradient with respect to the interpolated velocities.
+        grad_cells: (N, 2), is added to.
+        grad_field: (size, C), is added to.
+    """
+    many, walls = len(material) > 0, not (wraps[0] or wraps[1])
+    for p in range(len(cells)):
+        if not mask[p]:
+            continue
+        col = 2 * material[p] if many else 0
+        if walls:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], False)
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], False)
+        else:
+            i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+            j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
+        u, v = grad_out[p, 0], grad_out[p, 1]
+        at_a = u * field[a, col] + v * field[a, col + 1]
+        at_b = u * field[b, col] + v * field[b, col + 1]
+        at_c = u * field[c, col] + v * field[c, col + 1]
+        at_d = u * field[d, col] + v * field[d, col + 1]
+        along_x = (ONE - y) * (at_c - at_a) + y * (at_d - at_b)
+        along_y = (ONE - x) * (at_b - at_a) + x * (at_d - at_c)
+        grad_cells[p, 0] += weight_slope(cells[p, 0], shape[0], wraps[0]) * along_x
+        grad_cells[p, 1] += weight_slope(cells[p, 1], shape[1], wraps[1]) * along_y
+        for node, weight in ((a, (ONE - x) * (ONE - y)), (b, (ONE - x) * y), (c, x * (ONE - y)), (d, x * y)):
+            grad_field[node, col] += weight * u
+            grad_field[node, col + 1] += weight * v

@@ -1,6 +1,6 @@
 """The nodes that a position touches along an axis, and their weights, as in `nmpm.transfer.linear` and `quadratic`.
 
-A non-finite position must not become an index: what each transfer does with one is repeated here.
+Non-finite positions are handled as each transfer does: they must not become indices.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _NO_NODE = np.int64(-(2**63))
 
 
 @jit
-def wrap(x: Any, extent: Any) -> Any:
+def _wrap(x: Any, extent: Any) -> Any:
     """A position moved into a periodic axis; NaN if it is not finite."""
     if x >= ZERO and x < extent:
         return x
@@ -29,24 +29,23 @@ def wrap(x: Any, extent: Any) -> Any:
 
 
 @jit
-def interior(x: Any, count: Any, wraps: Any) -> Any:
+def _interior(x: Any, count: Any, wraps: Any) -> Any:
     """A position in the domain: wrapped on a periodic axis, clamped to the faces of a wall axis."""
     extent = np.float32(count)
     if wraps:
-        return wrap(x, extent)
+        return _wrap(x, extent)
     if x < ZERO:
         return ZERO
     return extent if x > extent else x
 
 
 @jit
-def node_below(x: Any) -> Any:
-    """The integer below a place in nodes."""
+def _node_below(x: Any) -> Any:
     return np.int64(np.floor(x)) if np.isfinite(x) else _NO_NODE
 
 
 @jit
-def fold(node: Any, count: Any, wraps: Any) -> Any:
+def _fold(node: Any, count: Any, wraps: Any) -> Any:
     """The index of a node that may lie beyond an axis' ends."""
     if node >= 0 and node < count:
         return node
@@ -62,9 +61,9 @@ def linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
     Beyond the last centre of a wall axis the position counts as there, which folds the support onto the border node.
     """
     if wraps:
-        offset = wrap(x, np.float32(count)) - HALF
-        base = node_below(offset)
-        return fold(base, count, True), fold(base + 1, count, True), np.float32(offset - np.floor(offset))
+        offset = _wrap(x, np.float32(count)) - HALF
+        base = _node_below(offset)
+        return _fold(base, count, True), _fold(base + 1, count, True), np.float32(offset - np.floor(offset))
     last = np.float32(count - 1)
     offset = x - HALF
     if not offset > ZERO:
@@ -85,17 +84,23 @@ def stencil(x: Any, count: Any, wraps: Any, steps: Any) -> Any:
         wraps: Whether it is periodic.
         steps: A tuple of as many integers as the kernel has nodes: 1 (nearest), 2 (linear) or 3 (quadratic).
     """
-    inside = interior(x, count, wraps)
+    inside = _interior(x, count, wraps)
     if len(steps) == 1:
-        base, weights = node_below(inside), (ONE, ZERO, ZERO)
+        base, weights = _node_below(inside), (ONE, ZERO, ZERO)
     elif len(steps) == 2:
         offset = inside - HALF
         upper = np.float32(offset - np.floor(offset))
-        base, weights = node_below(offset), (ONE - upper, upper, ZERO)
+        base, weights = _node_below(offset), (ONE - upper, upper, ZERO)
     else:
         nearest = np.floor(inside)
         d = inside - HALF - nearest
-        base = node_below(nearest) - 1
+        base = _node_below(nearest) - 1
         weights = (HALF * (HALF - d) ** 2, QUARTERS - d * d, HALF * (HALF + d) ** 2)
-    nodes = (fold(base, count, wraps), fold(base + 1, count, wraps), fold(base + 2, count, wraps))
+    nodes = (_fold(base, count, wraps), _fold(base + 1, count, wraps), _fold(base + 2, count, wraps))
     return nodes, weights
+
+
+@jit
+def weight_slope(x: Any, count: Any, wraps: Any) -> Any:
+    """1 where the weights of `linear_nodes` change with the position, 0 where they are held at an end of the axis."""
+    return ONE if wraps or (x > HALF and x < np.float32(count) - HALF) else ZERO

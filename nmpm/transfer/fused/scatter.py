@@ -1,4 +1,4 @@
-"""p2g: sums of particles' values and of their number over the nodes, each material apart, in one pass."""
+"""p2g: sums of particles' values and of their number over the nodes, each material apart; gradients for linear 2-D."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.transfer.fused.nodes import ONE, linear_nodes, stencil
+from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
 
 
 @jit
@@ -15,13 +15,13 @@ def scatter(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps
     """Add to each node its share of the particles.
 
     Args:
-        values: (N, V), e.g. velocities.
+        values: (N, V), e.g. velocities; V may be 0.
         material: (N,) int64; empty where there is only one. Particles of an unknown one count nowhere.
         mask: (N,) bool, False for padding, which is left out.
         cells: (N, D) positions.
         shape: Nodes along each axis, a tuple.
         wraps: Whether each is periodic, a tuple.
-        steps: As many integers as the kernel has nodes along an axis: 1 (nearest), 2 (linear) or 3 (quadratic).
+        steps: A tuple as long as the kernel has nodes along an axis: 1 (nearest), 2 (linear) or 3 (quadratic).
         out: (size, M V + M), is added to: the values of each material, then the number of particles of each.
     """
     if len(steps) != 2:
@@ -37,8 +37,8 @@ def _scatter_linear_2d(values: Any, material: Any, mask: Any, cells: Any, shape:
     width = values.shape[1]
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
-        own = material[p] if len(material) else 0
-        if not mask[p] or own < 0 or own >= materials:
+        kind = material[p] if len(material) else 0
+        if not mask[p] or kind < 0 or kind >= materials:
             continue
         i0, i1, x = _linear_nodes(cells[p, 0], shape[0], wraps[0])
         j0, j1, y = _linear_nodes(cells[p, 1], shape[1], wraps[1])
@@ -46,11 +46,11 @@ def _scatter_linear_2d(values: Any, material: Any, mask: Any, cells: Any, shape:
         at_a, at_b, at_c, at_d = (ONE - x) * (ONE - y), (ONE - x) * y, x * (ONE - y), x * y
         for k in range(width + 1):
             value = values[p, k] if k < width else ONE
-            place = own * width + k if k < width else materials * width + own
-            out[a, place] += at_a * value
-            out[b, place] += at_b * value
-            out[c, place] += at_c * value
-            out[d, place] += at_d * value
+            col = kind * width + k if k < width else materials * width + kind
+            out[a, col] += at_a * value
+            out[b, col] += at_b * value
+            out[c, col] += at_c * value
+            out[d, col] += at_d * value
 
 
 @jit
@@ -58,8 +58,8 @@ def _scatter_linear_3d(values: Any, material: Any, mask: Any, cells: Any, shape:
     width = values.shape[1]
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
-        own = material[p] if len(material) else 0
-        if not mask[p] or own < 0 or own >= materials:
+        kind = material[p] if len(material) else 0
+        if not mask[p] or kind < 0 or kind >= materials:
             continue
         i0, i1, x = _linear_nodes(cells[p, 0], shape[0], wraps[0])
         j0, j1, y = _linear_nodes(cells[p, 1], shape[1], wraps[1])
@@ -69,9 +69,9 @@ def _scatter_linear_3d(values: Any, material: Any, mask: Any, cells: Any, shape:
                 node, weight = (row * shape[1] + column) * shape[2], along_x * along_y
                 for k in range(width + 1):
                     value = values[p, k] if k < width else ONE
-                    place = own * width + k if k < width else materials * width + own
-                    out[node + k0, place] += weight * (ONE - z) * value
-                    out[node + k1, place] += weight * z * value
+                    col = kind * width + k if k < width else materials * width + kind
+                    out[node + k0, col] += weight * (ONE - z) * value
+                    out[node + k1, col] += weight * z * value
 
 
 @jit
@@ -90,8 +90,8 @@ def _scatter_stencil(
     width, last, depth = values.shape[1], len(shape) - 1, len(steps) if len(shape) == 3 else 1
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
-        own = material[p] if len(material) else 0
-        if not mask[p] or own < 0 or own >= materials:
+        kind = material[p] if len(material) else 0
+        if not mask[p] or kind < 0 or kind >= materials:
             continue
         rows, along_x = stencil(cells[p, 0], shape[0], wraps[0], steps)
         columns, along_y = stencil(cells[p, 1], shape[1], wraps[1], steps)
@@ -103,5 +103,61 @@ def _scatter_stencil(
                     if last == 2:
                         node, weight = node * shape[last] + layers[layer], np.float32(weight * along_z[layer])
                     for k in range(width):
-                        out[node, own * width + k] += weight * values[p, k]
-                    out[node, materials * width + own] += weight
+                        out[node, kind * width + k] += weight * values[p, k]
+                    out[node, materials * width + kind] += weight
+
+
+@jit
+def scatter_adjoint(
+    values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, mean: Any, grad_out: Any,
+    grad_cells: Any, grad_values: Any,
+) -> Any:  # fmt: skip
+    """Add the gradients of linear 2-D `scatter` with respect to positions and values.
+
+    Args:
+        values: (N, V).
+        material: (N,).
+        mask: (N,) bool, False for padding, which gets no gradient.
+        cells: (N, 2).
+        shape: Nodes along each axis.
+        wraps: Whether each is periodic.
+        mean: (size, M V + ...), first the means of each material's values: their sums over the numbers.
+        grad_out: (size, M V + M): gradients with respect to the sums at fixed means of each material, then to its
+            numbers at fixed means.
+        grad_cells: (N, 2), is added to.
+        grad_values: (N, V), is added to.
+    """
+    materials = grad_out.shape[1] // (values.shape[1] + 1)
+    for p in range(len(cells)):
+        kind = material[p] if len(material) else 0
+        if not mask[p] or kind < 0 or kind >= materials:
+            continue
+        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        along_x, along_y = ZERO, ZERO
+        for row, at_x, up_x in ((i0, ONE - x, -ONE), (i1, x, ONE)):
+            for column, at_y, up_y in ((j0, ONE - y, -ONE), (j1, y, ONE)):
+                node = row * shape[1] + column
+                slope = _add_corner(values, p, kind, materials, mean, grad_out, node, at_x * at_y, grad_values)
+                along_x += up_x * at_y * slope
+                along_y += at_x * up_y * slope
+        grad_cells[p, 0] += weight_slope(cells[p, 0], shape[0], wraps[0]) * along_x
+        grad_cells[p, 1] += weight_slope(cells[p, 1], shape[1], wraps[1]) * along_y
+
+
+@jit
+def _add_corner(
+    values: Any, p: Any, kind: Any, materials: Any, mean: Any, grad_out: Any, node: Any, weight: Any, grad_values: Any
+) -> Any:
+    """Add a node's share to a particle's gradient; return the gradient with respect to the particle's weight there.
+
+    A mean changes with a weight by (value - mean) / number: taken apart, two large numbers would cancel each other
+    where the number is small.
+    """
+    width = values.shape[1]
+    slope = grad_out[node, materials * width + kind]
+    for k in range(width):
+        col = kind * width + k
+        grad_values[p, k] += weight * grad_out[node, col]
+        slope += grad_out[node, col] * (values[p, k] - mean[node, col])
+    return slope
