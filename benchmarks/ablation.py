@@ -213,7 +213,7 @@ def train_variant(sweep: Sweep, name: str, steps: int, folder: Path, device: tor
     if (run / "checkpoints" / "last.ckpt").exists():
         words += ["--ckpt_path", "last"]
     with (run / "log.txt").open("a", encoding="utf-8") as log:
-        child = subprocess.Popen(words, stdout=log, stderr=log, env=os.environ | {"OMP_NUM_THREADS": "1"})  # noqa: S603
+        child = subprocess.Popen(words, stdout=log, stderr=log, env=os.environ | {"OMP_NUM_THREADS": "1"})
         _, status, usage = os.wait4(child.pid, 0)
     if status:
         raise RuntimeError(f"{name} failed; see {run / 'log.txt'}")

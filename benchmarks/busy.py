@@ -94,7 +94,7 @@ def main() -> None:
 @contextmanager
 def load(case: Case) -> Iterator[Sequence[str]]:
     """Make what a case meets; gives the words before its command."""
-    loops = [subprocess.Popen([sys.executable, "-c", LOOP]) for _ in range(case.loops)]  # noqa: S603
+    loops = [subprocess.Popen([sys.executable, "-c", LOOP]) for _ in range(case.loops)]
     try:
         if not case.quota:
             yield case.prefix
@@ -133,7 +133,7 @@ def time_step(case: Case, prefix: Sequence[str], steps: int) -> float:
             "--trainer.limit_val_batches", "0", "--trainer.limit_test_batches", "1",
             "--trainer.default_root_dir", folder,
         ]  # fmt: skip
-        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         training = json.loads((Path(folder) / "report.json").read_text())["training"]
     return float(training["seconds"]) / steps
 
@@ -141,7 +141,7 @@ def time_step(case: Case, prefix: Sequence[str], steps: int) -> float:
 def time_rollout(case: Case, prefix: Sequence[str]) -> float:
     """Seconds of 400 frames of the zoo's goop model."""
     words = [*prefix, sys.executable, "-c", ROLLOUT, str(case.threads)]
-    return float(subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True).stdout)  # noqa: S603
+    return float(subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True).stdout)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def former_card(name: str, revision: str) -> dict[str, Any]:
     """
     path = f"{revision}:zoo/{name}/{CARD}"
     words = ["git", "show", "--end-of-options", path]
-    found = subprocess.run(words, cwd=ZOO.parent, capture_output=True, text=True, check=False)  # noqa: S603
+    found = subprocess.run(words, cwd=ZOO.parent, capture_output=True, text=True, check=False)
     if found.returncode:
         raise ConfigError(f"{path}: {found.stderr.strip()}")
     card: dict[str, Any] = yaml.safe_load(found.stdout)

@@ -36,7 +36,7 @@ def _draw(name: str, seed: int, frames: int | None, folder: Path) -> Image.Image
     path = folder / f"{name}.png"
     length = min(load_preset(name).frames, frames or sys.maxsize)
     words = ["simulate", name, "--preview", str(path), "--seed", str(seed), "--frames", str(length)]
-    subprocess.run([sys.executable, "-m", "nmpm", *words], check=True)  # noqa: S603
+    subprocess.run([sys.executable, "-m", "nmpm", *words], check=True)
     with Image.open(path) as picture:
         return picture.convert("RGB")
 

@@ -104,7 +104,7 @@ def _run_logged(command: list[str], log: Path) -> int:
     with log.open("wb") as file:
         file.write(_first_line(command))
         file.flush()
-        status = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT).returncode  # noqa: S603
+        status = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT).returncode
         file.write(_last_line(status))
     return status
 

@@ -61,7 +61,7 @@ def main() -> int:
 def build(folder: Path) -> Path:
     """The wheel of this checkout, in a folder."""
     words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
-    subprocess.run(words, check=True)  # noqa: S603
+    subprocess.run(words, check=True)
     return next(folder.glob("nmpm-*.whl"))
 
 
@@ -70,7 +70,7 @@ def install(wheel: Path, environment: Path) -> Path:
     venv.create(environment, with_pip=True)
     programs = environment / "bin"
     constraints = ["-c", str(ROOT / "constraints.txt")]
-    subprocess.run([programs / "pip", "install", "--quiet", *constraints, str(wheel)], check=True)  # noqa: S603
+    subprocess.run([programs / "pip", "install", "--quiet", *constraints, str(wheel)], check=True)
     return programs
 
 
@@ -90,7 +90,7 @@ def checks(programs: Path, full: bool, recorded: Path | None) -> list[tuple[str,
 def run_offline(words: Sequence[str], folder: Path) -> int:
     """The exit status of a command without network, away from the checkout, and with an empty home of nmpm's."""
     home = {"NMPM_HOME": str(folder / "home"), "HOME": str(folder)}
-    return subprocess.run([*OFFLINE, *words], cwd=folder, env=os.environ | home, check=False).returncode  # noqa: S603
+    return subprocess.run([*OFFLINE, *words], cwd=folder, env=os.environ | home, check=False).returncode
 
 
 if __name__ == "__main__":
