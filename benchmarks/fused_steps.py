@@ -22,12 +22,12 @@ from nmpm.emulator import Emulator
 from nmpm.evaluation.stress.subject import Subject
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 from nmpm.zoo import Zoo
 
 PATHS: dict[str, Callable[[], AbstractContextManager[None]]] = {
     "kernels": nullcontext,
-    "tensor operations": lambda: using("native"),
+    "tensor operations": lambda: without_kernels(),
 }
 
 

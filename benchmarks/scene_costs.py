@@ -36,7 +36,7 @@ from nmpm.emulator import Bundle, Emulator, unroll
 from nmpm.evaluation.stress.subject import Subject, simulate_scenes
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 from nmpm.zoo import Zoo
 
 Row = dict[str, Any]
@@ -98,7 +98,7 @@ def time_call(emulator: Emulator, state: Particles, rounds: int) -> Row:
     context = emulator.context(state)
 
     def without() -> None:
-        with using("native"):
+        with without_kernels():
             emulator(state, context)
 
     actions = {"on": lambda: emulator(state, context), "off": without}
@@ -108,7 +108,7 @@ def time_call(emulator: Emulator, state: Particles, rounds: int) -> Row:
 @torch.no_grad()
 def roll_out_plainly(emulator: Emulator, particles: Particles, bundles: int) -> list[Bundle]:
     """A rollout with everything off."""
-    with using("native"):
+    with without_kernels():
         context = emulator.context(particles)
         return [bundle for bundle, _ in roll_on(lambda state: emulator(state, context), particles, bundles)]
 

@@ -38,7 +38,7 @@ from nmpm.processors import UNet
 from nmpm.scene import Scene
 from nmpm.sim import Preset, load_preset
 from nmpm.training.losses import position_error
-from nmpm.transfer import Linear, Nearest, Transfer, using
+from nmpm.transfer import Linear, Nearest, Transfer, without_kernels
 
 Call = Callable[[Particles, RolloutContext], Bundle]
 UNCONSTRAINED = Constraints(solids=False)
@@ -68,7 +68,7 @@ class Setup:
 
     def backend(self) -> AbstractContextManager[None]:
         """Within it what the setup says runs around the network."""
-        return nullcontext() if self.kernels else using("native")
+        return nullcontext() if self.kernels else without_kernels()
 
     def predictor(self, emulator: Emulator, context: RolloutContext, call: Call) -> Callable[[Particles], Bundle]:
         """A call from a state: in the rollout's context, or in one of its own in the paper's form.

@@ -16,7 +16,7 @@ from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.processors import FNO, Processor, UNet
 from nmpm.training import EmulatorModule
-from nmpm.transfer import Affine, Linear, Quadratic, Transfer, using
+from nmpm.transfer import Affine, Linear, Quadratic, Transfer, scatter_backend
 from nmpm.zoo import Zoo
 
 SMALL = UNet(width=4, depth=1, perceptron=(4,))
@@ -62,7 +62,7 @@ def test_backends_of_p2g_give_the_same_gradients(device, name):
     particles, gradients = cloud(scene, batch=2), []
     for place in (torch.device("cpu"), device):
         emulator = emulator_of(scene).to(place).requires_grad_()
-        with using(name):
+        with scatter_backend(name):
             emulator(particles.to(place)).position.square().sum().backward()
         gradients.append(torch.cat([p.grad.flatten().cpu() for p in emulator.parameters()]))
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-4 * float(gradients[0].abs().max()))

@@ -30,7 +30,7 @@ from nmpm.emulator.support import Support
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
-from nmpm.transfer.chunks import can_branch, chunks
+from nmpm.transfer.execution import chunks, is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
 
@@ -176,7 +176,7 @@ class Advection:
 
         On a CPU the free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
         """
-        if not can_branch(budget):
+        if not is_eager_cpu(budget):
             return self._limit_energy(flight, budget, flight.cells.unsqueeze(1)[:, :0])
         path = self._free(flight)
         energies = self._energies(flight.cells, flight.gravity, flight.share, path)
@@ -232,7 +232,7 @@ class Advection:
     def _bring_to_rest(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
         still = at_rest(start.cells, path, self.constraints.rest_speed, start.gravity)
-        if can_branch(still) and not bool(still.any()):
+        if is_eager_cpu(still) and not bool(still.any()):
             return path
         obstacle = obstacle_share(solid, self.walls) if self.scene.obstacles else None
         support = Support(start.filled, obstacle, self.scene, self.grid)
@@ -246,7 +246,7 @@ class Advection:
         The state after the bundle, which keeps the path's velocity, counts as a further frame.
         """
         after = self._spread_energies(start, path, spread)
-        if can_branch(budget) and not bool((after > budget.unsqueeze(1)).any()):
+        if is_eager_cpu(budget) and not bool((after > budget.unsqueeze(1)).any()):
             return spread
         share = affordable_share(self._spread_energies(start, path, path), after, budget)[:, None, None, None]
         return torch.where(share < 1, path + share * (spread - path), spread)

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nmpm.grid import Grid
-from nmpm.transfer.chunks import can_branch, chunks
+from nmpm.transfer.execution import chunks, is_eager_cpu
 from nmpm.transfer.linear import linear_g2p, linear_stencil
 
 SURFACE = 0.4
@@ -71,7 +71,7 @@ class Contact:
         Returns:
             (B, m, N, D): the path itself for particles that keep clear of obstacles.
         """
-        return self.hold_touching(start, path, mask) if can_branch(start) else self.hold_all(start, path, mask)
+        return self.hold_touching(start, path, mask) if is_eager_cpu(start) else self.hold_all(start, path, mask)
 
     def inside(self, places: Tensor) -> Tensor:
         """(B, K) bool: whether places (B, K, D) in cells are deeper in an obstacle than its surface."""

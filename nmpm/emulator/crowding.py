@@ -23,7 +23,7 @@ from torch import Tensor
 
 from nmpm.grid import Grid
 from nmpm.transfer import Linear
-from nmpm.transfer.chunks import can_branch, chunks
+from nmpm.transfer.execution import chunks, is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
 MAX_SHIFT = 0.5
@@ -64,7 +64,7 @@ class Crowding:
         """
         full = Linear().p2g(real.to(cells.dtype), cells, self.grid) * (self.particle / self.cap)
         excess = full - self.room
-        if can_branch(excess) and not bool((excess > 0).any()):
+        if is_eager_cpu(excess) and not bool((excess > 0).any()):
             return None
         flow = torch.cat(self._flow(excess), dim=1)
         parts = [linear_g2p(flow, cells[:, chunk], self.grid) for chunk in chunks(cells.shape[1], cells.device)]

@@ -227,7 +227,7 @@ class Emulator(nn.Module):
         """
         self.field_scales.warn_of_missing(particles)
         solid = self.solid(particles)
-        surroundings = steps_for(self, self._plan, particles, solid).survey(solid)
+        surroundings = steps_for(self, self._plan, particles, solid).prepare_rollout(solid)
         views = None if surroundings is None else Views()
         return RolloutContext(solid, self.budget(particles), surroundings, views=views)
 

@@ -17,7 +17,7 @@ from nmpm.emulator.model import Emulator
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.errors import NmpmError
 from nmpm.particles import Particles
-from nmpm.transfer.chunks import can_branch
+from nmpm.transfer.execution import is_eager_cpu
 
 _CROWDING_EVERY = 16  # bundles: its sum over particles costs as much as all the rest
 _READ_EVERY = 16  # bundles, where reading measures back halts the device
@@ -110,7 +110,7 @@ class Monitor:
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
         self.rest_share, self._judged = 0.0, 0
         self._unread = []
-        self._padded = not can_branch(particles.mask) or not bool(particles.mask.all())
+        self._padded = not is_eager_cpu(particles.mask) or not bool(particles.mask.all())
         if not emulator.scene.gravity_known:
             self._reference = None
             return
@@ -138,7 +138,7 @@ class Monitor:
         if self._bundles % _CROWDING_EVERY == 1:
             measures |= self._crowding_and_walls(emulator, particles, bundle.position[:, -1])
         self._unread.append((self._frames, measures))
-        if can_branch(bundle.position) or len(self._unread) == _READ_EVERY:
+        if is_eager_cpu(bundle.position) or len(self._unread) == _READ_EVERY:
             self.read()
 
     def read(self) -> None:

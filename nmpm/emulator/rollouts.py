@@ -17,7 +17,7 @@ from nmpm.emulator.periods import Periods
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
-from nmpm.transfer.chunks import can_branch
+from nmpm.transfer.execution import is_eager_cpu
 
 ROUNDING = 1e-3
 """Cells by which particles may start outside of the bounds without a warning."""
@@ -91,7 +91,7 @@ class _Calls:
 
         All or none where another number of scenes would be compiled anew.
         """
-        if self._emulator.training or not can_branch(after.position) or after.position.requires_grad:
+        if self._emulator.training or not is_eager_cpu(after.position) or after.position.requires_grad:
             return
         awake = [scene for scene in self._awake if not _is_same_state(before, after, scene)]
         if len(awake) == len(self._awake) or (awake and self._emulator.shapes_are_compiled):

@@ -18,7 +18,7 @@ from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.prediction import predict_bundle
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
-from nmpm.transfer.backends import kernels_take
+from nmpm.transfer.execution import kernels_take
 
 if TYPE_CHECKING:
     from nmpm.emulator.bundle import Bundle, RolloutContext
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class Steps(ABC):
     """How an emulator's calls are computed."""
 
-    def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
+    def prepare_rollout(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
         """What is prepared for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
         return None
 
@@ -86,7 +86,7 @@ class FusedSteps(Steps):
     plan: Plan
     walls: Tensor
 
-    def survey(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
+    def prepare_rollout(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
         from nmpm.emulator.fused.surroundings import survey_rollout  # imported late, as Numba is
 
         return survey_rollout(self.plan, solid, self.walls)
@@ -129,7 +129,7 @@ class TrainingSteps(TensorSteps):
 def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
-    Kernels run on a CPU, in float32, for the parts of this package (`make_plan`) and outside of `nmpm.transfer.using`:
+    Kernels run on a CPU, in float32, for the parts of this package (`make_plan`) and outside of `without_kernels`:
     in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation mode those without.
     Graphs that `torch.compile` traces take tensor operations.
     """

@@ -17,7 +17,7 @@ from torch import Tensor
 from nmpm.emulator.contact import SURFACE
 from nmpm.grid import Grid
 from nmpm.scene import Scene
-from nmpm.transfer.chunks import can_branch
+from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
 REACH = 2
@@ -109,7 +109,7 @@ class Support:
             for upwards in (False, True):
                 pull = gravity[:, 0, axis]
                 pulled = largest & (pull > 0 if upwards else pull <= 0)
-                if can_branch(pulled) and not bool(pulled.any()):
+                if is_eager_cpu(pulled) and not bool(pulled.any()):
                     continue
                 here = pulled.view(-1, *(1,) * self.grid.dim)
                 result = result & (self._supported_along(axis, upwards) | ~here)  # ONNX Runtime's Where takes no bool

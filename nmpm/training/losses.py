@@ -18,7 +18,7 @@ from nmpm.grid import Grid
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
-from nmpm.transfer.backends import kernels_take
+from nmpm.transfer.execution import kernels_take
 
 _FLOOR = 1e-4
 """Cells², added to errors before they are raised to a power: below a hundredth of a cell errors no longer count."""

@@ -1,10 +1,19 @@
-"""Particles to grid and back: the contract and one kernel per file."""
+"""Particles to grid and back: the contract, and the kernels that implement it."""
 
-from nmpm.transfer.affine import Affine
-from nmpm.transfer.backends import using
-from nmpm.transfer.base import Stencil, Transfer, gather, scatter
-from nmpm.transfer.linear import Linear
-from nmpm.transfer.nearest import Nearest
-from nmpm.transfer.quadratic import Quadratic
+from nmpm.transfer.execution import scatter_backend, without_kernels
+from nmpm.transfer.linear import Linear, Nearest
+from nmpm.transfer.quadratic import Affine, Quadratic
+from nmpm.transfer.transfer import Stencil, Transfer, gather, scatter
 
-__all__ = ["Affine", "Linear", "Nearest", "Quadratic", "Stencil", "Transfer", "gather", "scatter", "using"]
+__all__ = [
+    "Affine",
+    "Linear",
+    "Nearest",
+    "Quadratic",
+    "Stencil",
+    "Transfer",
+    "gather",
+    "scatter",
+    "scatter_backend",
+    "without_kernels",
+]

@@ -1,4 +1,7 @@
-"""Linear (cloud-in-cell, bilinear, trilinear) transfers: one kernel both ways, 2 nodes per axis."""
+"""Transfers whose g2p is linear interpolation (cloud-in-cell, bilinear, trilinear), 2 nodes per axis.
+
+Source of `Nearest`: Rochman-Sharabi, Lewin & Louppe, arXiv 2408.15753, section 3.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nmpm.grid import Grid, per_axis
-from nmpm.transfer.base import Stencil, Transfer, gather, inside, tensor_product
+from nmpm.transfer.transfer import Stencil, Transfer, gather, inside, tensor_product
 
 
 def linear_stencil(cells: Tensor, grid: Grid) -> Stencil:
@@ -44,6 +47,24 @@ class Linear(Transfer):
 
     def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
         return linear_stencil(cells, grid)
+
+    def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
+        return linear_stencil(cells, grid)
+
+    def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
+        return linear_g2p(field, cells, grid)
+
+
+@dataclass(frozen=True)
+class Nearest(Transfer):
+    """The paper's pair: p2g averages the particles in each voxel, g2p is linear interpolation.
+
+    p2g is piecewise constant in the positions, so no gradient flows through it to them; the pair is not adjoint.
+    """
+
+    def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
+        base = inside(cells.detach(), grid).floor().long()
+        return tensor_product(base, [torch.ones_like(cells, requires_grad=False)], grid)
 
     def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
         return linear_stencil(cells, grid)

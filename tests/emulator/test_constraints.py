@@ -14,7 +14,7 @@ from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import Pointwise, UNet
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 from nmpm.zoo import Zoo
 
 
@@ -124,7 +124,7 @@ def limited_everywhere(monkeypatch):
     """As on a GPU: nothing is decided by reading values back, and no kernel of the CPU runs."""
     monkeypatch.setattr("nmpm.emulator.steps.kernels_take", lambda *_: False)
     for module in ("advection", "contact"):
-        monkeypatch.setattr(f"nmpm.emulator.{module}.can_branch", lambda values: False)
+        monkeypatch.setattr(f"nmpm.emulator.{module}.is_eager_cpu", lambda values: False)
 
 
 @pytest.mark.parametrize("cells", [16, (16, 8)])
@@ -146,7 +146,7 @@ def test_with_and_without_branches_the_energy_limit_is_the_same_to_the_bit(monke
     scene = box()
     emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
     emulator.output_scale.mul_(3.0)
-    with using("native"):
+    with without_kernels():
         by_branching = rollout(emulator, particles, 24)
     limited_everywhere(monkeypatch)
     assert torch.equal(rollout(emulator, particles, 24), by_branching)

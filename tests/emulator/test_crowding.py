@@ -16,7 +16,7 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.processors import Pointwise
 from nmpm.scene import Scene
-from nmpm.transfer import Linear, using
+from nmpm.transfer import Linear, scatter_backend, without_kernels
 from nmpm.transfer.linear import linear_g2p
 
 
@@ -156,7 +156,7 @@ def test_derivatives_are_finite_and_those_of_differences():
 def test_the_form_for_other_devices_is_the_same(monkeypatch):
     crowd, dense = crowding(square()), block(3, 12)
     expected = crowd.shift(dense, everybody(dense))
-    monkeypatch.setattr("nmpm.emulator.crowding.can_branch", lambda _: False)
+    monkeypatch.setattr("nmpm.emulator.crowding.is_eager_cpu", lambda _: False)
     assert torch.equal(crowd.shift(dense, everybody(dense)), expected)
     loose = block(8, 8)
     assert crowd.shift(loose, everybody(loose)).eq(0).all()
@@ -246,7 +246,7 @@ def test_training_has_no_cap():
 def test_the_energy_of_no_frame_exceeds_that_of_the_first_state(branching, monkeypatch):
     if not branching:
         for module in ("advection", "crowding"):
-            monkeypatch.setattr(f"nmpm.emulator.{module}.can_branch", lambda _: False)
+            monkeypatch.setattr(f"nmpm.emulator.{module}.is_eager_cpu", lambda _: False)
     scene = box()
     emulator = emulator_of(scene, gain=1.0, energy=True, density_cap=1.0)
     state = crowd_in(scene, batch=2)
@@ -303,7 +303,7 @@ def test_padding_changes_nothing():
         material=torch.cat([state.material, torch.zeros(1, 7, dtype=torch.int64)], dim=1),
         mask=torch.cat([state.mask, torch.zeros(1, 7, dtype=torch.bool)], dim=1),
     )
-    with using("sorted"):
+    with without_kernels(), scatter_backend("sorted"):
         alone, together = rollout(emulator, state, 24), rollout(emulator, padded, 24)
     assert torch.equal(together[:, :, :400], alone)
 

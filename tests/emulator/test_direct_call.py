@@ -14,7 +14,7 @@ from nmpm.emulator.fused.batch import to_grid
 from nmpm.emulator.fused.direct import DirectCall
 from nmpm.emulator.fused.views import Views
 from nmpm.processors import Pointwise
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 
 
 def small_emulator(scene, **parts):
@@ -97,7 +97,7 @@ def test_single_frames_and_bfloat16_are_as_with_tensor_operations():
     emulator = recipe.build().eval().requires_grad_(False).with_network(torch.bfloat16)
     particles = cloud(scene, 60)
     kernels = emulator(particles)
-    with using("native"):
+    with without_kernels():
         tensors = emulator(particles)
     torch.testing.assert_close(kernels.position, tensors.position, rtol=0, atol=1e-5)
     torch.testing.assert_close(kernels.velocity, tensors.velocity, rtol=0, atol=1e-5)

@@ -12,7 +12,7 @@ from nmpm.emulator.rollouts import rollout, stream, unroll
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
 from nmpm.processors import FNO, Pointwise, UNet
-from nmpm.transfer import Affine, Linear, Nearest, Quadratic, using
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic, without_kernels
 
 SMALL = UNet(width=4, depth=1, perceptron=(4,))
 TRANSFERS = (Nearest(), Linear(), Quadratic(), Affine())
@@ -313,9 +313,9 @@ def in_sevens(count, device, values=1):
 def test_particles_in_chunks_move_as_all_at_once(transfer, monkeypatch):
     scene = box(materials=("water", "sand"))
     emulator, particles = small(scene, transfer), cloud(scene)
-    with torch.no_grad(), using("native"):
+    with torch.no_grad(), without_kernels():
         whole = emulator(particles)
-        for module in ("nmpm.transfer.base", "nmpm.emulator.advection"):
+        for module in ("nmpm.transfer.transfer", "nmpm.emulator.advection"):
             monkeypatch.setattr(f"{module}.chunks", in_sevens)
         cut = emulator(particles)
     torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)

@@ -20,7 +20,7 @@ from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.processors import FFNO, FNO, TFNO, Axial, ConvNeXt, Identity, Pointwise, UNet, UNetModern
 from nmpm.training.losses import position_error
-from nmpm.transfer import Affine, Linear, Nearest, Quadratic, using
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic, scatter_backend, without_kernels
 
 TRANSFERS = (Nearest(), Linear(), Quadratic(), Affine())
 DECODERS = (Absolute(), Residual(), Flip(), Blend(), Acceleration())
@@ -108,7 +108,7 @@ def test_each_kind_of_scene_trains_and_rolls_out(transfer, name):
 @pytest.mark.parametrize("transfer", TRANSFERS, ids=named)
 def test_reproducible_sums(transfer):
     emulator = emulator_of(SCENES["walls"], transfer)
-    with using("sorted"):
+    with without_kernels(), scatter_backend("sorted"):
         train(emulator, window(SCENES["walls"]))
         roll(emulator, window(SCENES["walls"]))
 

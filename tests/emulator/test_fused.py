@@ -20,7 +20,7 @@ from nmpm.emulator.rollouts import rollout
 from nmpm.emulator.steps import FusedSteps, TensorSteps, steps_for
 from nmpm.particles import Particles
 from nmpm.processors import Pointwise, UNet
-from nmpm.transfer import Linear, Nearest, Quadratic, using
+from nmpm.transfer import Linear, Nearest, Quadratic, without_kernels
 
 LIMIT = 2e-4  # cells: positions reach 16, and three bundles amplify their rounding
 
@@ -50,7 +50,7 @@ def predict_both(emulator, particles):
     with torch.no_grad():
         assert isinstance(steps_for(emulator, emulator._plan, particles, emulator.solid(particles)), FusedSteps)
         fused = emulator(particles)
-        with using("native"):
+        with without_kernels():
             assert isinstance(steps_for(emulator, emulator._plan, particles, emulator.solid(particles)), TensorSteps)
             tensors = emulator(particles)
     spacing = torch.tensor(emulator.grid.spacing)
@@ -147,7 +147,7 @@ def test_rollouts_are_those_of_tensor_operations():
     network = UNet(width=4, depth=1, perceptron=(4,))
     emulator = EmulatorRecipe(scene, 16, 4, processor=network, constraints=Constraints(energy=True)).build().eval()
     particles = cloud(scene, 200)
-    with using("native"):
+    with without_kernels():
         tensors = rollout(emulator, particles, 12)
     difference = (rollout(emulator, particles, 12) - tensors).abs().max() / emulator.grid.spacing[0]
     assert difference < LIMIT
@@ -196,7 +196,7 @@ def test_padding_changes_nothing_beside_obstacles_however_fast_and_wherever_it_i
     padded.mask[:, 200:] = False
     padded.position[:, 200:230] = slab[:, :30]
     padded.velocity[:, 230:] = 0.4
-    with torch.no_grad(), using(backend) if backend else contextlib.nullcontext():
+    with torch.no_grad(), without_kernels() if backend else contextlib.nullcontext():
         assert torch.equal(emulator(padded).position[:, :, :200], emulator(particles).position)
 
 

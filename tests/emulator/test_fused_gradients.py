@@ -15,7 +15,7 @@ from nmpm.emulator.steps import TensorSteps, TrainingSteps, steps_for
 from nmpm.particles import Window
 from nmpm.processors import Pointwise
 from nmpm.training.losses import TrainingError
-from nmpm.transfer import Linear, Nearest, Quadratic, using
+from nmpm.transfer import Linear, Nearest, Quadratic, without_kernels
 
 
 def emulator_of(scene, cells=10, frames=3, seed=0, **parts):
@@ -60,7 +60,7 @@ def train_once(emulator, particles, bundles=2):
 def assert_equal_to_rounding(emulator, particles):
     assert isinstance(steps_of(emulator, particles), TrainingSteps)
     found = train_once(emulator, particles)
-    with using("native"):
+    with without_kernels():
         assert isinstance(steps_of(emulator, particles), TensorSteps)
         tensors = train_once(emulator, particles)
     torch.testing.assert_close(found[0], tensors[0], rtol=1e-4, atol=1e-6)

@@ -15,7 +15,7 @@ from nmpm.emulator.steps import TensorSteps
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import UNet
-from nmpm.transfer import Quadratic, using
+from nmpm.transfer import Quadratic, without_kernels
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported
@@ -124,7 +124,7 @@ def test_rollouts_go_on_from_states_of_any_size_and_precision(device):
     for count in (60, 1, 60):
         state = cloud(box(), count, seed=count).to(device)
         for own in (state, state.double()):
-            with using("native"):
+            with without_kernels():
                 expected = rollout(emulator, own, 6)
             got = rollout(quick, own, 6)
             assert got.dtype == expected.dtype

@@ -115,14 +115,14 @@ class TestReadLate:
 
     @pytest.fixture(autouse=True)
     def _no_branches(self, monkeypatch):
-        monkeypatch.setattr("nmpm.emulator.monitor.can_branch", lambda values: False)
+        monkeypatch.setattr("nmpm.emulator.monitor.is_eager_cpu", lambda values: False)
 
     def test_what_is_seen_is_the_same(self, monkeypatch):
         scene = box()
         emulator, particles = emulator_of(scene, 5.0), cloud(scene, batch=2)
         late, early = Monitor(Policy.RECORD, speed=0.1), Monitor(Policy.RECORD, speed=0.1)
         rollout(emulator, particles, 4 * 37, late)
-        monkeypatch.setattr("nmpm.emulator.monitor.can_branch", lambda values: True)
+        monkeypatch.setattr("nmpm.emulator.monitor.is_eager_cpu", lambda values: True)
         rollout(emulator, particles, 4 * 37, early)
         assert late.incidents == early.incidents
         assert late.peaks == early.peaks

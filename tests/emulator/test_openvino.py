@@ -200,7 +200,7 @@ from scenes import box, cloud
 from nmpm._support.signal_stack import _Stack
 from nmpm.emulator import EmulatorRecipe, stream
 from nmpm.processors import Pointwise
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 
 def signal_stack():
     import ctypes
@@ -211,7 +211,7 @@ def signal_stack():
 before = signal_stack()
 emulator = EmulatorRecipe(box(), 8, 3, processor=Pointwise()).build().eval().requires_grad_(False)
 try:
-    with using("native"):  # kernels would be compiled first
+    with without_kernels():  # kernels would be compiled first
         for number, _ in enumerate(stream(emulator.with_runtime("openvino"), cloud(box()), 300)):
             if number == 5:
                 print("kept", signal_stack() == before)

@@ -15,7 +15,7 @@ from nmpm.emulator.runtimes import RUNTIMES, CudaGraph, Eager, cuda_graph, eager
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.errors import ConfigError
 from nmpm.processors import Pointwise, UNet
-from nmpm.transfer import Linear, Quadratic, using
+from nmpm.transfer import Linear, Quadratic, scatter_backend, without_kernels
 
 
 def emulator_of(scene=None, processor=Pointwise(hidden=(6,)), transfer=Linear(), **constraints) -> Emulator:
@@ -153,7 +153,7 @@ def test_other_constraints_are_another_graph(graphed):
 
 def test_chosen_backends_and_autocast_are_not_recorded(graphed):
     quick, state = graphed(emulator_of()), cloud(box())
-    with using("sorted"):
+    with without_kernels(), scatter_backend("sorted"):
         quick(state)
     with torch.autocast("cpu", torch.bfloat16):
         quick(state)

@@ -22,7 +22,7 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.processors import Pointwise
 from nmpm.scene import Scene
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 
 SPACING = 0.01
 WIDTH = 0.84 / 16
@@ -196,7 +196,7 @@ def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obst
     pull = torch.tensor(gravity).view(2, 1, 3)[..., :dim]
     expected = support.supported_cells(pull)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nmpm.emulator.support.can_branch", lambda _: False)
+        patch.setattr("nmpm.emulator.support.is_eager_cpu", lambda _: False)
         assert torch.equal(support.supported_cells(pull), expected)
     floors, held = np.array(floor_rows(support.scene, support.grid)), np.empty(support.grid.size, np.bool_)
     for scene in range(2):
@@ -242,7 +242,7 @@ def test_bundles_are_those_of_tensor_operations(dim, obstacles):
     emulator, state = emulator_of(scene), state_at_rest(scene, position, beam)
     with torch.no_grad():
         fused = emulator(state).position
-        with using("native"):
+        with without_kernels():
             tensors = emulator(state).position
     moved = (tensors[:, -1] - state.position).norm(dim=-1) > 1e-5
     assert 0.1 < moved.float().mean() < 0.95

@@ -18,7 +18,7 @@ from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.runtimes.grid_crops import BLOCK, Axis, cover_blocks, predict_on_crops
 from nmpm.errors import ConfigError
 from nmpm.processors import Axial, ConvNeXt, GridLayout, Patched, UNet
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 
 SMALL = UNet(width=4, depth=1, perceptron=(5,))  # sees 9 cells
 
@@ -123,7 +123,7 @@ def test_a_bundle_is_that_of_the_whole_grid(scene, kernels):
         particles = drops(scene, 100, batch, speed, seed, statics=5 * scene.obstacles)
         if scene.fields:
             particles = particles.with_fields({"temperature": particles.position[..., 0]})
-        with nullcontext() if kernels else using("native"):
+        with nullcontext() if kernels else without_kernels():
             parts, whole = (rollout(e, particles, 4) for e in (emulator.with_runtime("windows"), emulator))
         assert ((parts - whole) / torch.tensor(emulator.grid.spacing)).abs().max() < 1e-3
     assert min(computed) < 0.85 * batch * emulator.grid.size
@@ -135,7 +135,7 @@ def test_particles_that_leave_their_windows_are_computed_on_the_whole_grid(kerne
     scene = box(obstacles=obstacles)
     emulator = emulator_of(scene, scale=60.0, decoder=Absolute(), constraints=Constraints(rest_speed=0.01))
     particles, computed = drops(scene, 50, statics=5 * obstacles), cells_computed(emulator)
-    with nullcontext() if kernels else using("native"):
+    with nullcontext() if kernels else without_kernels():
         parts, whole = emulator.with_runtime("windows")(particles), emulator(particles)
     assert computed[0] < computed[1] == computed[2] == emulator.grid.size
     assert torch.equal(parts.position, whole.position)

@@ -26,7 +26,7 @@ from nmpm.training import EmulatorModule
 from nmpm.training.callbacks.report import ReportWriter
 from nmpm.training.checkpoints import load_module
 from nmpm.training.schedules import Schedule
-from nmpm.transfer import Nearest, using
+from nmpm.transfer import Nearest, without_kernels
 
 TINY = UNet(width=4, depth=1, perceptron=(4,))
 
@@ -354,7 +354,7 @@ def test_a_training_step_runs_on_the_device_alone(make_dataset, statics):
     window = next(iter(data.train_dataloader()))
     module = module_of(data)
     module.log = lambda *_, **__: None
-    with using("native"), Questions() as questions:  # as on a device: the kernels are a CPU's
+    with without_kernels(), Questions() as questions:  # as on a device: the kernels are a CPU's
         module.training_step(window, 0).backward()
     assert questions.asked == []
     with Questions() as questions:

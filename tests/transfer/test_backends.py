@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.transfer import Affine, Linear, Nearest, Quadratic, using
-from nmpm.transfer.backends import BACKENDS, add
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic, scatter_backend
+from nmpm.transfer.execution import BACKENDS, add
 
 GRID = Grid((17, 23), (0.0, 0.0), (1.0, 1.0), (False, True))
 HERE = [
@@ -38,7 +38,7 @@ def test_sums_are_those_of_a_loop(name, batch, length, size, channels, seed):
     for b in range(batch):
         for k in range(length):
             wanted[b, index[b, k]] += source[b, k]
-    with using(name):
+    with scatter_backend(name):
         torch.testing.assert_close(add(source, index, size), wanted, rtol=1e-12, atol=1e-12)
 
 
@@ -49,7 +49,7 @@ def test_all_give_the_same_values_and_gradients_to_rounding(name, transfer):
     velocity, member = torch.randn(2, 500, 2, requires_grad=True), torch.ones(2, 500, 1)
     results = []
     for each in ("native", name):
-        with using(each):
+        with scatter_backend(each):
             momentum, count = transfer.momentum(velocity, member, cells, GRID)
             (gradient,) = torch.autograd.grad(momentum.square().sum(), velocity)
             results.append((momentum.detach(), count.detach(), gradient))
@@ -63,12 +63,12 @@ def test_the_same_bits_in_every_run_and_for_any_number_of_threads(name):
     script = f"""
 import hashlib, sys, torch
 from nmpm.grid import Grid
-from nmpm.transfer import Linear, using
+from nmpm.transfer import Linear, scatter_backend
 torch.set_num_threads(int(sys.argv[1]))
 torch.manual_seed(0)
 grid = Grid((64, 64), (0.0, 0.0), (1.0, 1.0), (False, False))
 cells, values = 64 * torch.rand(4, 20000, 2), torch.randn(4, 20000, 3)
-with using({name!r}):
+with scatter_backend({name!r}):
     print(hashlib.sha256(Linear().p2g(values, cells, grid).numpy().tobytes()).hexdigest())
 """
     runs = [subprocess.run([sys.executable, "-c", script, n], capture_output=True, check=True) for n in ("1", "2", "2")]
@@ -76,11 +76,14 @@ with using({name!r}):
 
 
 def test_an_unknown_backend_lists_the_known_ones():
-    with pytest.raises(ConfigError, match="'cuda'; there are native, sorted, torch-scatter"), using("cuda"):
+    with pytest.raises(ConfigError, match="'cuda'; there are native, sorted, torch-scatter"), scatter_backend("cuda"):
         pass
 
 
 @pytest.mark.skipif(find_spec("torch_scatter") is not None, reason="torch-scatter is installed")
 def test_a_missing_package_says_how_to_get_it():
-    with pytest.raises(ConfigError, match="pip install --no-build-isolation torch-scatter"), using("torch-scatter"):
+    with (
+        pytest.raises(ConfigError, match="pip install --no-build-isolation torch-scatter"),
+        scatter_backend("torch-scatter"),
+    ):
         add(torch.ones(1, 1, 1), torch.zeros(1, 1, dtype=torch.int64), 1)

@@ -11,13 +11,13 @@ import torch
 
 from nmpm.emulator.runtimes import Eager, OpenVINO, Runtime
 from nmpm.errors import ConfigError
-from nmpm.transfer import using
+from nmpm.transfer import without_kernels
 from nmpm.zoo import Pretrained, optimization
 
 
 @pytest.fixture
 def model(small) -> Iterator[Pretrained]:
-    with using("native"):  # kernels would be compiled first
+    with without_kernels():  # kernels would be compiled first
         yield Pretrained(small.requires_grad_(False), {"name": "small"})
 
 

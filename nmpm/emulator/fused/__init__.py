@@ -3,5 +3,5 @@ and trainings with them (`training`, linear transfers only).
 
 They give what the tensor operations of `nmpm.emulator.rasterise`, `advection`, `constraints`, `contact` and `crowding`
 give, to rounding, in a tenth of the time. Those stay for everything else: other gradients, other devices, float64, the
-parts of other packages, exported programs. `with nmpm.transfer.using("native"):` chooses them everywhere.
+parts of other packages, exported programs. `with nmpm.transfer.without_kernels():` chooses them everywhere.
 """

@@ -18,7 +18,7 @@ from nmpm.emulator.runtimes.eager import Eager
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
-from nmpm.transfer.backends import is_chosen
+from nmpm.transfer.execution import is_default
 
 if TYPE_CHECKING:
     from nmpm.emulator.bundle import Bundle, RolloutContext
@@ -57,7 +57,7 @@ class CudaGraph(Runtime):
         state = {name: value for name, value in vars(particles).items() if isinstance(value, Tensor)}
         inputs = [*state.values(), context.solid, *([] if context.budget is None else [context.budget])]
         refuse_gradients(self, emulator, *inputs)
-        if is_chosen() or torch.is_autocast_enabled(emulator.device.type):
+        if not is_default() or torch.is_autocast_enabled(emulator.device.type):
             return emulator.predict(particles, context)  # what these choose is not to be recorded
 
         def predict(copies: Sequence[Tensor]) -> Bundle:

@@ -6,7 +6,7 @@ import torch
 from torch.export import Dim, ExportedProgram
 
 from nmpm.errors import ConfigError
-from nmpm.transfer.backends import using
+from nmpm.transfer.execution import without_kernels
 from nmpm.zoo.export.parts import VARYING, Part, Value
 
 
@@ -20,7 +20,7 @@ def program(part: Part) -> ExportedProgram:
     shapes = {value.name: _open(value, sizes) for value in part.inputs}
     example = part.draw_inputs(VARYING["B"], VARYING["N"])
     try:
-        with torch.no_grad(), using("native"):
+        with torch.no_grad(), without_kernels():
             return torch.export.export(part, (), example, dynamic_shapes=shapes)
     except Exception as error:  # any operation of a network that a program cannot do
         recipe = type(part.emulator.recipe.processor).__name__

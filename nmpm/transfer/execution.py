@@ -1,9 +1,10 @@
-"""Scatter-add backends, for the one operation of p2g whose fastest form depends on the hardware.
+"""How transfers are computed: by kernels or tensor operations, in chunks, and with which sum over particles.
 
-All give the same sums to rounding. Which one runs is decided in each call: the one chosen with `using`, else `sorted`
-if torch is to be deterministic and the device's own sum is not, else `native`. A backend is a function
+A scatter-add backend is the one operation of p2g whose fastest form depends on the hardware, a function
 
-    add(source (B, L, C), index (B, L), size) -> (B, size, C)
+    add(source (B, L, C), index (B, L), size) -> (B, size, C).
+
+All give the same sums to rounding.
 """
 
 from __future__ import annotations
@@ -19,6 +20,28 @@ from torch import Tensor
 from nmpm.errors import ConfigError
 
 Add = Callable[[Tensor, Tensor, int], Tensor]
+
+_CHUNK = 2**18  # particles on a CPU
+_CHUNK_ELSEWHERE = 2**22  # on a GPU many small chunks would cost more in kernel launches than they save
+
+
+def chunks(count: int, device: torch.device, values: int = 1) -> list[slice]:
+    """Slices that cover `count` particles, at least one, so that temporary memory is bounded; one in traced graphs.
+
+    Args:
+        count: Number of particles.
+        device: Where they are; decides the size of a chunk.
+        values: Intermediate values that the operation needs for each particle; chunks shrink in proportion.
+    """
+    if torch.compiler.is_compiling():
+        return [slice(None)]
+    size = max(1, (_CHUNK if device.type == "cpu" else _CHUNK_ELSEWHERE) // values)
+    return [slice(first, first + size) for first in range(0, max(count, 1), size)]
+
+
+def is_eager_cpu(values: Tensor) -> bool:
+    """Whether code may branch on tensor values: on a CPU, not in traced graphs; elsewhere it would halt the device."""
+    return values.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def native(source: Tensor, index: Tensor, size: int) -> Tensor:
@@ -63,12 +86,15 @@ BACKENDS: Mapping[str, Add] = MappingProxyType(
     {"native": native, "sorted": in_order, "torch-scatter": by_torch_scatter}
 )
 
-_chosen: ContextVar[Add | None] = ContextVar("nmpm_transfer_backend", default=None)
+_backend: ContextVar[Add | None] = ContextVar("nmpm_scatter_backend", default=None)
+_kernels: ContextVar[bool] = ContextVar("nmpm_kernels", default=True)
 
 
 @contextmanager
-def using(name: str) -> Iterator[None]:
-    """Choose the backend within a `with` block, in which no fused kernel runs (`nmpm.emulator.fused`).
+def scatter_backend(name: str) -> Iterator[None]:
+    """Choose the scatter-add backend of tensor operations within a `with` block; kernels have sums of their own.
+
+    Outside, it is `sorted` if torch is to be deterministic and the device's own sum is not, else `native`.
 
     Args:
         name: "native", "sorted" or "torch-scatter".
@@ -78,33 +104,34 @@ def using(name: str) -> Iterator[None]:
     """
     if name not in BACKENDS:
         raise ConfigError(f"No transfer backend is called {name!r}; there are {', '.join(BACKENDS)}.")
-    token = _chosen.set(BACKENDS[name])
+    token = _backend.set(BACKENDS[name])
     try:
         yield
     finally:
-        _chosen.reset(token)
+        _backend.reset(token)
 
 
-def is_chosen() -> bool:
-    """Whether code runs within `using`, and so with tensor operations alone."""
-    return _chosen.get() is not None
+@contextmanager
+def without_kernels() -> Iterator[None]:
+    """Compute with tensor operations alone within a `with` block, without the kernels of `nmpm.emulator.fused`."""
+    token = _kernels.set(False)
+    try:
+        yield
+    finally:
+        _kernels.reset(token)
+
+
+def is_default() -> bool:
+    """Whether code runs outside of `scatter_backend` and `without_kernels`."""
+    return _kernels.get() and _backend.get() is None
 
 
 def kernels_take(*values: Tensor) -> bool:
-    """Whether fused kernels can take these tensors: float32 on a CPU, outside of `using`."""
-    return not is_chosen() and all(each.device.type == "cpu" and each.dtype == torch.float32 for each in values)
+    """Whether fused kernels can take these tensors: float32 on a CPU, outside of `without_kernels`."""
+    return _kernels.get() and all(each.device.type == "cpu" and each.dtype == torch.float32 for each in values)
 
 
 def add(source: Tensor, index: Tensor, size: int) -> Tensor:
-    """Sum values into places.
-
-    Args:
-        source: (B, L, C) values.
-        index: (B, L) int64 place of each, from 0 to size - 1.
-        size: Number of places.
-
-    Returns:
-        (B, size, C).
-    """
+    """Sum values (B, L, C) into places (B, L) from 0 to size - 1, (B, size, C)."""
     fallback = in_order if source.is_cuda and torch.are_deterministic_algorithms_enabled() else native
-    return (_chosen.get() or fallback)(source, index, size)
+    return (_backend.get() or fallback)(source, index, size)

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from nmpm.grid import Grid
-from nmpm.transfer.backends import add
-from nmpm.transfer.chunks import chunks
+from nmpm.transfer.execution import add, chunks
 
 
 @dataclass(frozen=True)
