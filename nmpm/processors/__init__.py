@@ -1,18 +1,15 @@
-"""Grid processors: the contract and one network per file.
+"""Grid processors: the contract, and the networks that fulfil it.
 
-A processor is added by one file and one line here; others are named by their class path in a configuration.
+A processor is added by one class and one line here; others are named by their class path in a configuration.
 """
 
 from nmpm.processors.axial import Axial
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
-from nmpm.processors.convnext import ConvNeXt
-from nmpm.processors.ffno import FFNO
-from nmpm.processors.fno import FNO, TFNO
-from nmpm.processors.identity import Identity
+from nmpm.processors.baselines import Identity, Pointwise
+from nmpm.processors.fourier import FFNO, FNO, TFNO
 from nmpm.processors.patched import Patched
-from nmpm.processors.pointwise import Pointwise
 from nmpm.processors.unet import UNet
-from nmpm.processors.unet_modern import UNetModern
+from nmpm.processors.ushape import ConvNeXt, UNetModern
 
 __all__ = [
     "FFNO",

@@ -16,10 +16,17 @@ from torch.nn import functional
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
-from nmpm.processors.convnext import ChannelNorm
-from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution
-from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
-from nmpm.processors.patches import embed_patches, return_patches
+from nmpm.processors.convolution import (
+    CONVOLUTIONS,
+    TRANSPOSED,
+    Convolution,
+    check_multiple,
+    crop,
+    embed_patches,
+    pad_to_multiple,
+    return_patches,
+)
+from nmpm.processors.ushape import ChannelNorm
 
 _SLOWEST = 100.0  # patches in which the slowest rotary angle turns by one radian
 
@@ -62,7 +69,7 @@ class AxialNetwork(GridProcessor):
         fine = max(1, width // 4)
         self.cells = Convolution(layout.in_channels, fine, 3, layout.periodic)
         self.embed = CONVOLUTIONS[dim](fine, width, recipe.patch, recipe.patch)
-        self.layers = nn.ModuleList(Layer(recipe, layout.periodic) for _ in range(recipe.layers))
+        self.layers = nn.ModuleList(AxialLayer(recipe, layout.periodic) for _ in range(recipe.layers))
         self.back = TRANSPOSED[dim](width, fine, recipe.patch, recipe.patch)
         self.join = Convolution(2 * fine, fine, 3, layout.periodic)
         self.last = CONVOLUTIONS[dim](fine, outputs, 1)
@@ -78,7 +85,7 @@ class AxialNetwork(GridProcessor):
         return out
 
 
-class Layer(nn.Module):
+class AxialLayer(nn.Module):
     """Attention along each axis, then a perceptron at each patch."""
 
     def __init__(self, recipe: Axial, periodic: tuple[bool, ...]) -> None:

@@ -1,4 +1,5 @@
-"""Convolutions in 1, 2 or 3 axes that know how each axis ends: circular padding where it wraps, zeros at walls.
+"""Convolutions in 1, 2 or 3 axes that know how each axis ends (circular padding where it wraps, zeros at walls), and
+what else networks on grids share: padding to multiples, cropping, patches of cells as channels.
 
 Axes of one cell are extended by a cell of zeros, which changes no result: oneDNN 3.12 (torch 2.13), on CPUs that
 multiply matrices of bfloat16 (AMX), leaves strided convolutions to one cell along the last axis uncomputed
@@ -13,13 +14,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nmpm.processors.padding import crop
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
 
 CONVOLUTIONS: dict[int, Callable[..., nn.Module]] = {1: nn.Conv1d, 2: nn.Conv2d, 3: nn.Conv3d}
 TRANSPOSED: dict[int, Callable[..., nn.Module]] = {1: nn.ConvTranspose1d, 2: nn.ConvTranspose2d, 3: nn.ConvTranspose3d}
+_POINTWISE = {1: functional.conv1d, 2: functional.conv2d, 3: functional.conv3d}
 
 
 class Convolution(nn.Module):
@@ -35,14 +39,9 @@ class Convolution(nn.Module):
     """
 
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        kernel: int,
-        periodic: Sequence[bool],
-        stride: int = 1,
+        self, in_channels: int, out_channels: int, kernel: int, periodic: Sequence[bool], stride: int = 1,
         groups: int = 1,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         pad = (kernel - stride + 1) // 2
         self.stride = stride
@@ -108,3 +107,96 @@ def _extend(grid: Tensor, shape: Sequence[int], least: Sequence[int], stride: in
 
 def _circular_padding(periodic: Sequence[bool], pad: int) -> list[int]:
     return [pad if wraps else 0 for wraps in reversed(periodic) for _ in range(2)]
+
+
+def pad_to_multiple(grid: Tensor, multiple: int) -> Tensor:
+    """Extend each space axis of (B, C, *S) at its upper end to a multiple of cells, repeating the last one."""
+    for axis in range(2, grid.dim()):
+        missing = -grid.shape[axis] % multiple
+        if missing:
+            last = grid.narrow(axis, grid.shape[axis] - 1, 1)
+            grid = torch.cat([grid, last.expand(*grid.shape[:axis], missing, *grid.shape[axis + 1 :])], dim=axis)
+    return grid
+
+
+def crop(fields: Tensor, shape: Sequence[int], first: int = 2) -> Tensor:
+    """Keep the first cells of each space axis; these begin at axis `first` of the tensor."""
+    for axis, cells in enumerate(shape, start=first):
+        fields = fields.narrow(axis, 0, cells) if fields.shape[axis] > cells else fields
+    return fields
+
+
+def check_multiple(grid: Grid, multiple: int, what: str) -> None:
+    """Raise ConfigError for grids that a network which coarsens by `multiple` cannot take.
+
+    Args:
+        grid: The grid.
+        multiple: Cells of the grid in one of the coarsest level.
+        what: The network, for the message, e.g. "a U-Net of depth 3".
+
+    Raises:
+        ConfigError: if an axis is shorter than that, or periodic and not a multiple of it.
+    """
+    if min(grid.shape) < multiple:
+        raise ConfigError(
+            f"A grid of {grid.shape} cells is too small for {what}, which coarsens it {multiple} times: use at least "
+            f"{multiple} cells along each axis, or coarsen less."
+        )
+    for axis, (cells, wraps) in enumerate(zip(grid.shape, grid.periodic, strict=True)):
+        if wraps and cells % multiple:
+            raise ConfigError(
+                f"Axis {axis} is periodic, so its {cells} cells must be a multiple of {multiple} for {what}; the "
+                f"nearest is {round(cells / multiple) * multiple or multiple}."
+            )
+
+
+def embed_patches(convolution: nn.Module, grid: Tensor, patch: int) -> Tensor:
+    """Apply a convolution of kernel and stride `patch`, as one product of matrices per patch.
+
+    As a strided convolution in bfloat16, oneDNN 3.12 (torch 2.13) returns wrong numbers for kernels of 4 cells and more
+    and 8 to 24 channels, on CPUs with AMX.
+
+    Args:
+        convolution: From C to C' channels.
+        grid: (B, C, *S).
+        patch: Cells along each axis.
+
+    Returns:
+        (B, C', *S / patch).
+    """
+    weight, bias = convolution.get_parameter("weight"), convolution.get_parameter("bias")
+    return _multiply(cells_to_channels(grid, patch), weight.flatten(1), bias)
+
+
+def return_patches(transposed: nn.Module, hidden: Tensor, patch: int) -> Tensor:
+    """Apply a transposed convolution of kernel and stride `patch`: (B, C, *S) → (B, C', *S * patch)."""
+    weight, bias = transposed.get_parameter("weight"), transposed.get_parameter("bias")
+    of_cells = bias.repeat_interleave(patch ** (hidden.dim() - 2))
+    return channels_to_cells(_multiply(hidden, weight.flatten(1).t(), of_cells), patch)
+
+
+def _multiply(grid: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """(B, C, *S) by a (C', C) matrix at each cell."""
+    dim = grid.dim() - 2
+    return _POINTWISE[dim](grid, weight[(..., *(None,) * dim)], bias)
+
+
+def cells_to_channels(grid: Tensor, patch: int) -> Tensor:
+    """(B, C, *S) → (B, C * patch ** D, *S / patch)."""
+    dim = grid.dim() - 2
+    for axis in range(dim + 1, 1, -1):
+        grid = grid.unflatten(axis, (-1, patch))
+    within, across = range(3, 2 * dim + 2, 2), range(2, 2 * dim + 2, 2)
+    coarse: Tensor = grid.permute(0, 1, *within, *across).flatten(1, dim + 1)
+    return coarse
+
+
+def channels_to_cells(fields: Tensor, patch: int) -> Tensor:
+    """(B, C * patch ** D, *S) → (B, C, *S * patch), the inverse of `cells_to_channels`."""
+    dim = fields.dim() - 2
+    split = fields.unflatten(1, (-1, *(patch,) * dim))
+    order = [place for axis in range(dim) for place in (2 + dim + axis, 2 + axis)]
+    joined: Tensor = split.permute(0, 1, *order)
+    for axis in range(2, dim + 2):
+        joined = joined.flatten(axis, axis + 1)
+    return joined

@@ -15,8 +15,7 @@ from nmpm._support.specs import from_spec
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
-from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
-from nmpm.processors.patches import cells_to_channels, channels_to_cells
+from nmpm.processors.convolution import cells_to_channels, channels_to_cells, check_multiple, crop, pad_to_multiple
 from nmpm.processors.unet import UNet
 
 

@@ -17,8 +17,7 @@ from torch.nn import functional
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
-from nmpm.processors.convolution import Convolution, Upsampling, pointwise
-from nmpm.processors.padding import check_multiple, crop, pad_to_multiple
+from nmpm.processors.convolution import Convolution, Upsampling, check_multiple, crop, pad_to_multiple, pointwise
 from nmpm.processors.ushape import ushape_radius
 
 
@@ -53,7 +52,7 @@ class UNetNetwork(GridProcessor):
     def __init__(self, recipe: UNet, layout: GridLayout) -> None:
         super().__init__()
         width, periodic = recipe.width, layout.periodic
-        self.multiple = self.alignment = 2**recipe.depth
+        self.alignment = 2**recipe.depth
         reach = recipe.kernel // 2
         self.radius = ushape_radius(recipe.depth, level=reach, bottom=2 * reach, between=3)
         hidden = recipe.perceptron
@@ -68,7 +67,7 @@ class UNetNetwork(GridProcessor):
 
     def forward(self, grid: Tensor) -> Tensor:
         shape = grid.shape[2:]
-        hidden = self.encoder(pad_to_multiple(grid, self.multiple))
+        hidden = self.encoder(pad_to_multiple(grid, self.alignment))
         skips = []
         for convolve, coarsen in zip(self.down, self.coarsen, strict=False):
             skips.append(_activate(convolve(hidden)))

@@ -1,10 +1,25 @@
-"""The U shape: level by level down to coarser grids and up again, each level's result added on the way up."""
+"""U-shaped networks: residual blocks, or large kernels on single channels, at levels of coarser and coarser grids.
+
+Sources: Gupta & Brandstetter, Towards multi-spatiotemporal-scale generalized PDE modeling, TMLR 2023 (residual blocks,
+GELU, channels that grow with depth); Liu et al., A ConvNet for the 2020s, CVPR 2022; both compared, the latter best in
+one-step error on 9 of 17 sets: Ohana et al., The Well, NeurIPS 2024. Normalisation over groups of channels is left out
+by default: it mixes all cells of a grid, so that a scene of another size, or emptier, looks different.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
 
+import torch
 from torch import Tensor, nn
+from torch.nn import functional
+
+from nmpm.errors import ConfigError
+from nmpm.grid import Grid
+from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
+from nmpm.processors.convolution import CONVOLUTIONS, Convolution, check_multiple, crop, pad_to_multiple
 
 
 class UShape(nn.Module):
@@ -40,11 +55,6 @@ class UShape(nn.Module):
         return hidden
 
 
-def upsample_nearest() -> nn.Module:
-    """Upsampling that repeats each cell twice along each axis."""
-    return nn.Upsample(scale_factor=2.0, mode="nearest")
-
-
 def ushape_radius(depth: int, level: int, bottom: int, between: int) -> int:
     """Radius in cells of levels of convolutions in a U shape, see `GridProcessor.radius`.
 
@@ -56,3 +66,184 @@ def ushape_radius(depth: int, level: int, bottom: int, between: int) -> int:
     """
     coarsest = 1 << depth
     return (coarsest - 1) * (2 * level + between) + coarsest * bottom
+
+
+def _upsample_nearest() -> nn.Module:
+    return nn.Upsample(scale_factor=2.0, mode="nearest")
+
+
+@dataclass(frozen=True)
+class UNetModern(Processor):
+    """Recipe of a residual U-Net.
+
+    Args:
+        width: Channels of the finest level.
+        growth: Channels of each level over those of the finest; one less than their number are down-samplings by 2.
+        blocks: Residual blocks of each level, on the way down and on the way up.
+        kernel: Width of the convolutions, odd.
+        groups: Groups of channels that are normalised together; 0 for no normalisation.
+    """
+
+    width: int = 32
+    growth: tuple[int, ...] = (1, 2, 2, 4)
+    blocks: int = 1
+    kernel: int = 3
+    groups: int = 0
+
+    @property
+    def depth(self) -> int:
+        """Number of down-samplings."""
+        return len(self.growth) - 1
+
+    def build(self, layout: GridLayout) -> GridProcessor:
+        least = min((self.width, self.blocks, *self.growth), default=0)
+        if not self.growth or least < 1 or self.kernel % 2 == 0:
+            raise ConfigError(f"UNetModern needs width, growth and blocks >= 1 and an odd kernel; got {self}.")
+        if self.groups and any(self.width * factor % self.groups for factor in self.growth):
+            raise ConfigError(f"UNetModern's groups must divide the channels of each level; got {self}.")
+        return UNetModernNetwork(self, layout)
+
+    def check_grid(self, grid: Grid) -> None:
+        check_multiple(grid, 2**self.depth, f"a U-Net of depth {self.depth}")
+
+
+class UNetModernNetwork(GridProcessor):
+    """Residual blocks at each level; strided convolutions down, nearest cells and a convolution up, skips added."""
+
+    def __init__(self, recipe: UNetModern, layout: GridLayout) -> None:
+        super().__init__()
+        periodic, kernel = layout.periodic, recipe.kernel
+        widths = [recipe.width * factor for factor in recipe.growth]
+        self.frames, self.alignment, reach = layout.frames, 2**recipe.depth, kernel // 2
+        if not recipe.groups:  # normalisation over groups takes the mean over all cells
+            wide = 2 * recipe.blocks * reach
+            self.radius = reach + ushape_radius(recipe.depth, level=wide, bottom=wide, between=2 + reach)
+
+        def level(width: int) -> nn.Sequential:
+            return nn.Sequential(*(ResidualBlock(width, kernel, periodic, recipe.groups) for _ in range(recipe.blocks)))
+
+        self.first = Convolution(layout.in_channels, widths[0], kernel, periodic)
+        self.levels = UShape(
+            down=map(level, widths),
+            coarsen=[Convolution(fine, coarse, 4, periodic, stride=2) for fine, coarse in pairwise(widths)],
+            up=map(level, widths[:-1]),
+            refine=[
+                nn.Sequential(_upsample_nearest(), Convolution(coarse, fine, kernel, periodic))
+                for fine, coarse in pairwise(widths)
+            ],
+        )
+        self.last = CONVOLUTIONS[layout.dim](widths[0], layout.frames * layout.out_channels, 1)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        hidden = self.levels(self.first(pad_to_multiple(grid, self.alignment)))
+        out: Tensor = crop(self.last(functional.silu(hidden)), grid.shape[2:]).unflatten(1, (self.frames, -1))
+        return out
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(silu(conv(silu(x)))), each convolution after a normalisation if one is asked for.
+
+    SiLU is as smooth as the sources' GELU, at a third of its time on a CPU.
+    """
+
+    def __init__(self, width: int, kernel: int, periodic: tuple[bool, ...], groups: int) -> None:
+        super().__init__()
+        self.convolutions = nn.ModuleList(Convolution(width, width, kernel, periodic) for _ in range(2))
+        self.norms = nn.ModuleList(nn.GroupNorm(groups, width) if groups else nn.Identity() for _ in range(2))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Map (B, C, *S) to the same shape."""
+        change = hidden
+        for norm, convolution in zip(self.norms, self.convolutions, strict=True):
+            change = convolution(functional.silu(norm(change)))
+        return hidden + change
+
+
+@dataclass(frozen=True)
+class ConvNeXt(Processor):
+    """Recipe of a U-shaped ConvNeXt.
+
+    Args:
+        width: Channels of every level.
+        depth: Number of down-samplings by 2.
+        blocks: Blocks of each level, on the way down and on the way up.
+        kernel: Width of the convolutions of single channels, odd.
+        expansion: Width of the perceptrons over that of the level.
+    """
+
+    width: int = 64
+    depth: int = 2
+    blocks: int = 1
+    kernel: int = 7
+    expansion: int = 2
+
+    def build(self, layout: GridLayout) -> GridProcessor:
+        if min(self.width, self.blocks, self.expansion) < 1 or self.depth < 0 or self.kernel % 2 == 0:
+            raise ConfigError(f"ConvNeXt needs width, blocks, expansion >= 1, depth >= 0, an odd kernel; got {self}.")
+        return ConvNeXtNetwork(self, layout)
+
+    def check_grid(self, grid: Grid) -> None:
+        check_multiple(grid, 2**self.depth, f"a ConvNeXt of depth {self.depth}")
+
+
+class ConvNeXtNetwork(GridProcessor):
+    """Blocks at each level; strided convolutions down, nearest cells and 1x1 convolutions up, skips added."""
+
+    def __init__(self, recipe: ConvNeXt, layout: GridLayout) -> None:
+        super().__init__()
+        width, periodic, depth = recipe.width, layout.periodic, recipe.depth
+        reach = recipe.blocks * (recipe.kernel // 2)
+        self.frames, self.alignment = layout.frames, 2**depth
+        self.radius = 1 + ushape_radius(depth, level=reach, bottom=reach, between=2)
+
+        def level() -> nn.Sequential:
+            return nn.Sequential(*(ConvNeXtBlock(recipe, periodic) for _ in range(recipe.blocks)))
+
+        kind = CONVOLUTIONS[layout.dim]
+        self.first = Convolution(layout.in_channels, width, 3, periodic)
+        self.levels = UShape(
+            down=[level() for _ in range(depth + 1)],
+            coarsen=[Convolution(width, width, 4, periodic, stride=2) for _ in range(depth)],
+            up=[level() for _ in range(depth)],
+            refine=[nn.Sequential(kind(width, width, 1), _upsample_nearest()) for _ in range(depth)],
+        )
+        self.last = kind(width, layout.frames * layout.out_channels, 1)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        hidden = self.levels(self.first(pad_to_multiple(grid, self.alignment)))
+        out: Tensor = crop(self.last(hidden), grid.shape[2:]).unflatten(1, (self.frames, -1))
+        return out
+
+
+class ConvNeXtBlock(nn.Module):
+    """x + perceptron(norm(convolution of single channels)), the perceptron and norm at each cell."""
+
+    def __init__(self, recipe: ConvNeXt, periodic: tuple[bool, ...]) -> None:
+        super().__init__()
+        width, wide = recipe.width, recipe.width * recipe.expansion
+        kind = CONVOLUTIONS[len(periodic)]
+        self.spatial = Convolution(width, width, recipe.kernel, periodic, groups=width)
+        self.norm = ChannelNorm(width, len(periodic))
+        self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Map (B, C, *S) to the same shape."""
+        change: Tensor = self.perceptron(self.norm(self.spatial(hidden)))
+        return hidden + change
+
+
+class ChannelNorm(nn.Module):
+    """Normalises the channels of each cell by their root mean square, so that cells do not see each other.
+
+    Source: Zhang & Sennrich, Root Mean Square Layer Normalization, NeurIPS 2019.
+    """
+
+    def __init__(self, width: int, dim: int) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(width, *(1,) * dim))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Map (B, C, *S) to the same shape."""
+        # Squares of half precision overflow; the floor keeps empty cells at zero.
+        inverse = (full_precision(hidden).square().mean(dim=1, keepdim=True) + 1e-6).rsqrt()
+        return hidden * inverse.to(hidden.dtype) * self.scale

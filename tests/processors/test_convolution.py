@@ -11,8 +11,7 @@ import torch
 
 from nmpm.processors import Axial, ConvNeXt, Patched, UNet, UNetModern
 from nmpm.processors.base import GridLayout
-from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution, Upsampling
-from nmpm.processors.patches import embed_patches, return_patches
+from nmpm.processors.convolution import CONVOLUTIONS, TRANSPOSED, Convolution, Upsampling, embed_patches, return_patches
 
 CHANNELS = 24
 

@@ -18,7 +18,7 @@ from nmpm.processors import (
     UNet,
     UNetModern,
 )
-from nmpm.processors.patches import cells_to_channels, channels_to_cells
+from nmpm.processors.convolution import cells_to_channels, channels_to_cells
 from nmpm.testing import ProcessorContract
 
 

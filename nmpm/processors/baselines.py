@@ -1,4 +1,4 @@
-"""The processor that predicts nothing new: the baseline that every network must beat, and a part for tests."""
+"""Baselines that every network must beat: one that changes nothing, one that sees single cells."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.convolution import pointwise
 
 
 @dataclass(frozen=True)
@@ -32,3 +33,33 @@ class IdentityNetwork(GridProcessor):
 
     def forward(self, grid: Tensor) -> Tensor:
         return grid[:, self.channels].unsqueeze(1).expand(-1, self.frames, *(-1,) * (grid.dim() - 1))
+
+
+@dataclass(frozen=True)
+class Pointwise(Processor):
+    """Recipe of a perceptron on each cell alone, which cannot see its neighbours; no hidden layer makes it linear.
+
+    Args:
+        hidden: Widths of the hidden layers.
+    """
+
+    hidden: tuple[int, ...] = ()
+
+    def build(self, layout: GridLayout) -> GridProcessor:
+        return PointwiseNetwork(self, layout)
+
+
+class PointwiseNetwork(GridProcessor):
+    """1x1 convolutions."""
+
+    radius = 0
+
+    def __init__(self, recipe: Pointwise, layout: GridLayout) -> None:
+        super().__init__()
+        self.frames = layout.frames
+        widths = [layout.in_channels, *recipe.hidden, layout.frames * layout.out_channels]
+        self.perceptron = pointwise(widths, layout.dim)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        out: Tensor = self.perceptron(grid).unflatten(1, (self.frames, -1))
+        return out
