@@ -49,23 +49,18 @@ FALLBACK_COLOURS: tuple[Rgb, ...] = (
 """For materials not in MATERIAL_COLOURS."""
 
 
-def material_colour(name: str) -> Rgb:
-    """The colour of a material; an unknown one gets a fallback colour, the same in every scene and run."""
-    return MATERIAL_COLOURS.get(name) or FALLBACK_COLOURS[_fallback_index(name)]
-
-
 def material_colours(names: Iterable[str]) -> dict[str, Rgb]:
     """The colour of each material of one scene, in the given order.
 
-    As `material_colour`, but unknown materials get different fallback colours as long as there are enough.
+    An unknown one gets a fallback colour by its name, another one than the scene's others while there are enough.
     """
     ordered = list(dict.fromkeys(names))
-    chosen = {name: MATERIAL_COLOURS[name] for name in ordered if name in MATERIAL_COLOURS}
-    for name in sorted(set(ordered) - set(chosen)):
-        start = _fallback_index(name)
-        probes = [FALLBACK_COLOURS[(start + step) % len(FALLBACK_COLOURS)] for step in range(len(FALLBACK_COLOURS))]
-        chosen[name] = next((free for free in probes if free not in chosen.values()), probes[0])
-    return {name: chosen[name] for name in ordered}
+    colours = {name: MATERIAL_COLOURS[name] for name in ordered if name in MATERIAL_COLOURS}
+    for name in sorted(set(ordered) - set(colours)):
+        start = zlib.crc32(name.encode()) % len(FALLBACK_COLOURS)
+        candidates = FALLBACK_COLOURS[start:] + FALLBACK_COLOURS[:start]
+        colours[name] = next((free for free in candidates if free not in colours.values()), candidates[0])
+    return {name: colours[name] for name in ordered}
 
 
 def vary_brightness(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -87,7 +82,3 @@ def vary_brightness(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def hex_code(colour: Rgb) -> str:
     """A colour as #rrggbb, for matplotlib."""
     return "#{:02x}{:02x}{:02x}".format(*colour)
-
-
-def _fallback_index(name: str) -> int:
-    return zlib.crc32(name.encode()) % len(FALLBACK_COLOURS)

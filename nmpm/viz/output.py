@@ -1,10 +1,13 @@
-"""Output files of pictures: checks before drawing, and writing through a temporary file."""
+"""Output files of pictures: checks before drawing, writing through a temporary file, and self-contained pages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.writable import file_obstacle
@@ -62,3 +65,22 @@ def replace_picture(path: Path) -> Iterator[Path]:
         # The encoder's message continues with its whole command line.
         reason = error.strerror or str(error).partition("\n")[0]
         raise DataError(f"Cannot write {path}: {reason}. The file was left as it was before.") from error
+
+
+def fill_page(folder: Traversable, scripts: Sequence[str], data: Any) -> str:
+    """A page without links: `page.html` with `style.css`, the scripts and the data in the places that it marks.
+
+    Args:
+        folder: Holds these files.
+        scripts: Names of the scripts, in order.
+        data: What JSON can hold; the page reads it from its element `data`.
+    """
+    # `</script>` in a text would end the data.
+    packed = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    script = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in scripts)
+    style = folder.joinpath("style.css").read_text(encoding="utf-8")
+    page = folder.joinpath("page.html").read_text(encoding="utf-8")
+    for mark, content in {"/*STYLE*/": style, "/*SCRIPT*/": script, "/*DATA*/": packed}.items():
+        before, after = page.split(mark)
+        page = before + content + after
+    return page

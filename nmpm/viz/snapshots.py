@@ -19,10 +19,9 @@ from matplotlib.ticker import MaxNLocator
 
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
-from nmpm.viz.captions import format_out_of_view, format_time
 from nmpm.viz.colours import FAINT_TEXT, TEXT, Rgb, hex_code, material_colours
 from nmpm.viz.output import check_output, check_suffix, replace_picture
-from nmpm.viz.panel_renderer import PanelRenderer
+from nmpm.viz.panel import PanelRenderer, format_out_of_view, format_time
 from nmpm.viz.trajectories import LabelledTrajectories
 
 SUFFIXES = (".png",)

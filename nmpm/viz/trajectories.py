@@ -71,16 +71,16 @@ class LabelledTrajectories:
         fields: Mapping[str, Mapping[str, Floats]] | None = None,
         gravity: Sequence[float] | None = None,
     ) -> LabelledTrajectories:
-        """Takes box, time step, periodicity, gravity and material names from a scene.
+        """Takes box, time step, periodicity and material names from a scene, and gravity unless it is given.
 
         Args:
             scene: The scene.
-            positions: As in `LabelledTrajectories`.
+            positions: As in `LabelledTrajectories`, like the arguments below.
             material: (N,) index into `Scene.materials`.
-            obstacle: As in `LabelledTrajectories`.
-            title: As in `LabelledTrajectories`.
-            fields: As in `LabelledTrajectories`.
-            gravity: As in `LabelledTrajectories`, where scenes differ in it; the scene's when left out.
+            obstacle: Static particles.
+            title: Of the picture.
+            fields: Further numbers of the particles.
+            gravity: Where scenes differ in it; the scene's when left out.
         """
         return cls(
             positions,
@@ -213,14 +213,14 @@ class LabelledTrajectories:
         for name, values in {"periodic": self.periodic, "gravity": self.gravity}.items():
             if values and len(values) != self.dim:
                 raise DataError(f"{name} = {values} must have one entry for each of {self.dim} axes.")
-        if not (np.isfinite(self.dt) and self.dt > 0):
+        if not (0 < self.dt * self.frame_count < math.inf):
             raise DataError(f"dt = {self.dt} must be a positive number of seconds between frames.")
         if self.obstacles.ndim != 2 or self.obstacles.shape[1] != self.dim:
             raise DataError(f"Obstacles have shape {self.obstacles.shape}, expected (particles, {self.dim}).")
         _check_finite(self.obstacles[None], "obstacle")
 
 
-def material_names(ids: ArrayLike, names: Mapping[int, str] | Sequence[str]) -> NDArray[np.str_]:
+def material_names(ids: ArrayLike, names: Mapping[int, str]) -> NDArray[np.str_]:
     """The material name of each particle, (N,).
 
     Args:
@@ -230,13 +230,12 @@ def material_names(ids: ArrayLike, names: Mapping[int, str] | Sequence[str]) -> 
     Raises:
         DataError: if an id has no name.
     """
-    known = names if isinstance(names, Mapping) else dict(enumerate(names))
     unique, inverse = np.unique(np.asarray(ids), return_inverse=True)
-    missing = [index for index in unique.tolist() if index not in known]
+    missing = [index for index in unique.tolist() if index not in names]
     if missing:
-        listed = ", ".join(f"{index} {name}" for index, name in known.items())
+        listed = ", ".join(f"{index} {name}" for index, name in names.items())
         raise DataError(f"Particle type {missing[0]} has no name; known: {listed}. Name it in `particle_types`.")
-    return np.array([known[index] for index in unique.tolist()], dtype=np.str_)[inverse]
+    return np.array([names[index] for index in unique.tolist()], dtype=np.str_)[inverse]
 
 
 def _check_finite(position: Floats, label: str) -> None:

@@ -24,29 +24,21 @@ SCENE = Scene(
     gravity_varies=True, obstacles=True, densities=(1.0, 2.0), evolving=("heat",),
 )  # fmt: skip
 TEXTS = (
-    "", "{}", "[]", "null", "3", '"a"', "{", '{"5": 3}', '{"a": "water"}', "[" * 10**5, "é", "NaN",
-    '{"5": "\\u001b[2J"}', '{"5": "\\ud800"}',
-)  # fmt: skip
-VALUES = (
-    None,
-    True,
-    -1,
-    0,
-    1e-308,
-    1e308,
-    float("nan"),
-    "a",
     "",
-    [],
-    [0, 1],
-    [[0, 1]],
-    [[1, 0], [0, 1]],
-    {},
-    ["a", "b"],
+    "[]",
+    "3",
+    "{",
+    '{"5": 3}',
+    '{"a": "water"}',
+    "[" * 10**5,
+    "NaN",
+    '{"5": "\\u001b[2J"}',
+    '{"5": "\\ud800"}',
 )
+VALUES = (None, -1, 0, 1e-308, 1e308, float("nan"), "a", "", [], [[0, 1]], [[1, 0], [0, 1]], {}, ["a", "b"])
 ARRAYS = (
-    0, -1, 3.5, True, float("nan"), b"\xff\xfe", "text", [], [3.5, 1e300], [2**62], [[3], [4]], ["a", "b"],
-    np.array([1j]), np.zeros((2, 0)), np.array([(1, 2.0)], "i4,f8"), h5py.Empty("f4"), np.array([b"", b"\xff"]),
+    0, -1, 3.5, float("nan"), b"\xff\xfe", "text", [], [3.5, 1e300], [2**62], [[3], [4]], ["a", "b"], np.array([1j]),
+    np.array([(1, 2.0)], "i4,f8"), h5py.Empty("f4"), np.array([b"", b"\xff"]),
 )  # fmt: skip
 
 
@@ -85,14 +77,13 @@ def mutate(group, rng):
         name = rng.choice(sorted(group))
         values = group[name][()]
         del group[name]
-        made = [
+        other = rng.choice([
             None, values[:1], values[..., :1], values.T, values.astype("f8"), values.astype("i2"), values.astype("S4"),
             values[:0], np.full_like(values, 9e9 if values.dtype.kind == "f" else 30_000), values.ravel(),
             np.full(values.shape, np.nan), np.full(values.shape, 3e38, "f4"), np.asarray(rng.choice(ARRAYS[:4])),
-        ]  # fmt: skip
-        chosen = rng.choice(made)
-        if chosen is not None:
-            group[name] = chosen
+        ])  # fmt: skip
+        if other is not None:
+            group[name] = other
         return
     names = sorted(group.attrs) if kind == "attribute" else ["scene", "particle_types"]
     name = rng.choice(names)
@@ -118,14 +109,14 @@ def mutated(content, rng):
     return file.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("count", [100, pytest.param(500, marks=pytest.mark.slow)])
-def test_damaged_and_foreign_files_are_drawn_or_refused_in_one_line(content, tmp_path, count):
-    path, truth, rng, complaints = tmp_path / "out.h5", tmp_path / "truth.h5", random.Random(count), []
+def test_damaged_and_foreign_files_are_drawn_or_refused_in_one_line(content, tmp_path):
+    path, truth, rng, complaints = tmp_path / "out.h5", tmp_path / "truth.h5", random.Random(0), []
     truth.write_bytes(content)
     assert not draw(truth, truth)
-    for _ in range(count):
+    for _ in range(400):
         path.write_bytes(mutated(content, rng))
         complaints.append(draw(path, truth).replace(str(tmp_path), ""))
     assert not any("\n" in complaint or len(complaint) > 900 for complaint in complaints)
-    assert 0 < complaints.count("") < count
+    assert 0 < complaints.count("") < len(complaints)

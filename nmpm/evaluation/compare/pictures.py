@@ -16,7 +16,7 @@ from nmpm.evaluation.compare.measure import shown_frames
 from nmpm.evaluation.compare.outcome import Floats, Outcome
 from nmpm.evaluation.trade.choice import Kind
 from nmpm.evaluation.trade.scenes import Scenes
-from nmpm.viz.panel_renderer import PanelRenderer
+from nmpm.viz.panel import PanelRenderer
 from nmpm.viz.trajectories import LabelledTrajectories
 
 _STYLES: Mapping[Kind, dict[str, Any]] = MappingProxyType(

@@ -11,7 +11,7 @@ from nmpm.evaluation.trade.accuracy import shown_frame, thumbnail
 from nmpm.evaluation.trade.frontier import POOLS, advise, describe_measure, standings
 from nmpm.evaluation.trade.points import Point, measure_names
 from nmpm.evaluation.trade.scenes import Scenes
-from nmpm.viz.html import fill_page
+from nmpm.viz.output import fill_page
 
 _SCRIPTS = ("axes.js", "chart.js", "trade.js")
 

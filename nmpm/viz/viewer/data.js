@@ -1,6 +1,6 @@
 // Reading the page's data: trajectories as differences of 16-bit positions from frame to frame, deflated.
 
-/** The page's description: title, labels, materials, box; see packing.py. */
+/** The page's description: title, labels, materials, box; see page.py. */
 const scene = JSON.parse(document.getElementById("data").textContent);
 
 /** Inflates base64 text to bytes. */

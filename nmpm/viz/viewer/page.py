@@ -1,23 +1,27 @@
-"""The viewer's page: one HTML file without links, for any browser with WebGL 2."""
+"""The viewer's page: one HTML file without links, for any browser with WebGL 2.
+
+Positions are packed as 16-bit differences from frame to frame, deflated, in base64.
+"""
 
 from __future__ import annotations
 
+import base64
 import html
+import zlib
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.colours import hex_code, material_colours, vary_brightness
-from nmpm.viz.html import fill_page
-from nmpm.viz.output import check_output, check_suffix, replace_picture
-from nmpm.viz.spacing import particle_spacing
+from nmpm.viz.output import check_output, check_suffix, fill_page, replace_picture
+from nmpm.viz.panel import particle_spacing
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
-from nmpm.viz.viewer.packing import pack_bytes, pack_positions, quantize
 
 SCRIPTS = ("data.js", "matrices.js", "drawing.js", "layout.js", "curve.js", "viewer.js")
 COLOUR_SCALE = "viridis"
@@ -26,6 +30,8 @@ TOP_PERCENTILE = 99.5
 FIELD_PERCENTILES = (0.5, 99.5)
 """Of a field's values: what the ends of the colour scale stand for."""
 SAMPLED_FRAMES = 50
+STEPS = 65535
+"""Steps from the lowest to the highest position along an axis: an error of at most 1 / 131070 of the box."""
 
 
 class ViewerPage:
@@ -185,3 +191,24 @@ def _lengths(trajectories: LabelledTrajectories, difference: Floats) -> Floats:
 def _top(lengths: list[Floats]) -> float:
     top = np.percentile(np.concatenate([part.ravel() for part in lengths]), TOP_PERCENTILE) if lengths else 0.0
     return float(top) or 1.0
+
+
+def quantize(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """Positions (..., D) as multiples of (high - low) / 65535 above `low`, (D,) each."""
+    return np.round((position - low) / (high - low) * STEPS).astype(np.uint16)
+
+
+def pack_positions(steps: NDArray[np.uint16]) -> str:
+    """Packs quantised positions (T, N, D), or other numbers (T, N), with particles drawn in this order.
+
+    All low bytes precede all high bytes, which are mostly the same and so take next to no room.
+    """
+    change = steps.copy()
+    change[1:] -= steps[:-1]  # (modulo 65536)
+    flat = change.reshape(-1)
+    return pack_bytes(np.concatenate([flat & 0xFF, flat >> 8]).astype(np.uint8))
+
+
+def pack_bytes(values: NDArray[np.uint8]) -> str:
+    """Deflated bytes as base64 text."""
+    return base64.b64encode(zlib.compress(values.tobytes(), 6)).decode("ascii")

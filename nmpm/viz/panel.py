@@ -1,4 +1,4 @@
-"""Panels: the box with its particles as small antialiased discs, drawn with NumPy and Pillow.
+"""Panels: the box with its particles as small antialiased discs, drawn with NumPy and Pillow, and texts beside them.
 
 Everything is drawn on a canvas finer than the panel and averaged, so that edges are smooth and motion smaller than a
 pixel is visible.
@@ -16,7 +16,6 @@ from PIL import Image, ImageDraw
 
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
 from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours, vary_brightness
-from nmpm.viz.spacing import particle_spacing
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3
@@ -33,6 +32,11 @@ ARROW_LIMITS = (9.0, 24.0)
 """Smallest and largest radius of it in pixels."""
 CHUNK_POINTS = 1_000_000
 """Largest number of canvas points written at once."""
+SAMPLES = 64
+"""Particles from which the spacing is estimated."""
+NEIGHBOURS = {2: 6, 3: 12}
+"""Neighbours per dimension: enough to average over random placement, few enough to be local."""
+UNIT_BALL_VOLUME = {2: math.pi, 3: 4 * math.pi / 3}
 
 
 class PanelRenderer:
@@ -81,20 +85,15 @@ class PanelRenderer:
         """Counts the particles (N, D) outside of the window."""
         return int((~self._inside(self.camera.project(self.trajectories.wrap(position)))).sum())
 
-    def pixel_of(self, point: Floats) -> tuple[int, int]:
-        """Row and column of the pixel where a point (D,) is drawn."""
-        right, up, _ = self.camera.project(point) * self._scale / SUPERSAMPLING
-        return int(self.height - up), int(right)
-
     @property
     def _diameter(self) -> float:
         spacing = particle_spacing(next(iter(self.trajectories.positions.values()))[0])
         return float(np.clip(DISC_DIAMETER * spacing * self._scale / SUPERSAMPLING, *DIAMETER_LIMITS))
 
     def _colours_of_materials(self) -> NDArray[np.uint8]:
-        chosen = material_colours(self.trajectories.materials)
+        colours = material_colours(self.trajectories.materials)
         names, inverse = np.unique(self.trajectories.material, return_inverse=True)
-        return np.array([chosen[name] for name in names.tolist()], dtype=np.uint8)[inverse]
+        return np.array([colours[name] for name in names.tolist()], dtype=np.uint8)[inverse]
 
     def _inside(self, projected: NDArray[np.float64]) -> NDArray[np.bool_]:
         right, up = projected[:, 0], projected[:, 1]
@@ -137,14 +136,11 @@ class PanelRenderer:
         image = Image.new("RGBA", (self.width * SUPERSAMPLING, self.height * SUPERSAMPLING), (*BACKGROUND, 255))
         draw = ImageDraw.Draw(image)
         if self.trajectories.dim == 2:
-            self._paint_walls(draw)
+            self._paint_rectangle(draw, self.trajectories.outer_bounds, WALL)
+            self._paint_rectangle(draw, self.trajectories.bounds, INTERIOR)
         else:
             self._paint_box(draw)
         return np.array(image).view(np.uint32)[..., 0]
-
-    def _paint_walls(self, draw: ImageDraw.ImageDraw) -> None:
-        self._paint_rectangle(draw, self.trajectories.outer_bounds, WALL)
-        self._paint_rectangle(draw, self.trajectories.bounds, INTERIOR)
 
     def _paint_rectangle(self, draw: ImageDraw.ImageDraw, box: tuple[tuple[float, float], ...], fill: Rgb) -> None:
         (left, bottom), (right, top) = self._canvas_points(np.array(box).T)
@@ -175,3 +171,50 @@ def _disc_offsets(radius: float) -> NDArray[np.int64]:
 def _fade_by_depth(colours: NDArray[np.uint8], nearness: NDArray[np.float64]) -> NDArray[np.uint8]:
     fade = DEPTH_FADE * (1 - nearness[:, None])
     return np.asarray(colours * (1 - fade) + np.array(INTERIOR) * fade, dtype=np.uint8)
+
+
+def particle_spacing(position: Floats) -> float:
+    """Edge of the square or cube that one particle occupies, in domain length.
+
+    A ball around a particle with the distance to its k-th neighbour as radius contains about k + 1/2 particles; the
+    median radius over a sample of particles gives the spacing. The result is within 2% of the spacing of a regular
+    lattice. For random positions it is the mean spacing, about twice the mean distance to the nearest neighbour.
+
+    Args:
+        position: (N, D), one frame; D is 2 or 3.
+
+    Returns:
+        The spacing; infinite for a single particle.
+    """
+    count, dim = position.shape
+    neighbours = min(NEIGHBOURS[dim], count - 1)
+    if neighbours == 0:
+        return math.inf
+    sample = position[np.linspace(0, count - 1, min(SAMPLES, count)).astype(int)].astype(np.float64)
+    # One axis at a time, because the differences of all axes together exceed the cache.
+    squares = np.zeros((len(sample), count))
+    for axis in range(dim):
+        squares += np.square(sample[:, axis, None] - position[None, :, axis])
+    radius = np.sqrt(np.partition(squares, neighbours, axis=1)[:, neighbours])
+    return float((UNIT_BALL_VOLUME[dim] * np.median(radius) ** dim / (neighbours + 0.5)) ** (1 / dim))
+
+
+def format_time(trajectories: LabelledTrajectories, frame: int) -> str:
+    """The time of a frame in seconds, with the same number of decimals for every frame."""
+    longest = max(trajectories.frame_count - 1, 1) * trajectories.dt
+    decimals = max(0, 2 - math.floor(math.log10(longest)))
+    return f"{frame * trajectories.dt:.{decimals}f} s"
+
+
+def format_distance(trajectories: LabelledTrajectories, length: float) -> str:
+    """A distance in domain length, rounded to about a thousandth of the box, with the same number of decimals for every
+    frame; in scientific notation from 100 box lengths on.
+    """
+    longest = max(high - low for low, high in trajectories.bounds)
+    decimals = max(0, 3 - math.floor(math.log10(longest)))
+    return f"{length:.{decimals}f}" if length < 100 * longest else f"{length:.1e}"
+
+
+def format_out_of_view(count: int) -> str:
+    """States how many particles lie outside of the picture; empty for none."""
+    return f"{count} out of view" if count else ""
