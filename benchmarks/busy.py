@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 from timing import Spread, describe_machine, make_parser, write_json
 
-from nmpm._support.parallel import usable_cores
+from nmpm._support.threads import usable_cores
 
 LOOP = "while True: pass"
 ROLLOUT = """

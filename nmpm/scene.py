@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
-from nmpm._support.plain_data import from_plain, to_lists
+from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 
 Boundary = Literal["wall", "periodic"]
@@ -206,7 +206,7 @@ class Scene:
         for name in ("densities", "evolving", "properties", "parameters"):
             if not plain[name]:
                 del plain[name]
-        return {key: to_lists(value) for key, value in plain.items()}
+        return {key: to_plain(value) for key, value in plain.items()}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:

@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nmpm._support.specs import from_spec, to_spec
+from nmpm._support.plain_data import from_spec, to_spec
 from nmpm.grid import Grid
 from nmpm.processors import GridLayout, GridProcessor, Processor
 from nmpm.transfer import Transfer

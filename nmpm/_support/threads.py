@@ -1,7 +1,7 @@
-"""How many threads work: as many as the process may use, or one where measured times say so.
+"""Threads: how many a process may use, how many it uses, and work on ranges of items by several.
 
 Threads that wait for one another inside of small operations gain little on a quiet machine, and on a busy one each
-waits for a core that does other work. So the choice is measured, and measured again, as load changes.
+waits for a core that does other work. So `ThreadChoice` measures, and measures again, as load changes.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Mapping, MutableMapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 from nmpm._support.messages import counted
-from nmpm._support.parallel import usable_cores
+
+T = TypeVar("T")
 
 WAITING_POLICIES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 """Environment variables by which a user says how OpenMP's threads wait."""
@@ -27,6 +30,39 @@ HOPELESS = 3.0
 LOOK_AGAIN = 30.0
 """Seconds from one measurement to the next, or `LOOK_AGAIN_SHARE` times what it took."""
 LOOK_AGAIN_SHARE = 50
+
+
+def usable_cores() -> int:
+    """Processor cores that this process may use: by its affinity and its container's quota, at least 1."""
+    from joblib import cpu_count  # here, as it imports NumPy
+
+    return int(cpu_count())
+
+
+def split(count: int, size: int) -> list[tuple[int, int]]:
+    """The ranges of at most `size` that cover `count` items; they do not depend on the number of threads."""
+    return [(low, min(low + size, count)) for low in range(0, count, size)]
+
+
+def for_each(work: Callable[[int], object], count: int, threads: int) -> None:
+    """Call `work` with 0 … count - 1, each the work of one thread; see `map_ranges`."""
+    map_ranges(lambda low, _: work(low), split(count, 1), threads)
+
+
+def map_ranges(function: Callable[[int, int], T], ranges: list[tuple[int, int]], threads: int) -> list[T]:
+    """The function's results for each range (low, high), in order.
+
+    Threads live for one call: none is left behind for a process that forks, and none is needed for a single range.
+
+    Args:
+        function: Is called from several threads; it should release the interpreter's lock.
+        ranges: From `split`.
+        threads: How many work at most.
+    """
+    if threads == 1 or len(ranges) < 2:
+        return [function(low, high) for low, high in ranges]
+    with ThreadPoolExecutor(min(threads, len(ranges))) as pool:
+        return list(pool.map(lambda both: function(*both), ranges))
 
 
 def limit_spinning(environment: MutableMapping[str, str] = os.environ) -> None:

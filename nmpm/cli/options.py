@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nmpm._support.writable import file_obstacle, folder_obstacle, name_obstacle
+from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from yaml import YAMLError
 
 from nmpm._support.bounded_files import check_yaml
 from nmpm._support.messages import one_line
-from nmpm._support.plugins import load_plugins
+from nmpm._support.plain_data import load_plugins
 from nmpm.cli.console import quiet_lightning
 from nmpm.cli.emulator_cli import EmulatorCLI, RunConfig
 from nmpm.errors import ConfigError

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.parallel import map_ranges, split, usable_cores
+from nmpm._support.threads import map_ranges, split, usable_cores
 
 _LEVEL = 1
 FILTERS: Mapping[str, Any] = MappingProxyType({"shuffle": True, "compression": "gzip", "compression_opts": _LEVEL})

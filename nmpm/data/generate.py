@@ -19,11 +19,10 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from queue import SimpleQueue
 
-from nmpm._support.atomic import atomic_write, temporary_files
-from nmpm._support.parallel import usable_cores
+from nmpm._support.atomic import atomic_write, lock_folder, temporary_files
 from nmpm._support.progress import progress_bar
+from nmpm._support.threads import usable_cores
 from nmpm._support.version import __version__
-from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,

@@ -6,11 +6,10 @@ import shutil
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from nmpm._support.atomic import new_folder
+from nmpm._support.atomic import lock_folder, new_folder
 from nmpm._support.limits import EXPANSION, FILE_NAME, expansion_limit
 from nmpm._support.shipped import user_home
 from nmpm.data.archive_errors import ZIP_ERRORS
-from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import SPLITS
 from nmpm.errors import ConfigError, DataError
 

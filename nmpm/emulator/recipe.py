@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from nmpm._support.plain_data import from_plain, to_lists
-from nmpm._support.specs import from_spec, to_spec
+from nmpm._support.plain_data import from_plain, from_spec, to_plain, to_spec
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.model import Emulator
@@ -142,4 +141,4 @@ def _plain(value: Any) -> Any:
         return value.to_dict()
     if isinstance(value, Constraints):
         return dataclasses.asdict(value)
-    return to_spec(value) if dataclasses.is_dataclass(value) else to_lists(value)
+    return to_spec(value) if dataclasses.is_dataclass(value) else to_plain(value)

@@ -11,9 +11,10 @@ from typing import Any, ClassVar, Self
 
 from nmpm._support.limits import FILE_NAME
 from nmpm._support.messages import one_line
+from nmpm._support.plain_data import to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.config import check, to_plain
+from nmpm.sim.config import check
 from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory
 
 BOUNDARY = 3

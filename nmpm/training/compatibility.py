@@ -8,8 +8,7 @@ from typing import Any
 
 from torch.optim import Optimizer
 
-from nmpm._support.plain_data import to_lists
-from nmpm._support.specs import class_path
+from nmpm._support.plain_data import class_path, to_plain
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
 from nmpm.scene import Scene
@@ -147,7 +146,7 @@ def adopt_optimizer_arguments(checkpoint: Mapping[str, Any], optimizer: Optimize
     for stored, mine in zip(states[0]["param_groups"], optimizer.param_groups, strict=False):
         for name in sorted(optimizer.defaults.keys() & stored.keys() & mine.keys()):
             kept, new = "initial_lr" if name == "lr" and "initial_lr" in stored else name, mine[name]
-            if to_lists(stored[kept]) == to_lists(new):
+            if to_plain(stored[kept]) == to_plain(new):
                 continue
             changed[f"model.optimizer.{name} = {new} (was {stored[kept]})"] = None
             if kept == "initial_lr":

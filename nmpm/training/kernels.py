@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nmpm._support.jit import jit, jit_sum
-from nmpm._support.parallel import for_each
+from nmpm._support.threads import for_each
 from nmpm.emulator.fused.arrays import as_array, material_rows
 from nmpm.grid import Grid
 from nmpm.transfer.fused.scatter import scatter, scatter_adjoint

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nmpm._support.collectives import global_mean
 from nmpm._support.digests import weights_digest
-from nmpm._support.specs import class_path
+from nmpm._support.plain_data import class_path
 from nmpm.emulator import Emulator, EmulatorRecipe, Rollout, predict_rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.compilation import compile_network

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nmpm._support.parallel import map_ranges
+from nmpm._support.threads import map_ranges
 
 T = TypeVar("T")
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+from filelock import lock_descriptor
 
 from nmpm._support.atomic import temporary_files
 from nmpm.errors import ConfigError
@@ -36,16 +37,16 @@ class RunFolder:
         self.root.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+            locked = lock_descriptor(descriptor, blocking=False)
+        except OSError:
+            return descriptor
+        if not locked:
             holder = os.read(descriptor, 20).decode() or "unknown"
             os.close(descriptor)
             raise ConfigError(
                 f"Another process ({holder}) is training in {self.root}. Wait for it, or choose another folder with"
                 " --trainer.default_root_dir."
-            ) from error
-        except OSError:
-            return descriptor
+            )
         os.truncate(descriptor, 0)
         os.write(descriptor, str(os.getpid()).encode())
         return descriptor

@@ -9,8 +9,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from nmpm._support.atomic import atomic_write
-from nmpm._support.writable import file_obstacle
+from nmpm._support.atomic import atomic_write, file_obstacle
 from nmpm.errors import ConfigError, DataError
 
 

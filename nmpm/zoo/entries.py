@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import lock_descriptor
 from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
@@ -66,7 +66,7 @@ def writing(folder: Path) -> Iterator[None]:
                     raise
                 continue
             locks.callback(os.close, handle)
-            fcntl.flock(handle, fcntl.LOCK_EX)
+            lock_descriptor(handle)
         yield
 
 

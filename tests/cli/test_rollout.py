@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nmpm._support.atomic import atomic_write
+from nmpm._support.atomic import atomic_write, file_obstacle
 from nmpm._support.shipped import shipped_folder
-from nmpm._support.writable import file_obstacle
 from nmpm.cli import main
 from nmpm.data.format import Split, Trajectory, write_split
 from nmpm.errors import DataError

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nmpm._support.specs import from_spec, to_spec
+from nmpm._support.plain_data import from_spec, to_spec
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.processors import (

@@ -1,14 +1,18 @@
 """Files and folders appear whole or not at all."""
 
 import errno
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
-from nmpm._support.atomic import atomic_folder, atomic_write, new_folder
+from nmpm._support.atomic import atomic_folder, atomic_write, lock_folder, new_folder, temporary_files
+from nmpm.errors import DataError
 
 
 def files_of(folder):
@@ -72,25 +76,26 @@ with atomic.{writer}(Path({str(path)!r})) as new:
 BETWEEN_RENAMES = """
 rename = os.replace
 def replace(source, target):
-    if Path(source).name == "new":
+    if str(source).endswith(".new"):
         os.kill(os.getpid(), signal.SIGKILL)
     rename(source, target)
 os.replace = replace
 """
 
 
-@pytest.mark.parametrize("writer", ["new_folder", "atomic_folder"])
-@pytest.mark.parametrize("name", ["one", "[o]*?", "o" * 200])
-def test_what_a_killed_process_left_is_cleared_by_the_next_one(tmp_path, writer, name):
-    killed(writer, tmp_path / name)
+@pytest.mark.parametrize("name", ["[o]*?", "o" * 200])
+def test_what_a_killed_process_left_is_cleared_by_the_next_one(tmp_path, name):
+    killed("new_folder", tmp_path / name)
     killed("atomic_folder", tmp_path / f"{name}.other")
     assert not (tmp_path / name).exists()
     with atomic_folder(tmp_path / name) as new, new_folder(tmp_path / f"{name}s") as other:
         (new / "file").write_text("whole")
         (other / "file").write_text("another")
-    left = {path: text for path, text in files_of(tmp_path).items() if text not in ("of the killed", "")}
-    assert left == {f"{name}/file": "whole", f"{name}s/file": "another"}
-    assert len(list(tmp_path.iterdir())) == 3  # what was left for another path stays
+    shown = {path: text for path, text in files_of(tmp_path).items() if not path.startswith(".")}
+    assert shown == {f"{name}/file": "whole", f"{name}s/file": "another"}
+    assert "of the killed" in files_of(tmp_path).values()  # what was left for another path stays
+    write(tmp_path / f"{name}.other", "next")
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_a_former_folder_comes_back_after_a_kill_between_two_renames(tmp_path):
@@ -102,20 +107,44 @@ def test_a_former_folder_comes_back_after_a_kill_between_two_renames(tmp_path):
     assert files_of(tmp_path) == {"one/inner/file": "first"}
 
 
-def test_a_folder_of_a_running_process_is_left_alone(tmp_path, monkeypatch):
+def test_writers_of_the_same_folder_wait_for_one_another(tmp_path, caplog):
     with atomic_folder(tmp_path / "one") as first:
         (first / "file").write_text("first")
-        # In a container of the same host name, another process has this number, or none has.
-        monkeypatch.setattr(os, "kill", lambda *_: (_ for _ in ()).throw(ProcessLookupError))
-        write(tmp_path / "one", "second")
-    assert files_of(tmp_path) == {"one/file": "first"}
+        second = threading.Thread(target=write, args=(tmp_path / "one", "second"))
+        second.start()
+        while "waiting" not in caplog.text:
+            time.sleep(0.01)
+        assert list(first.iterdir()) == [first / "file"]
+    second.join()
+    assert files_of(tmp_path) == {"one/inner/file": "second"}
 
 
-def test_processes_of_the_same_number_write_a_file_each(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "getpid", lambda: 7)
+@pytest.mark.parametrize("kind", [threading.Thread, multiprocessing.get_context("fork").Process])
+def test_a_locked_folder_is_waited_for(tmp_path, kind, caplog):
+    def work():
+        with lock_folder(tmp_path / "deep"):
+            (tmp_path / "deep" / "file").write_text("second")
+
+    with lock_folder(tmp_path / "deep"):
+        other = kind(target=work)
+        other.start()
+        time.sleep(0.2)
+        assert not (tmp_path / "deep" / "file").exists()
+    other.join()
+    assert (tmp_path / "deep" / "file").read_text() == "second"
+
+
+def test_a_folder_that_cannot_be_locked_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="file: cannot be written"), lock_folder(tmp_path / "file"):
+        pass
+
+
+def test_two_writers_of_a_file_write_a_file_each(tmp_path):
     with atomic_write(tmp_path / "one") as first, atomic_write(tmp_path / "one") as second:
         first.write_text("first")
         second.write_text("second")
+        assert set(temporary_files(tmp_path)) == {first, second}
     assert files_of(tmp_path) == {"one": "first"}
 
 

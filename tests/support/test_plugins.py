@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nmpm._support.plugins import load_plugins
-from nmpm._support.specs import from_spec
+from nmpm._support.plain_data import from_spec, load_plugins
 from nmpm.errors import ConfigError
 from nmpm.processors import Processor
 

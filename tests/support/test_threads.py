@@ -1,12 +1,17 @@
-import os
 import subprocess
 import sys
 
 import pytest
 from jsonargparse.typing import PositiveInt
 
-from nmpm._support.parallel import usable_cores
-from nmpm._support.threads import LOOK_AGAIN, LOOK_AGAIN_SHARE, SKIPPED, ThreadChoice, limit_spinning, stated_threads
+from nmpm._support.threads import (
+    LOOK_AGAIN,
+    LOOK_AGAIN_SHARE,
+    SKIPPED,
+    ThreadChoice,
+    limit_spinning,
+    stated_threads,
+)
 
 
 class Machine:
@@ -78,24 +83,3 @@ def test_importing_the_package_changes_neither_environment_nor_threads():
         "assert before == (dict(os.environ), torch.get_num_threads())"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
-
-
-@pytest.mark.parametrize(
-    ("files", "cores"),
-    [
-        ({"cpu.max": "200000 100000"}, 2),
-        ({"cpu.max": "max 100000", "box/cpu.max": "100000 100000"}, 1),
-        ({"box/cpu.max": "20000 100000"}, 1),
-        ({"cpu/box/cpu.cfs_quota_us": "150000", "cpu/box/cpu.cfs_period_us": "50000"}, 3),
-        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 8),
-        ({}, 8),
-    ],
-)
-def test_quotas_of_containers_limit_the_cores(monkeypatch, tmp_path, files, cores):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text + "\n")
-    groups = tmp_path / "groups"
-    groups.write_text("4:cpu,cpuacct:/box\n2:memory:/box\n0::/box\n")
-    assert usable_cores(tmp_path, groups) == cores

@@ -3,8 +3,8 @@ import pytest
 import torch
 import yaml
 
+from nmpm._support.plain_data import from_spec
 from nmpm._support.shipped import shipped_folder
-from nmpm._support.specs import from_spec
 from nmpm.cli import main
 from nmpm.data.format import Split
 from nmpm.decoders import Flip

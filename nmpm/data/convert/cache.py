@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
 from nmpm.data.convert import Options, convert, open_dataset
-from nmpm.data.folder_lock import lock_folder
 from nmpm.data.format import METADATA_FILE
 from nmpm.data.scene_inference import check_gravity
 

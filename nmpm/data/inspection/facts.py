@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from nmpm._support.plain_data import to_lists
+from nmpm._support.plain_data import to_plain
 from nmpm.scene import Interval
 
 Range = tuple[int, int]
@@ -118,4 +118,4 @@ def _plain(value: Any) -> Any:
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return to_lists(value)
+    return to_plain(value)

@@ -6,8 +6,8 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from threading import Lock
 
-from nmpm._support.parallel import usable_cores
 from nmpm._support.progress import progress_bar
+from nmpm._support.threads import usable_cores
 from nmpm.data.format import SPLITS, Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.background import Task, map_in_threads, raise_if_abandoned, run_in_thread

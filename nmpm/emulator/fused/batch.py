@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.fused.arrays import check_materials, output_arrays
 from nmpm.emulator.fused.crowd import CrowdArrays, spread_scene
 from nmpm.emulator.fused.flight import land

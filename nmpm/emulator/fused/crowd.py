@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.fused.crowding import count_particles, drift, push, spread_energies
 from nmpm.emulator.fused.flight import weigh
 from nmpm.emulator.fused.path import ROUNDING

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
 from nmpm.emulator.fused import contact
 from nmpm.emulator.fused.flight import first_excess, fly, weigh

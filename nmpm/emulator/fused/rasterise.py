@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.parallel import map_ranges, split
+from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.fused.plan import Array, Plan
 from nmpm.transfer.fused.scatter import scatter
 from nmpm.transfer.fused.state import fill_state, to_cells

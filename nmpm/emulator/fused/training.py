@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nmpm._support.parallel import for_each
+from nmpm._support.threads import for_each
 from nmpm.emulator.fused.adjoint import fly_back, rasterise_back
 from nmpm.emulator.fused.arrays import as_array, as_copy, check_materials, material_rows, output_arrays
 from nmpm.emulator.fused.batch import rasterise_batch, to_grid

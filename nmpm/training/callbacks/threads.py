@@ -8,8 +8,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nmpm._support.devices import processor_name
-from nmpm._support.parallel import usable_cores
-from nmpm._support.threads import ThreadChoice
+from nmpm._support.threads import ThreadChoice, usable_cores
 from nmpm.particles import Window
 from nmpm.training.module import EmulatorModule
 from nmpm.training.parts import MOST_PARTS
