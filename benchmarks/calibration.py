@@ -20,7 +20,7 @@ import numpy as np
 from nmpm._support.progress import progress_bar
 from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
-from nmpm.data.seeds import derive_seed
+from nmpm.data.simulation import derive_seed
 from nmpm.data.statistics import MotionStatistics
 from nmpm.sim import load_preset
 

@@ -28,7 +28,7 @@ from nmpm.data.generate import preset_metadata
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import RecordingReader
-from nmpm.data.seeds import derive_seed
+from nmpm.data.simulation import derive_seed
 from nmpm.decoders import Absolute, Decoder, Residual
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.calibration import calibrate

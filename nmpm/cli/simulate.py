@@ -13,7 +13,7 @@ from nmpm.cli.options import check_at_least, check_folder, check_picture
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from nmpm.data.shard import Shard
+    from nmpm.data.simulation_request import Shard
     from nmpm.sim import Preset
 
 _INTERRUPTED = 130  # as shells report SIGINT
@@ -81,7 +81,7 @@ def _simulate(chosen: argparse.Namespace) -> None:
         check_picture("--preview", chosen.preview)
     elif chosen.out is not None:
         check_folder("--out", chosen.out)
-    from nmpm.data.shard import Shard
+    from nmpm.data.simulation_request import Shard
     from nmpm.sim import load_preset
 
     shard = None if chosen.shard is None else Shard.parse(chosen.shard)

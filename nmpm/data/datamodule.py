@@ -300,7 +300,7 @@ def _make_source(
         return FolderSource(Path(path), stated)
     if source == "hub":
         return HubSource(Path(str(name)), stated)
-    from nmpm.data.loading.simulated_sources import EmbeddedSource, SimulatedSource
+    from nmpm.data.loading.simulated import EmbeddedSource, SimulatedSource
 
     sources: dict[str, Callable[[str], DataSource]] = {
         "disk": lambda known: EmbeddedSource(known, generate),

@@ -1,11 +1,11 @@
-"""Simulates datasets in parallel; resumes after an interruption; gives the same bytes for any number of workers.
+"""Simulates datasets; resumes after an interruption; gives the same bytes for any number of workers.
 
 An unfinished folder contains `.parts`, with the request and a file for each finished trajectory. When all parts of a
 split are there they are assembled into its HDF5 file; `metadata.json` is written last and marks the dataset as
 complete. Files are written atomically, so that a repeated call continues where the last one stopped.
 
-Shards are processes that write different parts to the same folder at the same time, under a shared lock; whoever
-assembles the parts holds an exclusive lock.
+Shards are processes that write different parts to the same folder at the same time. Each holds a lock of its own; who
+holds the folder's lock, to simulate the rest and to assemble, waits for theirs.
 """
 
 from __future__ import annotations
@@ -14,34 +14,35 @@ import dataclasses
 import json
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from queue import SimpleQueue
+
+import numpy as np
 
 from nmpm._support.atomic import atomic_write, lock_folder, temporary_files
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import usable_cores
 from nmpm._support.version import __version__
+from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,
     Metadata,
     Split,
+    Trajectory,
     read_metadata,
     write_metadata,
     write_split,
 )
-from nmpm.data.parts import PARTS, explain_write_errors, part_path, read_parts, request_path, write_part
-from nmpm.data.seeds import DRAWS, seed_of_draw
-from nmpm.data.shard import Shard
-from nmpm.data.simulation_request import SimulationRequest
-from nmpm.data.simulation_workers import Worker, started_workers
+from nmpm.data.simulation import DRAWS, seed_of_draw, simulate_all
+from nmpm.data.simulation_request import Shard, SimulationRequest
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import DataError
-from nmpm.sim import Preset
+from nmpm.sim import Preset, SimulatedTrajectory
 from nmpm.sim.preset import BOUNDARY
 
+_PARTS, _REQUEST = ".parts", "request.json"
 _KEY = "simulation"
 
 _log = logging.getLogger(__name__)
@@ -75,8 +76,22 @@ def generate(
     request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
         return
-    with explain_write_errors(folder), lock_folder(folder):
-        _complete(request, folder, workers or usable_cores(), known)
+    with _explained_write_errors(folder), lock_folder(folder):
+        if _is_complete(request, folder):
+            return
+        _prepare_parts(request, folder)
+        for shard in sorted((folder / _PARTS).glob("shard-*")):
+            with lock_folder(shard):  # waits for the shard that is being simulated
+                pass
+        for stale in temporary_files(folder):
+            stale.unlink(missing_ok=True)
+        if known is not None:
+            _copy_parts(request, folder, known)
+        _simulate_parts(request, folder, request.trajectories, workers)
+        for split in request.splits:
+            _assemble(request, folder, split)
+        _write_metadata(request, folder)
+        shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
 
 def generate_shard(
@@ -98,38 +113,29 @@ def generate_shard(
     request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):
         return 0
-    with explain_write_errors(folder), lock_folder(folder, shared=True):
-        if _is_complete(request, folder):
-            return 0
-        with lock_folder(folder / PARTS):
+    with _explained_write_errors(folder), ExitStack() as own_lock:
+        with lock_folder(folder):
+            if _is_complete(request, folder):
+                return 0
             _prepare_parts(request, folder)
-        _simulate_parts(request, folder, shard.select(request.trajectories), workers or usable_cores())
-        # While the lock is held nobody assembles: the last shard to come here finds all parts.
+            own_lock.enter_context(lock_folder(folder / _PARTS / f"shard-{shard.index}-of-{shard.count}"))
+        _simulate_parts(request, folder, shard.select(request.trajectories), workers)
         missing = len(_missing(folder, request.trajectories))
     if missing == 0:
         generate(preset, folder, counts, seed, workers)
     return missing
 
 
-def _complete(request: SimulationRequest, folder: Path, workers: int, known: Path | None) -> None:
-    if _is_complete(request, folder):
-        return
-    _prepare_parts(request, folder)
-    _remove_stale_files(folder)
-    if known is not None:
-        _copy_parts(request, folder, known)
-    _simulate_parts(request, folder, request.trajectories, workers)
-    for split in request.splits:
-        _assemble(request, folder, split)
-    metadata = preset_metadata(request.preset)
-    first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
-    for index in range(len(first)):
-        statistics.add(first.read(index))
-    redrawn = _find_redrawn(request, folder)
-    simulation = request.to_dict() | ({"redrawn": redrawn} if redrawn else {})
-    extra = metadata.extra | statistics.result() | {_KEY: simulation}
-    write_metadata(folder, dataclasses.replace(metadata, extra=extra))
-    shutil.rmtree(folder / PARTS, ignore_errors=True)
+@contextmanager
+def _explained_write_errors(folder: Path) -> Iterator[None]:
+    """Raises a DataError, which says how to continue, where writing to the folder fails."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error}). Finished trajectories are kept; free space or correct the"
+            " permissions, and repeat the call to continue."
+        ) from error
 
 
 def _is_complete(request: SimulationRequest, folder: Path) -> bool:
@@ -141,7 +147,7 @@ def _is_complete(request: SimulationRequest, folder: Path) -> bool:
 
 def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
     """Writes the request beside the parts, or checks that existing parts belong to the same request."""
-    path = request_path(folder)
+    path = folder / _PARTS / _REQUEST
     if path.is_file():
         request.check_same(json.loads(path.read_text(encoding="utf-8")), folder)
         return
@@ -152,15 +158,18 @@ def _prepare_parts(request: SimulationRequest, folder: Path) -> None:
         temporary.write_text(json.dumps(request.to_dict(), indent=1), encoding="utf-8")
 
 
-def _remove_stale_files(folder: Path) -> None:
-    """Removes files that killed processes left incomplete; the lock guarantees that no other process is writing."""
-    for stale in [*temporary_files(folder), *temporary_files(folder / PARTS)]:
-        stale.unlink(missing_ok=True)
+def _part_path(folder: Path, split: str, index: int) -> Path:
+    return folder / _PARTS / f"{split}-{index:05d}.npz"
+
+
+def _write_part(path: Path, run: SimulatedTrajectory | Trajectory) -> None:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, position=run.position, particle_type=run.particle_type, **run.attributes)
 
 
 def _missing(folder: Path, wanted: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Those of the trajectories that are neither in their split's file nor in a part."""
-    return [(s, i) for s, i in wanted if not (folder / f"{s}.h5").is_file() and not part_path(folder, s, i).is_file()]
+    """Trajectories still to simulate."""
+    return [(s, i) for s, i in wanted if not (folder / f"{s}.h5").is_file() and not _part_path(folder, s, i).is_file()]
 
 
 def _copy_parts(request: SimulationRequest, folder: Path, known: Path) -> None:
@@ -173,60 +182,72 @@ def _copy_parts(request: SimulationRequest, folder: Path, known: Path) -> None:
     _log.info("Copying %d trajectories of %s from %s.", len(missing), request.preset.name, known)
     with progress_bar(f"Copying trajectories of {known.name}", len(missing)) as advance:
         for split, index in missing:
-            write_part(part_path(folder, split, index), splits[split].read(index))
+            _write_part(_part_path(folder, split, index), splits[split].read(index))
             advance()
 
 
-def _simulate_parts(request: SimulationRequest, folder: Path, wanted: Sequence[tuple[str, int]], workers: int) -> None:
+def _simulate_parts(
+    request: SimulationRequest, folder: Path, wanted: Sequence[tuple[str, int]], workers: int | None
+) -> None:
     missing, total = _missing(folder, wanted), len(wanted)
     if not missing:
         return
     _log.info("Simulating %d of %d trajectories of %s into %s.", len(missing), total, request.preset.name, folder)
-    with started_workers(request, folder, workers, len(missing)) as started:
-        idle: SimpleQueue[Worker] = SimpleQueue()
-        for worker in started:
-            idle.put(worker)
-        pool = ThreadPoolExecutor(len(started))
-        try:
-            with progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance:
-                for future in as_completed([pool.submit(_simulate_part, idle, s, i) for s, i in missing]):
-                    future.result()
-                    advance()
-        finally:  # after Ctrl-C or a simulation that failed, too: the others need not end before it shows
-            for worker in started:
-                worker.stop()
-            pool.shutdown(cancel_futures=True)
-
-
-def _simulate_part(idle: SimpleQueue[Worker], split: str, index: int) -> None:
-    worker = idle.get()
-    try:
-        worker.simulate(split, index)
-    finally:
-        idle.put(worker)
+    entropies = [request.entropy(split, index) for split, index in missing]
+    with (
+        progress_bar(f"Simulating {request.preset.name}", total, total - len(missing)) as advance,
+        closing(simulate_all(request.preset, entropies, workers or usable_cores())) as runs,
+    ):
+        for number, run in runs:
+            _write_part(_part_path(folder, *missing[number]), run)
+            advance()
 
 
 def _assemble(request: SimulationRequest, folder: Path, split: str) -> None:
     path = folder / f"{split}.h5"
-    parts = [part_path(folder, split, index) for index in range(request.counts[split])]
+    parts = [_part_path(folder, split, index) for index in range(request.counts[split])]
     if not path.is_file():
         with progress_bar(f"Writing {path.name}", len(parts)) as advance:
-            write_split(path, read_parts(parts, advance))
+            write_split(path, _read_parts(parts, advance))
     for part in parts:
         part.unlink(missing_ok=True)
 
 
+def _read_parts(paths: Iterable[Path], advance: Callable[[], object]) -> Iterator[Trajectory]:
+    for path in paths:
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                attributes = {k: arrays[k][()] for k in sorted(set(arrays) - {"position", "particle_type"})}
+                yield Trajectory(arrays["position"], arrays["particle_type"], attributes)
+        except NPZ_ERRORS as error:
+            raise DataError(
+                f"{path}: damaged ({error}); delete it and repeat the call, which simulates it again."
+            ) from error
+        advance()
+
+
+def _write_metadata(request: SimulationRequest, folder: Path) -> None:
+    metadata = preset_metadata(request.preset)
+    first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
+    for index in range(len(first)):
+        statistics.add(first.read(index))
+    redrawn = _find_redrawn(request, folder)
+    simulation = request.to_dict() | ({"redrawn": redrawn} if redrawn else {})
+    extra = metadata.extra | statistics.result() | {_KEY: simulation}
+    write_metadata(folder, dataclasses.replace(metadata, extra=extra))
+
+
 def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[str, int]]:
     """The trajectories whose first seeds were unstable, and how many were, by split and index."""
-    found: dict[str, dict[str, int]] = {}
+    redrawn: dict[str, dict[str, int]] = {}
     for split in request.splits:
         stored = Split(folder / f"{split}.h5")
         for index in range(len(stored)):
             entropy, seed = request.entropy(split, index), int(stored.attributes(index)["seed"])
             draw = next(draw for draw in range(DRAWS) if seed_of_draw(entropy, draw) == seed)
             if draw:
-                found.setdefault(split, {})[str(index)] = draw
-    return found
+                redrawn.setdefault(split, {})[str(index)] = draw
+    return redrawn
 
 
 def preset_metadata(preset: Preset) -> Metadata:

@@ -1,17 +1,20 @@
-"""The request for a simulated dataset: its preset, the numbers of trajectories, and the seed of each."""
+"""The request for a simulated dataset: its preset, the numbers of trajectories and the seed of each; shards of it."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from nmpm.data.format import SPLITS
-from nmpm.data.seeds import seed_of_draw
+from nmpm.data.simulation import seed_of_draw
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import Preset
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,45 @@ class SimulationRequest:
             raise DataError(
                 f"{folder}: has other data than requested: {what}. Choose another folder, or delete this one."
             )
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Every `count`-th trajectory, from the `index`-th on, for the tasks of a cluster's job array.
+
+    Args:
+        index: Which shard, from 1 to `count`.
+        count: Shards in all.
+
+    Raises:
+        ConfigError: if the index is not from 1 to `count`.
+    """
+
+    index: int
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.index <= self.count:
+            raise ConfigError(f"shard {self}: shards are counted from 1, as in 1/8, 2/8, …, 8/8.")
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Reads "I/N".
+
+        Raises:
+            ConfigError: if it cannot be read, or I is not from 1 to N.
+        """
+        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+        if match is None:
+            raise ConfigError(f"shard {text}: give I/N, as in 1/8, 2/8, …, 8/8.")
+        return cls(int(match[1]), int(match[2]))
+
+    def select(self, items: Sequence[T]) -> list[T]:
+        """This shard's items; each item is in exactly one of the `count` shards."""
+        return list(items[self.index - 1 :: self.count])
 
 
 def same_trajectories(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

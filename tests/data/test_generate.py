@@ -1,6 +1,5 @@
 import dataclasses
 import errno
-import itertools
 import json
 import os
 import shutil
@@ -15,7 +14,7 @@ import pytest
 
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.generate import generate
-from nmpm.data.seeds import seed_of_draw
+from nmpm.data.simulation import seed_of_draw
 from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import MpmPreset
@@ -162,23 +161,6 @@ def test_resumes_with_the_existing_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: simulated.append(seed) or simulate(preset, seed))
     generate(TINY, tmp_path, COUNTS, workers=1)
     assert len(simulated) == 3
-
-
-def test_an_error_does_not_wait_for_other_simulations(tmp_path, monkeypatch):
-    calls, frames = itertools.count(), []
-
-    def fails_or_lasts(preset, seed, progress):
-        if next(calls) > 0:
-            raise DataError("a simulation failed")
-        for frame in range(1, 500):
-            time.sleep(0.01)
-            frames.append(frame)
-            progress(frame)
-
-    monkeypatch.setattr(MpmPreset, "simulate", fails_or_lasts)
-    with pytest.raises(DataError, match="a simulation failed"):
-        generate(TINY, tmp_path, COUNTS, workers=2)
-    assert len(frames) < 400
 
 
 UNSTABLE = {

@@ -7,20 +7,17 @@ with whatever comes next. So threads are waited for, and long work calls `raise_
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextvars import ContextVar, copy_context
-from queue import Empty, SimpleQueue
-from typing import Generic, ParamSpec, TypeVar
+from typing import Generic, TypeVar
 
-P = ParamSpec("P")
 T = TypeVar("T")
-S = TypeVar("S")
 
 _POLL_SECONDS = 0.05
 
 _cancelled: ContextVar[threading.Event | None] = ContextVar("cancelled", default=None)
-"""Set when the task that the current thread works for is cancelled; a task's own threads inherit it."""
+"""Set when the task that the current thread works for is cancelled."""
 
 
 class AbandonedError(Exception):
@@ -39,13 +36,17 @@ def raise_if_abandoned() -> None:
 
 
 class Task(Generic[T]):
-    """A function that runs in a thread of its own; `run_in_thread` starts one."""
+    """Calls a function in a thread of its own, from now on.
 
-    def __init__(self, function: Callable[[], T], cancelled: threading.Event) -> None:
+    Args:
+        function: What to call.
+    """
+
+    def __init__(self, function: Callable[[], T]) -> None:
         self._future: Future[T] = Future()
-        self._cancelled = cancelled
+        self._cancelled = threading.Event()
         context = copy_context()
-        context.run(_cancelled.set, cancelled)
+        context.run(_cancelled.set, self._cancelled)
         self._thread = threading.Thread(target=context.run, args=(self._work, function))
         self._thread.start()
 
@@ -75,58 +76,4 @@ class Task(Generic[T]):
     def cancel(self) -> None:
         """Makes the function stop at its next `raise_if_abandoned`, and waits until its thread has ended."""
         self._cancelled.set()
-        self.join()
-
-    def join(self) -> None:
-        """Waits until the thread has ended, whatever the outcome."""
         self._thread.join()
-
-
-def run_in_thread(function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> Task[T]:
-    """Calls a function in a thread of its own."""
-    return Task(lambda: function(*arguments, **options), threading.Event())
-
-
-def map_in_threads(function: Callable[[S], T], items: Sequence[S], workers: int) -> list[T]:
-    """Computes the function's values for all items, in their order, in several threads.
-
-    The threads belong to the current task: cancelling it cancels them.
-
-    Raises:
-        Exception: the first that the function raised, once the items that were begun by then are done; others are
-            skipped.
-    """
-    waiting: SimpleQueue[tuple[int, S]] = SimpleQueue()
-    for numbered in enumerate(items):
-        waiting.put(numbered)
-    values: dict[int, T] = {}
-
-    def work() -> None:
-        try:
-            while True:
-                index, item = waiting.get_nowait()
-                raise_if_abandoned()
-                values[index] = function(item)
-        except Empty:
-            return
-        except BaseException:
-            _drain(waiting)
-            raise
-
-    cancelled = _cancelled.get() or threading.Event()
-    tasks = [Task(work, cancelled) for _ in range(min(workers, len(items)))]
-    try:
-        for task in tasks:
-            task.result()
-    finally:
-        for task in tasks:
-            task.join()
-    return [values[index] for index in range(len(items))]
-
-
-def _drain(waiting: SimpleQueue[tuple[int, S]]) -> None:
-    try:
-        while True:
-            waiting.get_nowait()
-    except Empty:
-        return

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import count, groupby
 from typing import Protocol
 
 import numpy as np
 import torch
 
-from nmpm.data.loading.background import run_in_thread
+from nmpm.data.loading.background import Task
 from nmpm.data.loading.padded_batch import PaddedRecordings, displacements
 from nmpm.data.loading.recording import Recording
 from nmpm.data.loading.window_plan import Drawn, WindowPlan
@@ -127,7 +128,7 @@ class TrajectoryBuffer:
         plan = self.plan
         contents = self._load(plan.members(plan.locate(start, world)[0], rank, world), None)
         for buffer, indices in groupby(count(start), key=lambda index: plan.locate(index, world)[0]):
-            upcoming = run_in_thread(self._load, plan.members(buffer + 1, rank, world), contents)
+            upcoming = Task(partial(self._load, plan.members(buffer + 1, rank, world), contents))
             try:
                 bucket, dealt = range(0), []
                 for index in indices:

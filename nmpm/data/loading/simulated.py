@@ -1,27 +1,104 @@
-"""Endless training trajectories straight from a simulator; nothing is written to disk."""
+"""Trajectories of an embedded dataset, or straight from a simulator. Apart, as the simulators take time to import."""
 
 from __future__ import annotations
 
+import inspect
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
 from threading import Lock
+from typing import Any
 
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import usable_cores
+from nmpm.data import catalog
 from nmpm.data.format import SPLITS, Trajectory
 from nmpm.data.generate import preset_metadata
-from nmpm.data.loading.background import Task, map_in_threads, raise_if_abandoned, run_in_thread
+from nmpm.data.loading.background import Task, raise_if_abandoned
+from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import Recording, RecordingReader
-from nmpm.data.seeds import simulate_first_stable
+from nmpm.data.loading.sources import DataSource
+from nmpm.data.loading.window_plan import EndlessWindowPlan, WindowPlan
+from nmpm.data.simulation import simulate_all
 from nmpm.errors import ConfigError
+from nmpm.scene import Scene
 from nmpm.sim import Preset
 
 _STREAM = len(SPLITS)  # not the index of a split, so that no seed is that of a written trajectory
 _CACHED_REQUESTS = 2  # the buffer in use and the next
+_GENERATE = frozenset(inspect.signature(catalog.ensure).parameters) - {"name"}
+
+
+@dataclass(frozen=True)
+class EmbeddedSource(DataSource):
+    """An embedded dataset, simulated on first use.
+
+    Args:
+        name: One of `nmpm.data.catalog.catalog()`.
+        generate: Keyword arguments of `nmpm.data.catalog.ensure`.
+    """
+
+    name: str
+    generate: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def description(self) -> str:
+        return f"{self.name}, simulated by nmpm"
+
+    @cached_property
+    def folder(self) -> Path:
+        return catalog.ensure(self.name, **self._check_options())
+
+    @property
+    def scene(self) -> Scene:
+        return catalog.scene(self.name)
+
+    def _check_options(self) -> dict[str, Any]:
+        unknown = sorted(set(self.generate) - _GENERATE)
+        if unknown:
+            mend = (
+                " Trajectories per split belong under counts: generate: {counts: {train: 4, valid: 1, test: 1}}."
+                if set(unknown) & set(SPLITS)
+                else ""
+            )
+            raise ConfigError(
+                f"generate = {self.generate}: {', '.join(map(repr, unknown))} is not an option; there are"
+                f" {', '.join(sorted(_GENERATE))}.{mend}"
+            )
+        return self.generate
+
+
+@dataclass(frozen=True)
+class SimulatedSource(EmbeddedSource):
+    """Trains on new trajectories from the simulator, each in one buffer only; evaluates on the embedded dataset."""
+
+    @property
+    def description(self) -> str:
+        return f"{self.name}, simulated by nmpm while training"
+
+    @cached_property
+    def folder(self) -> Path:
+        options = self._check_options()
+        counts = dict(options.get("counts") or catalog.describe(self.name).counts)
+        return catalog.ensure(self.name, **(options | {"counts": counts | {"train": 0}}))
+
+    @cached_property
+    def training_recordings(self) -> SimulatedRecordings:
+        """The trajectories to train on: one provider, whose buffers calibration and training share."""
+        options = {key: value for key, value in self._check_options().items() if key not in ("counts", "workers")}
+        request = catalog.simulation_request(self.name, **options)
+        return SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
+
+    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        frames = (self.training_recordings.preset.frames + 1,) * plan["buffer_size"]
+        return self.training_recordings, EndlessWindowPlan(frames=frames, length=length, **plan)
 
 
 class SimulatedRecordings:
-    """The trajectories that a preset gives for a seed, simulated on request.
+    """Endless trajectories that a preset gives for a seed, simulated on request; nothing is written to disk.
 
     Index i is always the same trajectory, so that a resumed training uses the same ones as an uninterrupted one.
 
@@ -38,31 +115,25 @@ class SimulatedRecordings:
         self._lock = Lock()
         self._requests: OrderedDict[tuple[int, ...], Task[list[Recording]]] = OrderedDict()
 
-    def __getitem__(self, index: int) -> Recording:
-        """Simulates one trajectory.
-
-        Raises:
-            ConfigError: if the simulation fails from several seeds in a row; names preset and seed.
-        """
-        entropy = (self.seed, _STREAM, index)
-        run = simulate_first_stable(self.preset, entropy, progress=lambda _: raise_if_abandoned())
-        trajectory = Trajectory(run.position, run.particle_type, run.attributes)
-        return self.reader.recording(trajectory, f"{self.preset.name}, simulated trajectory {index}")
-
     @property
     def max_bytes(self) -> int:
         """Size of the positions of the largest trajectory that can occur."""
         return 4 * (self.preset.frames + 1) * self.preset.max_particles * self.scene.dim
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
-        """Simulates several trajectories in parallel; the results of the last two requests are cached."""
+        """Simulates several trajectories in parallel; the results of the last two requests are cached.
+
+        Raises:
+            ConfigError: if no initial state fits into the box; names preset and seed.
+            UnstableError: if the simulation is unstable for several seeds in a row.
+        """
         key = tuple(indices)
         with self._lock:
             if key in self._requests and self._requests[key].failed:
                 del self._requests[key]
             first = not self._requests
             if key not in self._requests:
-                self._requests[key] = run_in_thread(self._simulate_first if first else self._simulate, key)
+                self._requests[key] = Task(lambda: self._simulate_first(key) if first else self._simulate(key))
             while len(self._requests) > _CACHED_REQUESTS:
                 self._requests.popitem(last=False)
             request = self._requests[key]
@@ -88,17 +159,19 @@ class SimulatedRecordings:
         for request in requests:
             request.cancel()
 
-    def _simulate(self, indices: Sequence[int]) -> list[Recording]:
-        return map_in_threads(self.__getitem__, indices, self.workers)
-
     def _simulate_first(self, indices: Sequence[int]) -> list[Recording]:
         """Simulates with a progress bar, as training waits for the first trajectories."""
         what = f"Simulating the first {len(indices)} trajectories of {self.preset.name}"
         with progress_bar(what, len(indices)) as advance:
+            return self._simulate(indices, advance)
 
-            def simulate(index: int) -> Recording:
-                recording = self[index]
+    def _simulate(self, indices: Sequence[int], advance: Callable[[], object] = lambda: None) -> list[Recording]:
+        entropies = [(self.seed, _STREAM, index) for index in indices]
+        recordings: dict[int, Recording] = {}
+        with closing(simulate_all(self.preset, entropies, self.workers, raise_if_abandoned)) as runs:
+            for number, run in runs:
+                trajectory = Trajectory(run.position, run.particle_type, run.attributes)
+                where = f"{self.preset.name}, simulated trajectory {indices[number]}"
+                recordings[number] = self.reader.recording(trajectory, where)
                 advance()
-                return recording
-
-            return map_in_threads(simulate, indices, self.workers)
+        return [recordings[number] for number in range(len(indices))]

@@ -1,4 +1,4 @@
-"""Where a datamodule's trajectories come from: a folder or the Hugging Face hub; `simulated_sources` has the others."""
+"""Where a datamodule's trajectories come from: a folder or the Hugging Face hub; `simulated` has the others."""
 
 from __future__ import annotations
 

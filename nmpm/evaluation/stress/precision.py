@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.data.seeds import try_seeds
+from nmpm.data.simulation import try_seeds
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.evaluation.stress.lines import Line, Size

@@ -12,7 +12,7 @@ from nmpm.data.generate import preset_metadata
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import Recording, RecordingReader
-from nmpm.data.seeds import try_seeds
+from nmpm.data.simulation import try_seeds
 from nmpm.emulator import Emulator
 from nmpm.emulator.calibrated import with_usual_gravity
 from nmpm.particles import Particles, Window
@@ -59,7 +59,7 @@ class Subject:
         return state.to(self.device)
 
     def entropies(self, count: int) -> list[tuple[int, int, int]]:
-        """Numbers that the seeds of scenes outside of any dataset are derived from, see `nmpm.data.seeds`."""
+        """Numbers that the seeds of scenes outside of any dataset are derived from, see `nmpm.data.simulation`."""
         return [(self.seed, _STREAM, index) for index in range(count)]
 
     def with_emulator(self, emulator: Emulator) -> Subject:

@@ -8,7 +8,7 @@ import torch
 from scenes import box, cloud
 
 from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
-from nmpm.data.seeds import seed_of_draw
+from nmpm.data.simulation import seed_of_draw
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
