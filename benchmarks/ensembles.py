@@ -30,8 +30,8 @@ from timing import make_parser, write_json
 from torch import Tensor
 
 from nmpm.emulator import Bundle, Emulator, RolloutContext, rollout
-from nmpm.emulator.gradients import Call, unroll_with_gradients
 from nmpm.emulator.rasterise import volume_fraction
+from nmpm.emulator.rollouts import Call, unroll_with_gradients
 from nmpm.metrics import MSE
 from nmpm.particles import Particles, Window
 from nmpm.training.augmentation import with_jitter

@@ -24,7 +24,7 @@ from torch import Tensor
 from nmpm._support.shipped import find_config
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Rollout
-from nmpm.emulator.gradients import recomputed
+from nmpm.emulator.rollouts import recomputed
 from nmpm.particles import Window
 from nmpm.training import EmulatorModule
 from nmpm.training.unrolling import Discount, unroll_training

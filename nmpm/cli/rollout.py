@@ -43,7 +43,7 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
     chosen = _parser().parse_args(words[1:])
     _check(chosen)
-    from nmpm.emulator.rollouts import warn_of_start_outside
+    from nmpm.emulator.input_checks import warn_of_start_outside
     from nmpm.zoo.registry import load_model
 
     model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime, chosen.precision)

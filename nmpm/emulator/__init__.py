@@ -1,10 +1,17 @@
 """The emulator: its recipe, the network between p2g and g2p, what its rollouts are held to, and rollouts themselves."""
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
-from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.model import NETWORK_PRECISIONS, Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
-from nmpm.emulator.rollouts import Rollout, predict_rollout, rollout, stream, stream_rollout, unroll
+from nmpm.emulator.rollouts import (
+    Rollout,
+    differentiable_rollout,
+    predict_rollout,
+    rollout,
+    stream,
+    stream_rollout,
+    unroll,
+)
 from nmpm.emulator.runtimes import Windows
 
 __all__ = [

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nmpm.decoders import Decoder
+from nmpm.emulator.bundle import BundleStart
 from nmpm.emulator.constraints import (
     BOUNDS,
     Constraints,
@@ -25,7 +26,6 @@ from nmpm.emulator.constraints import (
 )
 from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.crowding import Crowding
-from nmpm.emulator.departure import BundleStart
 from nmpm.emulator.support import Support
 from nmpm.grid import Grid
 from nmpm.scene import Scene

@@ -1,4 +1,4 @@
-"""What a call of the emulator predicts, and what stays the same between the calls of a rollout."""
+"""The bundle of frames that one call predicts: what it starts from, its result, and what a rollout's calls share."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from nmpm.emulator.fused.views import Views
@@ -13,6 +14,43 @@ from nmpm.particles import Particles
 
 if TYPE_CHECKING:
     from nmpm.emulator.fused.surroundings import Surroundings
+
+
+@dataclass(frozen=True)
+class BundleStart:
+    """The particles at the start of a bundle and the grids around them, in cells and cells per frame.
+
+    Args:
+        cells: (B, N, D) positions.
+        velocity: (B, N, D) the particles' own velocities.
+        gravity: (B, 1, D), what a frame adds to a velocity.
+        material: (B, N) indices into the scene's materials.
+        mask: (B, N) bool, False for padding.
+        state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
+        output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
+        scale: (m, C, 1, ...), by which it is multiplied.
+    """
+
+    cells: Tensor
+    velocity: Tensor
+    gravity: Tensor
+    material: Tensor
+    mask: Tensor
+    state: Tensor
+    output: Tensor
+    scale: Tensor
+
+    @property
+    def fields(self) -> Tensor:
+        """(B, m, C, *S), the predicted velocities, of the scale's precision."""
+        return self.output.to(torch.promote_types(self.scale.dtype, torch.float32)) * self.scale
+
+    @property
+    def filled(self) -> Tensor:
+        """(B, 1, *S), the volume fraction of all materials that the network has seen."""
+        velocities = self.output.shape[2]
+        materials = velocities // self.cells.shape[-1]
+        return self.state[:, velocities : velocities + materials].sum(1, keepdim=True)
 
 
 @dataclass(frozen=True)

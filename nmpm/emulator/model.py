@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -24,12 +25,12 @@ from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.fused.plan import make_plan
 from nmpm.emulator.fused.views import Views
+from nmpm.emulator.prediction import steps_for
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
-from nmpm.emulator.steps import steps_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
-from nmpm.processors import GridLayout
+from nmpm.processors import GridLayout, GridProcessor
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 """Precisions of the network in rollouts, by name; everything else computes in float32."""
+_LOG = logging.getLogger(__name__)
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
 
@@ -292,3 +294,24 @@ def _with_plain_names(_module: nn.Module, state: dict[str, Any], prefix: str, _l
     """Save a network that is wrapped by `torch.compile` as the plain one."""
     for name in [name for name in state if name.startswith(prefix + COMPILED)]:
         state[f"{prefix}processor.{name.removeprefix(prefix + COMPILED)}"] = state.pop(name)
+
+
+def compile_network(network: GridProcessor, grid: Tensor) -> bool:
+    """Compile a network in place; names and weights stay, and so do its checkpoints.
+
+    Args:
+        network: What to compile.
+        grid: (B, C_in, *S), an example of the input, to try it with.
+
+    Returns:
+        Whether it is compiled. Without a compiler, or if the network cannot be traced, it stays as it was.
+    """
+    network.compile()
+    try:
+        with torch.no_grad():
+            network(grid)
+    except Exception as error:  # (compilers document no exceptions)
+        network._compiled_call_impl = None
+        _LOG.warning("The network is not compiled: %s", str(error).splitlines()[0][:200])
+        return False
+    return True

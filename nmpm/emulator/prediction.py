@@ -1,9 +1,15 @@
-"""One call of an emulator: p2g, network, and m times g2p and advection; the parts around the network are `Steps`."""
+"""One call of an emulator: particles to the grid, network, and back through a bundle of frames.
+
+Around the network there are two implementations: tensor operations, for every device and with gradients, and the
+kernels of `nmpm.emulator.fused`. `steps_for` chooses. Only the network is computed by the emulator's runtime.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,53 +17,168 @@ import torch
 from torch import Tensor
 
 from nmpm._support.collectives import normal_like
-from nmpm.emulator.bundle import Bundle, RolloutContext
-from nmpm.emulator.departure import BundleStart
+from nmpm.emulator.bundle import Bundle, BundleStart, RolloutContext
+from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
+from nmpm.transfer.execution import kernels_take
 
 if TYPE_CHECKING:
+    from nmpm.emulator.fused.surroundings import Surroundings
     from nmpm.emulator.model import Emulator
-    from nmpm.emulator.steps import TensorSteps
 
 
-def predict_bundle(emulator: Emulator, steps: TensorSteps, particles: Particles, context: RolloutContext) -> Bundle:
-    """The next m frames, operation by operation; only the network is left to the runtime.
+class Steps(ABC):
+    """How an emulator's calls are computed."""
 
-    Args:
-        emulator: Gives network, statistics and units.
-        steps: What is computed around the network.
-        particles: The state to start from.
-        context: Of the rollout.
-    """
-    device = particles.position.device.type
-    with _full_precision(device):
-        cells, velocity, gravity, state = steps.rasterise(particles, context.solid)
-        normalised = emulator.normalise(state)
-        if emulator.training and emulator.recipe.grid_noise > 0:
-            normalised = normalised + emulator.recipe.grid_noise * normal_like(normalised)
+    def prepare_rollout(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
+        """What is prepared for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
+        return None
 
-    output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
-    with _full_precision(device):
-        velocities = len(emulator.scene.materials) * emulator.scene.dim  # channels of the output; then rates of fields
-        predicted, scale = output[:, :, :velocities], emulator.output_scale[:, :velocities]
-        start = BundleStart(cells, velocity, gravity, particles.material, particles.mask, state, predicted, scale)
-        path = steps.path(start, context)
-        fields: Mapping[str, Tensor] = {}
-        if emulator.scene.evolving:
-            rates = output[:, :, velocities:].to(emulator.precision) * emulator.output_scale[:, velocities:]
-            before = torch.cat([cells.unsqueeze(1), path[:, :-1]], dim=1)
-            gather = partial(emulator.advection.gather, material=particles.material)
-            fields = emulator.field_scales.evolve(particles, before, rates, gather)
-        step = path[:, -1] - (path[:, -2] if emulator.frames > 1 else cells)
-        if emulator.constraints.density_cap and not emulator.training:
-            # Spreading is no motion of the material: the velocity is that of the path without it.
-            path = steps.uncrowded(start, path, context)
-        precision = particles.position.dtype
-        last_velocity = emulator.grid.to_displacement(step.to(precision))
-        return Bundle(emulator.grid.to_length(path.to(precision)), last_velocity, fields)
+    @abstractmethod
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        """The next m frames, from these steps and the emulator's network."""
+
+
+@dataclass(frozen=True)
+class TensorSteps(Steps):
+    """The steps as tensor operations; subclasses replace some of them."""
+
+    emulator: Emulator
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        device = particles.position.device.type
+        with _full_precision(device):
+            cells, velocity, gravity, state = self.rasterise(particles, context.solid)
+            normalised = emulator.normalise(state)
+            if emulator.training and emulator.recipe.grid_noise > 0:
+                normalised = normalised + emulator.recipe.grid_noise * normal_like(normalised)
+        output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
+        with _full_precision(device):
+            velocities = len(emulator.scene.materials) * emulator.scene.dim  # channels; then rates of fields
+            predicted, scale = output[:, :, :velocities], emulator.output_scale[:, :velocities]
+            start = BundleStart(cells, velocity, gravity, particles.material, particles.mask, state, predicted, scale)
+            path = self.path(start, context)
+            fields: Mapping[str, Tensor] = {}
+            if emulator.scene.evolving:
+                rates = output[:, :, velocities:].to(emulator.precision) * emulator.output_scale[:, velocities:]
+                before = torch.cat([cells.unsqueeze(1), path[:, :-1]], dim=1)
+                gather = partial(emulator.advection.gather, material=particles.material)
+                fields = emulator.field_scales.evolve(particles, before, rates, gather)
+            step = path[:, -1] - (path[:, -2] if emulator.frames > 1 else cells)
+            if emulator.constraints.density_cap and not emulator.training:
+                # Spreading is no motion of the material: the velocity is that of the path without it.
+                path = self.uncrowded(start, path, context)
+            precision = particles.position.dtype
+            last_velocity = emulator.grid.to_displacement(step.to(precision))
+            return Bundle(emulator.grid.to_length(path.to(precision)), last_velocity, fields)
+
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Particles in grid units, and the grid state.
+
+        Args:
+            particles: In domain length.
+            solid: (B, C_solid, *S).
+
+        Returns:
+            (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) state.
+        """
+        model = self.emulator
+        cells, velocity, gravity = model.in_cells(particles)
+        state = grid_state(
+            model.scene, model.grid, model.transfer, particles, cells, velocity, solid, model.field_scales
+        )
+        return cells, velocity, gravity, state
+
+    def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
+        """(B, m, N, D) positions in cells, which obey the emulator's constraints."""
+        advection = self.emulator.advection
+        if self.emulator.training:
+            return advection.free_path(start)
+        return advection.constrained_path(start, context.solid, context.budget)
+
+    def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
+        """The path (B, m, N, D) with its overfull cells spread, see `Advection.uncrowded_path`."""
+        return self.emulator.advection.uncrowded_path(start, path, context.solid, context.budget)
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
     """A context without autocast; entering one where none is on would cost as much as a small operation."""
     on = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
     return torch.autocast(device, enabled=False) if on else nullcontext()
+
+
+@dataclass(frozen=True)
+class FusedSteps(Steps):
+    """All steps as kernels; only for what `steps_for` gives them to.
+
+    Args:
+        plan: Of the emulator.
+        walls: (*S), the share of each cell that is wall.
+    """
+
+    plan: Plan
+    walls: Tensor
+
+    def prepare_rollout(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
+        from nmpm.emulator.fused.surroundings import survey_rollout  # imported late, as Numba is
+
+        return survey_rollout(self.plan, solid, self.walls)
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        from nmpm.emulator.fused.direct import predict
+
+        return predict(emulator, self.plan, particles, context)
+
+
+@dataclass(frozen=True)
+class TrainingSteps(TensorSteps):
+    """The steps of trainings as kernels with gradients; only for what `steps_for` gives them to.
+
+    Args:
+        plan: Of the emulator.
+    """
+
+    plan: Plan
+
+    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        from nmpm.emulator.fused.training import Rasterise
+
+        own = particles
+        cells, velocity, gravity, state = Rasterise.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
+            self.plan, own.position, own.velocity, own.gravity, own.material, own.mask, solid
+        )
+        return cells, velocity, gravity, state
+
+    def path(self, start: BundleStart, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
+        from nmpm.emulator.fused.training import FreePath
+
+        path: Tensor = FreePath.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
+            self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
+            start.output, start.scale,
+        )  # fmt: skip
+        return path
+
+
+def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid: Tensor) -> Steps:
+    """The kernels where they can do what is asked for, else tensor operations.
+
+    Kernels run on a CPU, in float32, for the parts of this package (`make_plan`) and outside of `without_kernels`:
+    in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation mode those without.
+    Graphs that `torch.compile` traces take tensor operations.
+    """
+    own = (particles.position, particles.velocity)
+    fixed = (particles.gravity, solid)
+    kernels = plan is not None and emulator.precision == torch.float32 and kernels_take(*own, particles.gravity)
+    if plan is None or not kernels or torch.compiler.is_compiling():
+        return TensorSteps(emulator)
+    if emulator.training:
+        covered = plan.trains and not _needs_gradients(*fixed)
+        return TrainingSteps(emulator, plan) if covered else TensorSteps(emulator)
+    if _needs_gradients(*own, *fixed, *emulator.parameters()):
+        return TensorSteps(emulator)
+    return FusedSteps(plan, emulator.walls)
+
+
+def _needs_gradients(*tensors: Tensor) -> bool:
+    return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.numbers import check_whole
-from nmpm.emulator.bundle import Bundle
+from nmpm.emulator.bundle import Bundle, RolloutContext
+from nmpm.emulator.input_checks import check_inputs, warn_of_training_mode
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.periods import Periods
-from nmpm.errors import DataError
 from nmpm.particles import Particles
-from nmpm.scene import Scene
 from nmpm.transfer.execution import is_eager_cpu
 
-ROUNDING = 1e-3
-"""Cells by which particles may start outside of the bounds without a warning."""
+Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
 
 
 def unroll(
@@ -106,123 +104,6 @@ def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
         return False
     pairs += [(before.fields[name], values) for name, values in after.fields.items()]
     return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
-
-
-class _Numbers(NamedTuple):
-    """Numbers of a state that must be finite.
-
-    Args:
-        place: What an error calls one of them, with the index into K.
-        values: (B, K, V).
-        counts: (B, K) bool, False for padding.
-    """
-
-    place: str
-    values: Tensor
-    counts: Tensor
-
-    @property
-    def wrong(self) -> Tensor:
-        """(B, K) bool."""
-        return ~self.values.isfinite().all(-1) & self.counts
-
-
-def _state_numbers(particles: Particles) -> list[_Numbers]:
-    real = particles.mask
-    vectors = {name: getattr(particles, name) for name in ("position", "velocity")}
-    numbers = {name: values.unsqueeze(-1) for name, values in particles.fields.items()}
-    return [
-        *(
-            _Numbers(f"particle {{}}: its {name}", values.expand(*real.shape, -1), real)
-            for name, values in (vectors | numbers).items()
-        ),
-        _Numbers("obstacle particle {}: its position", particles.obstacle, particles.obstacle_mask),
-        _Numbers("its gravity", particles.gravity.unsqueeze(1), torch.ones_like(real[:, :1])),
-    ]
-
-
-def check_inputs(emulator: Emulator, particles: Particles) -> None:
-    """Reject emulators with non-finite weights, and states that are non-finite or outside of the domain.
-
-    All checks are read back from the device at once; details are computed only if one fails.
-
-    Args:
-        emulator: Is to predict.
-        particles: The state to start from.
-
-    Raises:
-        DataError: naming the weight or statistic; or scene, particle and value.
-    """
-    real, materials = particles.mask, emulator.scene.materials
-    numbers = _state_numbers(particles)
-    wrong = [given.wrong for given in numbers]
-    beyond = beyond_walls(emulator.scene, particles.position) & real
-    unknown = ((particles.material < 0) | (particles.material >= len(materials))) & real
-    weights = emulator.state_dict()
-    unsound = [~values.isfinite().all() for values in weights.values()]
-    checks = [torch.stack(unsound).any(), *(bad.any() for bad in (*wrong, unknown, beyond))]
-    if not bool(torch.stack(checks).any()):
-        return
-    for name, bad in zip(weights, unsound, strict=True):
-        if bad:
-            raise DataError(f"The emulator's {name} holds values that are not finite: load a sound checkpoint.")
-    for given, bad in zip(numbers, wrong, strict=True):
-        if bad.any():
-            scene, index = map(int, bad.nonzero()[0])
-            raise DataError(
-                f"Scene {scene} of the batch, {given.place.format(index)} is {given.values[scene, index].tolist()}; it"
-                " must be finite."
-            )
-    if unknown.any():
-        scene, particle = map(int, unknown.nonzero()[0])
-        kind = int(particles.material[scene, particle])
-        raise DataError(
-            f"Scene {scene} of the batch, particle {particle}: its material is {kind}; it must be an index, from 0,"
-            f" into the model's {len(materials)} ({', '.join(materials)})."
-        )
-    scene, particle = map(int, beyond.nonzero()[0])
-    raise DataError(
-        f"Scene {scene} of the batch, particle {particle}: it is at {particles.position[scene, particle].tolist()},"
-        f" outside of the domain {list(emulator.scene.domain)} ({int(beyond.sum())} particles are)."
-    )
-
-
-def warn_of_training_mode(emulator: Emulator) -> None:
-    """Warn of an emulator in training mode, such as a module's own, whose rollouts would be other than intended."""
-    held = emulator.constraints
-    constrained = held.energy or held.rest_speed or held.density_cap or (held.solids and emulator.scene.obstacles)
-    if emulator.training and (constrained or emulator.recipe.grid_noise):
-        warnings.warn(
-            "The emulator is in training mode, in which rollouts obey none of its constraints but the bounds, and the"
-            " network's input gets the noise of trainings: call emulator.eval() first.",
-            stacklevel=4,
-        )
-
-
-def warn_of_start_outside(emulator: Emulator, particles: Particles) -> None:
-    """Warn of particles that start outside of the bounds by more than rounding: the first frame moves them in."""
-    scene = emulator.scene
-    sides = [
-        torch.zeros_like(column) if wraps else torch.maximum(low - column, column - high)
-        for column, (low, high), wraps in zip(particles.position.unbind(-1), scene.bounds, scene.periodic, strict=True)
-    ]
-    apart = torch.stack(sides).amax(0).masked_fill(~particles.mask, 0.0)
-    outside = apart > ROUNDING * min(emulator.grid.spacing)
-    if outside.any():
-        warnings.warn(
-            f"{int(outside.sum())} of {int(particles.mask.sum())} particles start outside of the bounds"
-            f" {list(scene.bounds)}, by up to {float(apart.max()):.3g}: rollouts move them in.",
-            stacklevel=4,
-        )
-
-
-def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
-    """Whether positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
-    sides = [
-        torch.zeros_like(column, dtype=torch.bool) if wraps else (column < low) | (column > high)
-        for column, (low, high), wraps in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True)
-    ]
-    return torch.stack(sides).any(0)
 
 
 class Rollout(NamedTuple):
@@ -327,3 +208,73 @@ def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monit
         return Rollout.join(parts)
     none = particles.position.new_zeros(batch, frames, *rest)  # of no scene, or of no frame
     return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
+
+
+def unroll_with_gradients(
+    emulator: Emulator,
+    particles: Particles,
+    bundles: int,
+    call: Call,
+    state_after: Callable[[Bundle, Particles], Particles] = Bundle.state_after,
+) -> Iterator[Bundle]:
+    """Predict bundle after bundle, each from the last, with gradients.
+
+    Args:
+        emulator: Predicts m frames a call.
+        particles: The state to start from.
+        bundles: How many calls to make.
+        call: Makes one, such as `recomputed`.
+        state_after: What the next call starts from, of a bundle and of what it started from.
+    """
+    context = emulator.context(particles)
+    for _ in range(bundles):
+        bundle = call(emulator, particles, context)
+        yield bundle
+        particles = state_after(bundle, particles)
+
+
+def recomputed(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+    """A call of the emulator that keeps no activations: backward passes compute it again.
+
+    The memory of several is that of one and of the states between them, for the time of one more forward pass.
+    """
+    bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
+    return bundle
+
+
+def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
+    """Predict `frames` frames with gradients to the state: its positions, velocities, obstacles and gravity.
+
+    The trajectories of liquids are chaotic: over long rollouts gradients grow without bound and say less and less.
+    Optimise over the shortest horizon that the purpose allows, clip gradients, or average them over several slightly
+    different states of a batch.
+
+    Args:
+        emulator: In evaluation mode; its own parameters should not require gradients
+            (`emulator.requires_grad_(False)`), which saves time.
+        particles: The state to start from, see `Pretrained.state`, which keeps gradients of what it is given.
+        frames: How many frames to predict, at least 1.
+
+    Returns:
+        (B, frames, N, D) positions in domain length.
+
+    Raises:
+        ConfigError: if `frames` is below 1, or no whole number.
+        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+
+    Warns:
+        UserWarning: if the emulator is in training mode, in which constraints do not act.
+    """
+    frames = check_whole("frames", frames, 1)
+    warn_of_training_mode(emulator)
+    with torch.no_grad():
+        check_inputs(emulator, particles)
+    periods = Periods(emulator)
+    bundles = unroll_with_gradients(
+        emulator,
+        periods.wrap(particles),
+        -(-frames // emulator.frames),
+        recomputed,
+        lambda bundle, start: periods.wrap(bundle.state_after(start)),
+    )
+    return torch.cat([periods.unwrapped(bundle).position for bundle in bundles], dim=1)[:, :frames]

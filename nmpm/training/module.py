@@ -20,10 +20,10 @@ from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
 from nmpm.emulator import Emulator, EmulatorRecipe, Rollout, predict_rollout
 from nmpm.emulator.calibration import calibrate
-from nmpm.emulator.compilation import compile_network
 from nmpm.emulator.fields import warn_of_ignored
-from nmpm.emulator.gradients import recomputed
+from nmpm.emulator.model import compile_network
 from nmpm.emulator.recipe import FORMAT, check_format
+from nmpm.emulator.rollouts import recomputed
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric, overall_error

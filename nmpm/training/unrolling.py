@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator import Bundle, Emulator, RolloutContext
-from nmpm.emulator.gradients import Call, unroll_with_gradients
+from nmpm.emulator.rollouts import Call, unroll_with_gradients
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
@@ -29,7 +29,7 @@ def unroll_training(
         emulator: In training mode.
         particles: The state to start from.
         bundles: K, how many calls to make.
-        call: Makes one: `direct`, or `nmpm.emulator.gradients.recomputed` to save memory.
+        call: Makes one: `direct`, or `nmpm.emulator.rollouts.recomputed` to save memory.
         discount: Hands states from bundle to bundle.
     """
     return unroll_with_gradients(

@@ -16,8 +16,8 @@ from nmpm._support.devices import find_device
 from nmpm._support.numbers import check_whole
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, differentiable_rollout, predict_rollout
-from nmpm.emulator.calibrated import with_usual_gravity
-from nmpm.emulator.rollouts import warn_of_start_outside
+from nmpm.emulator.calibration import with_usual_gravity
+from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.runtimes import Runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nmpm.emulator import EmulatorRecipe
-from nmpm.emulator.calibrated import calibrated_range, gravity_range, usual_gravity, with_usual_gravity
+from nmpm.emulator.calibration import calibrated_range, gravity_range, usual_gravity, with_usual_gravity
 from nmpm.processors import Pointwise
 from tests.scenes import box, cloud, set_gravity_statistics
 

@@ -10,8 +10,7 @@ from scenes import box, cloud
 from nmpm.decoders import Absolute, Acceleration, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, lowest_potential, mass_shares
-from nmpm.emulator.gradients import differentiable_rollout
-from nmpm.emulator.rollouts import rollout, unroll
+from nmpm.emulator.rollouts import differentiable_rollout, rollout, unroll
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import Pointwise, UNet
 from nmpm.transfer import without_kernels
@@ -122,7 +121,7 @@ def test_equal_densities_are_as_none():
 
 def limited_everywhere(monkeypatch):
     """As on a GPU: nothing is decided by reading values back, and no kernel of the CPU runs."""
-    monkeypatch.setattr("nmpm.emulator.steps.kernels_take", lambda *_: False)
+    monkeypatch.setattr("nmpm.emulator.prediction.kernels_take", lambda *_: False)
     for module in ("advection", "contact"):
         monkeypatch.setattr(f"nmpm.emulator.{module}.is_eager_cpu", lambda values: False)
 
@@ -169,7 +168,7 @@ def test_chunks_of_particles_share_one_energy(monkeypatch):
     scene = box()
     emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
     emulator.output_scale.mul_(3.0)
-    monkeypatch.setattr("nmpm.emulator.steps.kernels_take", lambda *_: False)
+    monkeypatch.setattr("nmpm.emulator.prediction.kernels_take", lambda *_: False)
     whole = rollout(emulator, particles, 12)
     in_sevens = lambda count, device, values=1: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
     monkeypatch.setattr("nmpm.emulator.advection.chunks", in_sevens)

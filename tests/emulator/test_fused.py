@@ -16,8 +16,8 @@ from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.fused.direct import DirectCall
+from nmpm.emulator.prediction import FusedSteps, TensorSteps, steps_for
 from nmpm.emulator.rollouts import rollout
-from nmpm.emulator.steps import FusedSteps, TensorSteps, steps_for
 from nmpm.particles import Particles
 from nmpm.processors import Pointwise, UNet
 from nmpm.transfer import Linear, Nearest, Quadratic, without_kernels

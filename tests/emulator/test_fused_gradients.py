@@ -11,7 +11,7 @@ from scenes import box, cloud
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.steps import TensorSteps, TrainingSteps, steps_for
+from nmpm.emulator.prediction import TensorSteps, TrainingSteps, steps_for
 from nmpm.particles import Window
 from nmpm.processors import Pointwise
 from nmpm.training.losses import TrainingError

@@ -10,8 +10,8 @@ from scenes import box, cloud
 from nmpm.decoders import Absolute, Acceleration, Blend
 from nmpm.emulator import Emulator, EmulatorRecipe, rollout
 from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.prediction import TensorSteps
 from nmpm.emulator.runtimes import Triton, cuda_graph
-from nmpm.emulator.steps import TensorSteps
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import UNet

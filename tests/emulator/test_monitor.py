@@ -9,8 +9,9 @@ from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Flip
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
+from nmpm.emulator.input_checks import check_inputs
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
-from nmpm.emulator.rollouts import check_inputs, rollout, stream
+from nmpm.emulator.rollouts import rollout, stream
 from nmpm.errors import DataError
 from nmpm.processors import Pointwise
 

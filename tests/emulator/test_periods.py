@@ -9,9 +9,8 @@ from scenes import box, cloud
 from nmpm.decoders import Flip, Residual
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.gradients import differentiable_rollout
 from nmpm.emulator.monitor import Monitor, Policy
-from nmpm.emulator.rollouts import rollout
+from nmpm.emulator.rollouts import differentiable_rollout, rollout
 from nmpm.processors import Identity, Pointwise
 
 PERIOD = 0.8

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import unroll
-from nmpm.emulator.gradients import recomputed
+from nmpm.emulator.rollouts import recomputed
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.processors import UNet

@@ -26,7 +26,7 @@ ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
 @dataclass(frozen=True)
 class SceneArrays:
-    """One scene of an `emulator.departure.BundleStart`; shapes as in `flight.fly`."""
+    """One scene of an `emulator.bundle.BundleStart`; shapes as in `flight.fly`."""
 
     cells: Array
     velocity: Array

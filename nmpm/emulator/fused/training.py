@@ -75,7 +75,7 @@ class FreePath(torch.autograd.Function):
         ctx: Any, plan: Plan, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor,
         state: Tensor, output: Tensor, scale: Tensor,
     ) -> Tensor:  # fmt: skip
-        """(B, m, N, D) positions in cells; arguments as of `emulator.departure.BundleStart`."""
+        """(B, m, N, D) positions in cells; arguments as of `emulator.bundle.BundleStart`."""
         starts = _Starts(plan, cells, velocity, gravity, material, mask, state, output, scale)
         check_materials(plan, starts.material)
         path = np.empty((len(cells), output.shape[1], *cells.shape[1:]), np.float32)

@@ -9,14 +9,13 @@ import torch
 import triton
 from torch import Tensor
 
-from nmpm.emulator.bundle import RolloutContext
+from nmpm.emulator.bundle import BundleStart, RolloutContext
 from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
 from nmpm.emulator.contact import SURFACE, obstacle_share
 from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
-from nmpm.emulator.departure import BundleStart
 from nmpm.emulator.fused.plan import Plan
 from nmpm.emulator.gpu import contact, crowding, flight, grid
-from nmpm.emulator.steps import TensorSteps
+from nmpm.emulator.prediction import TensorSteps
 from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
 from nmpm.particles import Particles
 
@@ -29,7 +28,7 @@ _COLUMNS = 16
 
 @dataclass(frozen=True)
 class TritonSteps(TensorSteps):
-    """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.triton` takes. States are contiguous.
+    """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.Triton` takes. States are contiguous.
 
     Args:
         plan: Of the emulator.

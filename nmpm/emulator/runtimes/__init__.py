@@ -9,11 +9,9 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from nmpm._support.messages import one_line, suggestion
-from nmpm.emulator.runtimes.base import Runtime
-from nmpm.emulator.runtimes.cuda_graph import CudaGraph
-from nmpm.emulator.runtimes.eager import Eager
+from nmpm.emulator.runtimes.cuda_graph import CudaGraph, Triton
 from nmpm.emulator.runtimes.openvino import OpenVINO
-from nmpm.emulator.runtimes.triton import Triton
+from nmpm.emulator.runtimes.runtime import Eager, Runtime
 from nmpm.emulator.runtimes.windows import Windows
 from nmpm.errors import ConfigError
 

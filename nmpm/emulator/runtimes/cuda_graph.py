@@ -7,17 +7,18 @@ launches them all at once. Shapes are fixed: each batch and number of particles 
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
-from nmpm.emulator.runtimes.base import Runtime, refuse_gradients
-from nmpm.emulator.runtimes.eager import Eager
 from nmpm.emulator.runtimes.programs import Programs
+from nmpm.emulator.runtimes.runtime import Eager, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
+from nmpm.transfer import Linear
 from nmpm.transfer.execution import is_default
 
 if TYPE_CHECKING:
@@ -73,6 +74,41 @@ class CudaGraph(Runtime):
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
         """The bundle that is recorded."""
         return emulator.predict(particles, context)
+
+
+class Triton(CudaGraph):
+    """Records kernels in Triton around the network; chosen by name alone, as no GPU has confirmed them yet."""
+
+    name: ClassVar[str] = "triton"
+    automatic: ClassVar[bool] = False
+
+    def unsupported_reason(self, emulator: Emulator) -> str:
+        scene, bounds = emulator.scene, emulator.constraints.bounds
+        rules = {
+            f"{scene.dim} dimensions": scene.dim != 2,
+            f"fields ({', '.join(scene.fields)})": bool(scene.fields),
+            f"the transfer {type(emulator.transfer).__name__}": type(emulator.transfer) is not Linear,
+            f"constraints.bounds {bounds}": bounds != "stop",
+            f"the decoder {type(emulator.decoder).__name__}, or for bounds so far off": emulator._plan is None,
+            f"{emulator.precision}": emulator.precision != torch.float32,
+            "deterministic algorithms": torch.are_deterministic_algorithms_enabled(),
+        }
+        if emulator.device.type != "cuda":
+            return f"The runtime triton needs a CUDA GPU; the model is on {emulator.device}."
+        for reason, holds in rules.items():
+            if holds:
+                return f"The runtime triton has no kernels for {reason}: use cuda-graph or eager."
+        if importlib.util.find_spec("triton") is None:
+            return "The runtime triton needs Triton, which comes with torch's builds for CUDA: pip install triton."
+        return ""
+
+    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+        from nmpm.emulator.gpu.steps import TritonSteps
+
+        if emulator._plan is None:
+            raise ConfigError(self.unsupported_reason(emulator))
+        steps = TritonSteps(emulator, emulator._plan)
+        return steps.predict(emulator, particles.map(Tensor.contiguous), context)
 
 
 class Recorded:

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from nmpm._support.messages import one_line
 from nmpm._support.signal_stack import kept_signal_stack
-from nmpm.emulator.runtimes.base import Runtime, refuse_gradients
 from nmpm.emulator.runtimes.programs import Programs
+from nmpm.emulator.runtimes.runtime import Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
 

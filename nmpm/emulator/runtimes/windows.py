@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.emulator.runtimes.base import Runtime, refuse_gradients
-from nmpm.emulator.runtimes.eager import Eager
 from nmpm.emulator.runtimes.grid_crops import BLOCK, CALL_CELLS, Axis, Blocks, GridCrop, cover_blocks, predict_on_crops
+from nmpm.emulator.runtimes.runtime import Eager, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
-from nmpm.emulator.calibrated import with_usual_gravity
+from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.rollouts import rollout
 from nmpm.evaluation.stress.lines import Line, Size
 from nmpm.evaluation.stress.subject import Subject

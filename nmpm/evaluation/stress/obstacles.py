@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nmpm.data.initial_states import lattice, state_at_rest
-from nmpm.emulator.calibrated import with_usual_gravity
+from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
 from nmpm.evaluation.stress.lines import Line, Size

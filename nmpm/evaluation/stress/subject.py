@@ -14,7 +14,7 @@ from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import Recording, RecordingReader
 from nmpm.data.simulation import try_seeds
 from nmpm.emulator import Emulator
-from nmpm.emulator.calibrated import with_usual_gravity
+from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.particles import Particles, Window
 from nmpm.sim import Preset
 

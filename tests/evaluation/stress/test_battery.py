@@ -12,7 +12,8 @@ from nmpm.data.simulation import seed_of_draw
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.rollouts import beyond_walls, rollout
+from nmpm.emulator.input_checks import beyond_walls
+from nmpm.emulator.rollouts import rollout
 from nmpm.errors import UnstableError
 from nmpm.evaluation.stress import GROUPS, Line, Size, Subject, battery
 from nmpm.evaluation.stress.precision import growth, nudge

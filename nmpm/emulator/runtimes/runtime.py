@@ -1,13 +1,15 @@
-"""The contract of runtimes."""
+"""The contract of runtimes, and the runtime of torch itself, which takes every network, device and precision."""
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
+from nmpm._support.devices import computes_bfloat16
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
 
@@ -56,6 +58,22 @@ class Runtime(ABC):
 
     def __reduce__(self) -> tuple[type[Self], tuple[()]]:
         return type(self), ()
+
+
+class Eager(Runtime):
+    """Calls the network."""
+
+    name: ClassVar[str] = "eager"
+    fixed_shapes: ClassVar[bool] = False
+
+    def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
+        if precision == torch.bfloat16 and not computes_bfloat16(grid.device):
+            warnings.warn(
+                "This processor has no instructions for bfloat16: torch is slower in it than in float32.",
+                stacklevel=2,
+            )
+        out: Tensor = network(grid.to(precision))
+        return out
 
 
 def refuse_gradients(runtime: Runtime, network: nn.Module, *inputs: Tensor) -> None:
