@@ -212,7 +212,7 @@ def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):
         for number in (1, 3):
             torch.set_num_threads(number)
             start = call.rasterise(particles)
-            positions.append(call.finish(start, call.path(start, output, None)).position)
+            positions.append(call.finish(start, call.path(start, output)).position)
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(*positions)

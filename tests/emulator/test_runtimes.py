@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.emulator import Emulator, EmulatorRecipe, rollout
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.runtimes import RUNTIMES, CudaGraph, Eager, cuda_graph, eager, find_runtime
+from nmpm.emulator.runtimes import RUNTIMES, CudaGraph, Eager, cuda_graph, find_runtime, runtime
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.errors import ConfigError
 from nmpm.processors import Pointwise, UNet
@@ -36,7 +36,7 @@ def test_a_runtime_is_found_by_name_and_another_is_refused_with_the_known_ones()
 
 
 def test_torch_in_bfloat16_without_instructions_for_it_warns(monkeypatch):
-    monkeypatch.setattr(eager, "computes_bfloat16", lambda device: device.type != "cpu")
+    monkeypatch.setattr(runtime, "computes_bfloat16", lambda device: device.type != "cpu")
     with pytest.warns(UserWarning, match="no instructions for bfloat16: torch is slower in it than in float32"):
         emulator_of().with_network(torch.bfloat16)(cloud(box()))
     with warnings.catch_warnings():
