@@ -20,7 +20,7 @@ from timing import Spread, describe_machine, make_timing_parser, time_alternatin
 from nmpm.emulator import Emulator, rollout
 from nmpm.emulator.runtimes import find_runtime
 from nmpm.zoo import Pretrained, Zoo
-from nmpm.zoo.speed import repeat_scene, thrown_scene
+from nmpm.zoo.measures.speed import repeat_scene, thrown_scene
 
 GRAPHS = ("cuda-graph", "triton")
 BUNDLES = 4

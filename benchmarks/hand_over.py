@@ -25,8 +25,8 @@ from timing import make_parser, write_json
 
 from nmpm.sim import InitialState, Preset
 from nmpm.zoo import Zoo
+from nmpm.zoo.measures.scenes import iterate_test_scenes, simulation_of
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.scenes import iterate_test_scenes, simulation_of
 
 Array = NDArray[Any]
 

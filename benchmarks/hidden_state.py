@@ -27,8 +27,8 @@ from nmpm.errors import DataError
 from nmpm.particles import Window
 from nmpm.sim import InitialState, Preset
 from nmpm.zoo import Zoo
+from nmpm.zoo.measures.scenes import iterate_test_scenes, simulation_of
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.scenes import iterate_test_scenes, simulation_of
 
 Array = NDArray[Any]
 _INSIDE = 1e-7

@@ -38,7 +38,7 @@ if not ROOT.is_dir():
 SCRIPTS = sorted(path.stem for path in ROOT.glob("*.py") if 'if __name__ == "__main__":' in path.read_text())
 WITHOUT_DEVICE = {"exported", "fused_steps", "gallery", "padding", "recipes", "runtimes", "scene_costs", "windows"} | {
     "against_recordings", "beside_simulator", "bodies", "busy", "calibration", "call_profile", "cropping", "dam_break",
-    "ensembles", "former_entries", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state",
+    "ensembles", "generalisation", "gns", "gradient_shares", "hand_over", "hidden_state",
     "installed_wheel", "kills", "precision_steps", "random_commits", "recipe_pictures", "run_time_knob",
     "settled_shape", "simulators", "stable_substeps", "stiffness", "trade_tables", "trades", "where_emulation_pays",
 }  # fmt: skip
@@ -510,34 +510,6 @@ def test_tables_name_the_weights_that_were_measured_and_those_that_the_zoo_has_r
     line = weights_line([Choice(row, {}) for row in rows], {"goop": "aaa", "goop/fast": "ddd"}.get)
     assert line == "Weights: goop aaa, goop/fast bbb (the zoo has others by now), runs-mine ccc."
     assert weights_line([Choice({"model": "goop"}, {})], {"goop": "aaa"}.get) == ""
-
-
-# ---- former entries of the zoo
-
-
-def made_card(errors, seed=0):
-    return {
-        "training": {"seconds": 3600.0},
-        "simulation": {"seed": seed},
-        "per_trajectory": [{"mse@32": error, "mse@100": error, "mse": error} for error in errors],
-    }
-
-
-def test_former_entries_are_compared_scene_by_scene():
-    from former_entries import table_lines
-
-    scenes = np.geomspace(1e-4, 1e-1, 20)  # their scatter is much larger than the gain, which is the same in all
-    lines = list(table_lines({"goop": (made_card(scenes), made_card(0.8 * scenes))}))
-    assert lines[2].startswith("| `goop` | 1.0 | 1.0 | ")
-    assert lines[2].count("(0.80: 0.80–0.80)") == 3
-
-
-def test_former_entries_of_other_test_scenes_are_refused():
-    from former_entries import table_lines
-
-    for other in (made_card([1.0, 2.0], seed=1), made_card([1.0])):
-        with pytest.raises(ConfigError, match="test scenes"):
-            list(table_lines({"goop": (made_card([1.0, 2.0]), other)}))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "trade").glob("*.yaml")), ids=lambda path: path.stem)

@@ -21,7 +21,6 @@ from nmpm.zoo import Zoo
 
 SMALL = UNet(width=4, depth=1, perceptron=(4,))
 HELD = {"energy": True, "bounds": "reflect", "rest_speed": 0.01}
-ENTRIES = Path(__file__).parent / "golden" / "zoo"
 
 
 def emulator_of(scene, processor: Processor = SMALL, transfer: Transfer = Linear(), **held) -> Emulator:
@@ -81,7 +80,7 @@ def test_cuda_graphs_give_what_operations_one_by_one_give(device, held):
 
 @pytest.mark.parametrize("name", ["goop", "waterramps"])
 def test_a_model_of_the_zoo_rolls_out_as_on_the_cpu(device, name):
-    here, there = Zoo.load(ENTRIES / name).emulator, Zoo.load(ENTRIES / name, device=device).emulator
+    here, there = Zoo.load(name).emulator, Zoo.load(name, device=device).emulator
     particles = cloud(here.scene, 200, speed=0.0)
     cell = min(here.grid.spacing)
     gap = rollout(there, particles.to(device), 16).cpu() - rollout(here, particles, 16)

@@ -100,8 +100,10 @@ def parse_yaml(text: str, where: Path | str) -> dict[str, Any]:
 
 
 def to_yaml(content: Mapping[str, Any]) -> str:
-    """The text that `parse_yaml` reads as this content."""
-    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    """The text that `parse_yaml` reads as this content, lists and mappings of plain values in a line each."""
+    return yaml.dump(
+        dict(content), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120, default_flow_style=None
+    )
 
 
 @dataclass

@@ -67,11 +67,6 @@ def join_hardware(*names: str) -> str:
     return "; ".join(dict.fromkeys(part for name in names for part in name.split("; ") if part))
 
 
-def same_hardware(one: str, other: str) -> bool:
-    """Whether two results of `device_name` name the same; earlier versions of it wrote "1 threads"."""
-    return one.replace(", 1 threads", ", 1 thread") == other.replace(", 1 threads", ", 1 thread")
-
-
 def processor_name() -> str:
     """The model of this machine's processor."""
     try:

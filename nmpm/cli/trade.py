@@ -126,7 +126,7 @@ def _models_of(dataset: str) -> dict[str, Emulator]:
     """The zoo's models of a simulated dataset by name; damaged ones are left out, and named on stderr."""
     from nmpm.errors import ZooError
     from nmpm.zoo import Zoo, load_model
-    from nmpm.zoo.pretrained import preset_of
+    from nmpm.zoo.card import preset_of
 
     found = {}
     for name in Zoo.list():

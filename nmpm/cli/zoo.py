@@ -78,9 +78,6 @@ def _parser() -> argparse.ArgumentParser:
         " twin and floor (the simulator beside itself), stress; invariants: the stress tests without the simulator,"
         " where its scenes would take hours",
     )
-    refresh.add_argument(
-        "--half", action="store_true", help="store the network's weights in float16 where a rollout does not notice"
-    )
     refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its test scenes")
     refresh.add_argument(
         "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
@@ -101,7 +98,7 @@ def _parser() -> argparse.ArgumentParser:
 def _list(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ZooError
-    from nmpm.zoo.lifecycle import lifecycle
+    from nmpm.zoo.card import lifecycle
     from nmpm.zoo.registry import Zoo
 
     for name in Zoo.list(chosen.root):
@@ -126,8 +123,8 @@ def _summary(card: Mapping[str, Any]) -> str:
 def _card(chosen: argparse.Namespace) -> None:
     from nmpm._support.bounded_files import to_yaml
     from nmpm.errors import ZooError
-    from nmpm.zoo.cards import MALFORMED, readme
     from nmpm.zoo.entries import read_card
+    from nmpm.zoo.pages import MALFORMED, entry_page
     from nmpm.zoo.registry import find_entry
 
     card = read_card(find_entry(chosen.name, chosen.root))
@@ -135,7 +132,7 @@ def _card(chosen: argparse.Namespace) -> None:
         sys.stdout.write(to_yaml(card))
         return
     try:
-        text = readme(card)
+        text = entry_page(card)
     except MALFORMED as error:
         raise ZooError(
             f"The card of {chosen.name} is not complete ({error}): `nmpm zoo card {chosen.name} --yaml` shows what it"
@@ -168,8 +165,8 @@ def _verify(chosen: argparse.Namespace) -> int:
     Of all, a damaged one counts as a figure that is not confirmed.
     """
     from nmpm.errors import ConfigError, NmpmError
-    from nmpm.zoo.registry import Zoo
-    from nmpm.zoo.verification import verify
+    from nmpm.zoo.registry import Zoo, find_entry
+    from nmpm.zoo.verification import verify_entry
 
     _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
     check_device(chosen.device)
@@ -177,7 +174,7 @@ def _verify(chosen: argparse.Namespace) -> int:
     for name in Zoo.list(chosen.root) if chosen.name is None else [chosen.name]:
         sys.stdout.write(f"{name}\n")
         try:
-            for check in verify(Zoo.load(name, chosen.root, chosen.device), chosen.full, chosen.data):
+            for check in verify_entry(find_entry(name, chosen.root), chosen.full, chosen.data, chosen.device):
                 sys.stdout.write(f"  {check}\n")
                 failed += not check.passed
         except ConfigError as error:
@@ -197,9 +194,9 @@ def _verify(chosen: argparse.Namespace) -> int:
 
 def _refresh(chosen: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
-    from nmpm.zoo.index import refresh, write_index
+    from nmpm.zoo.pages import write_index
+    from nmpm.zoo.refresh import refresh
     from nmpm.zoo.registry import Zoo
-    from nmpm.zoo.storage import halve
 
     _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
     _check_one("--failures is about one model", chosen.failures, chosen.name)
@@ -208,12 +205,10 @@ def _refresh(chosen: argparse.Namespace) -> None:
     names = Zoo.list(root) if chosen.name is None else [chosen.name]
     folders = [_find_writable(name, chosen.root) for name in names]
     for folder in folders:
-        if chosen.half:
-            halve(folder)
         refresh(folder, chosen.measure, chosen.data, chosen.failures, chosen.device)
         sys.stdout.write(f"wrote {folder}\n")
     if all(folder.resolve().is_relative_to(root.resolve()) for folder in folders):
-        sys.stdout.write(f"wrote {write_index(root)}\n")
+        sys.stdout.write(f"wrote {write_index(root, Zoo.list(root))}\n")
 
 
 def _check_one(option: str, value: object, name: str | None) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
-from nmpm._support.devices import same_hardware
 from nmpm._support.numbers import is_finite
 from nmpm.errors import ConfigError, ZooError
 
@@ -52,13 +51,14 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
     Raises:
         ZooError: if none is within the limits, or times are needed of which none is known.
     """
-    errors = {name: mse for name, card in cards.items() if (mse := _stated_mse(card)) is not None}
+    errors = {name: mse for name, card in cards.items() if (mse := stated_mse(card)) is not None}
     times = {name: time for name in errors if (time := milliseconds(name)) is not None}
     if limits.max_ms_per_frame is not None and errors and not times:
-        where = limits.hardware or "this machine"
+        hardware = sorted({hardware for name in errors for hardware in stated_milliseconds(cards[name])})
+        elsewhere = f", but on {'; '.join(hardware)} (hardware=…)" if hardware else ""
         raise ZooError(
-            f"The cards of {', '.join(sorted(errors))} state no time on {where}{_measured(cards, list(errors))}. Give"
-            " calibrate=True to time them here."
+            f"The cards of {', '.join(sorted(errors))} state no time on {limits.hardware or 'this machine'}{elsewhere}."
+            " Give calibrate=True to time them here."
         )
     accurate = [name for name, mse in errors.items() if limits.max_mse is None or mse <= limits.max_mse]
     timed = [name for name in accurate if name in times]
@@ -67,36 +67,25 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
     else:
         within = timed or accurate
     if not within:
-        found = "; ".join(
+        figures = "; ".join(
             f"{name}: MSE {mse:.3g}" + (f", {times[name]:.3g} ms" if name in times else "")
             for name, mse in errors.items()
         )
-        raise ZooError(f"No model is within the limits. {found or 'None states an error.'}")
+        raise ZooError(f"No model is within the limits. {figures or 'None states an error.'}")
     by_time = limits.max_ms_per_frame is None and bool(timed)
     return min(within, key=lambda name: times[name] if by_time else errors[name])
 
 
-def stated_milliseconds(card: Mapping[str, Any], hardware: str) -> float | None:
-    """The time per frame that a card states for a hardware; None where it states none."""
-    own = [time for name, time in _stated_times(card) if same_hardware(name, hardware)]
-    return own[0] if own else None
+def stated_milliseconds(card: Mapping[str, Any]) -> dict[str, float]:
+    """Milliseconds per frame by hardware, as a card states them; malformed ones are left out."""
+    speed = card.get("speed")
+    entries = [entry for entry in speed if isinstance(entry, Mapping)] if isinstance(speed, list) else []
+    times = {str(entry.get("hardware")): entry.get("ms_per_frame") for entry in entries}
+    return {name: float(time) for name, time in times.items() if is_finite(time) and time > 0}
 
 
-def _stated_times(card: Mapping[str, Any]) -> list[tuple[str, float]]:
-    """Hardware and milliseconds per frame of each measurement that a card states; malformed ones are left out."""
-    entries = card.get("speed")
-    found = [entry for entry in entries if isinstance(entry, Mapping)] if isinstance(entries, list) else []
-    times = [(str(entry.get("hardware")), entry.get("ms_per_frame")) for entry in found]
-    return [(name, float(time)) for name, time in times if is_finite(time) and time > 0]
-
-
-def _stated_mse(card: Mapping[str, Any]) -> float | None:
+def stated_mse(card: Mapping[str, Any]) -> float | None:
     """The full-rollout error that a card states; None where it states none that is finite."""
     test = card.get("test")
     mse = test.get("mse") if isinstance(test, Mapping) else None
     return float(mse) if is_finite(mse) else None
-
-
-def _measured(cards: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
-    known = sorted({hardware for name in names for hardware, _ in _stated_times(cards[name])})
-    return f", but on {'; '.join(known)} (hardware=…)" if known else ""

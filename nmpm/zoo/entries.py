@@ -1,73 +1,92 @@
-"""Entries of the zoo, read as text and tensors: nothing is unpickled, imported or fetched."""
+"""Entries and checkpoints, read as text and tensors: nothing is unpickled, imported or fetched, sizes are bounded."""
 
 from __future__ import annotations
 
+import csv
+import dataclasses
 import hashlib
-import os
+import io
+import json
+import math
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from filelock import lock_descriptor
 from safetensors import SafetensorError
 from safetensors.torch import load
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.modules import module as hooks
 
-from nmpm._support.bounded_files import read_bounded, read_yaml
-from nmpm._support.limits import WEIGHT_BYTES
+from nmpm._support.bounded_files import read_bounded, read_text, read_yaml
+from nmpm._support.limits import CELLS, FRAMES, INTEGER, LAYERS, PARAMETERS, TEXT_BYTES, WEIGHT_BYTES
 from nmpm._support.messages import one_line
-from nmpm.errors import DataError, NmpmError, ZooError
-from nmpm.zoo.building import build, read_recipe
-from nmpm.zoo.lifecycle import CARD_FORMAT
+from nmpm.emulator import Emulator, EmulatorRecipe
+from nmpm.errors import ConfigError, DataError, NmpmError, ZooError
+from nmpm.processors import GridLayout
+from nmpm.zoo.card import CARD, FORMAT
 from nmpm.zoo.pretrained import Pretrained
 
-CARD = "card.yaml"
+if TYPE_CHECKING:
+    from nmpm.training.module import EmulatorModule
+
+CONFIG, WEIGHTS = "config.yaml", "model.safetensors"
+SCENES = "scenes.csv"
+"""The errors of each test scene, a row each in their order."""
+FILES = (
+    CARD,
+    CONFIG,
+    WEIGHTS,
+    "README.md",
+    SCENES,
+    "errors.csv",
+    "training.csv",
+    "chart.png",
+    "rollout.png",
+    "worst.png",
+)
+"""All files of an entry; the tables and pictures after its README may be missing."""
+BEST = Path("checkpoints") / "best.ckpt"
+"""The best checkpoint within a run's folder."""
 REAL = frozenset({torch.float16, torch.bfloat16, torch.float32, torch.float64})
 """Types of stored weights that are converted to the model's own."""
+Rows = list[dict[str, float]]
+"""Figures by their names, of each test scene."""
 
 
 def read_card(folder: Path) -> dict[str, Any]:
     """The content of an entry's card.
 
     Raises:
-        ZooError: if it is missing or damaged, or a newer nmpm wrote it.
+        ZooError: if it is missing or damaged, or of another format, such as a newer nmpm's.
     """
     try:
         card = read_yaml(folder / CARD)
     except DataError as error:
         raise ZooError(str(error)) from error
-    found = card.get("format", 0)  # cards of version 0.1 state none
-    if not isinstance(found, int) or found > CARD_FORMAT:
+    if card.get("format") != FORMAT:
         raise ZooError(
-            f"{folder / CARD} has format {one_line(found, 60)}; this nmpm reads up to {CARD_FORMAT}: pip install"
+            f"{folder / CARD} has format {one_line(card.get('format'), 60)}; this nmpm reads {FORMAT}: pip install"
             " --upgrade nmpm."
         )
     return card
 
 
-@contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """Lets one process at a time write to the entries of a zoo. What is locked are folders, without a file in them.
+def read_scenes(folder: Path) -> Rows:
+    """The errors of an entry's test scenes, from `scenes.csv`.
 
-    Args:
-        folder: Of an entry. As a variant's lies within that of its dataset, which may be replaced, the two folders that
-            an entry lies in are locked: of any two entries of a zoo they have one in common.
+    Raises:
+        ZooError: if it is missing or damaged.
     """
-    with ExitStack() as locks:
-        inner = folder.resolve().parent
-        for place in (inner.parent, inner):  # in this order, so that none waits for ever
-            place.mkdir(parents=True, exist_ok=True)
-            try:
-                handle = os.open(place, os.O_RDONLY)
-            except PermissionError:  # a folder around a zoo that others own
-                if place == inner:
-                    raise
-                continue
-            locks.callback(os.close, handle)
-            lock_descriptor(handle)
-        yield
+    try:
+        lines = csv.DictReader(io.StringIO(read_text(folder / SCENES)), strict=True)
+        rows = [{name: float(value) for name, value in line.items() if value} for line in lines]
+    except (DataError, csv.Error, TypeError, ValueError, AttributeError) as error:
+        raise ZooError(f"The errors of single test scenes are not known: {one_line(error)}") from error
+    if not rows or not all(rows):
+        raise ZooError(f"{folder / SCENES} states no errors of single test scenes.")
+    return rows
 
 
 def load_entry(folder: Path) -> Pretrained:
@@ -78,16 +97,16 @@ def load_entry(folder: Path) -> Pretrained:
             not those of card and recipe.
     """
     card = read_card(folder)
-    weights = _read_weights(folder / "model.safetensors", card)
+    weights = _read_weights(folder / WEIGHTS, card)
     try:
-        emulator = build(read_recipe(read_yaml(folder / "config.yaml")))
+        emulator = build(read_recipe(read_yaml(folder / CONFIG)))
     except DataError as error:
         raise ZooError(str(error)) from error
     except Exception as error:  # values from anywhere may raise anything
         kind = "" if isinstance(error, NmpmError) else f" ({type(error).__name__})"
         reason = one_line(error, 600)
-        raise ZooError(f"{folder / 'config.yaml'} does not describe a model{kind}: {reason}") from error
-    _check_weights(folder / "model.safetensors", emulator.state_dict(), weights)
+        raise ZooError(f"{folder / CONFIG} does not describe a model{kind}: {reason}") from error
+    _check_weights(folder / WEIGHTS, emulator.state_dict(), weights)
     emulator.load_state_dict(weights)
     return Pretrained(emulator.eval().requires_grad_(False), card)
 
@@ -105,25 +124,151 @@ def _read_weights(path: Path, card: Mapping[str, Any]) -> dict[str, Tensor]:
         raise ZooError(f"{path} is not a file of tensors: {one_line(error)}") from error
 
 
-def _check_weights(path: Path, expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
+def _check_weights(path: Path, expected: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:
     """Compare names, shapes and types with the model's.
 
     Raises:
         ZooError: naming the first tensor that differs or is not finite.
     """
-    for problem, names in (("lacks", set(expected) - set(found)), ("has the unknown", set(found) - set(expected))):
+    for problem, names in (("lacks", set(expected) - set(stored)), ("has the unknown", set(stored) - set(expected))):
         if names:
             raise ZooError(
                 f"{path} {problem} tensors {one_line(', '.join(sorted(names)), 100)} of config.yaml's model."
             )
-    for name, tensor in found.items():
-        own = expected[name]
-        if tensor.shape != own.shape:
+    for name, tensor in stored.items():
+        needed = expected[name]
+        if tensor.shape != needed.shape:
             raise ZooError(
                 f"{path}: {name} has the shape {one_line(tuple(tensor.shape), 100)}; the model of config.yaml needs"
-                f" {tuple(own.shape)}."
+                f" {tuple(needed.shape)}."
             )
-        if tensor.dtype != own.dtype and not {tensor.dtype, own.dtype} <= REAL:
-            raise ZooError(f"{path}: {name} is of {tensor.dtype}; the model of config.yaml needs {own.dtype}.")
+        if tensor.dtype != needed.dtype and not {tensor.dtype, needed.dtype} <= REAL:
+            raise ZooError(f"{path}: {name} is of {tensor.dtype}; the model of config.yaml needs {needed.dtype}.")
         if not torch.isfinite(tensor).all():
             raise ZooError(f"{path}: {name} holds values that are not finite.")
+
+
+def load_checkpoint(path: Path) -> Pretrained:
+    """The model of a checkpoint, on the CPU; nothing in the file is executed.
+
+    Its card has the training horizon and, where the run's `report.json` is found, the dataset and how it was trained;
+    test errors only with the checkpoint that they are of, `best.ckpt`.
+
+    Raises:
+        DataError: if the file cannot be read, or is not a checkpoint of an emulator.
+        ConfigError: if a newer nmpm wrote it, or it names a part that is not known.
+    """
+    module = _load_module(path)
+    report = _report(path.parent.parent / "report.json") if path.parent.name == BEST.parent.name else {}
+    keys = ("dataset", "versions", *(("test",) if path.name == BEST.name else ()))
+    training = report.get("training")
+    card = {
+        "name": str(path),
+        "dataset": "not stated by the checkpoint",
+        **{key: report[key] for key in keys if key in report},
+        "training": (training if isinstance(training, dict) else {})
+        | {"horizon": module.emulator.frames * module.unroll},
+    }
+    return Pretrained(module.emulator.eval().requires_grad_(False), card)
+
+
+def _load_module(path: Path) -> EmulatorModule:
+    """The module of a checkpoint, after its size has been checked."""
+    from nmpm.training.checkpoints import load_module, read_checkpoint  # imports Lightning, which entries do without
+
+    try:
+        stored = read_checkpoint(path).get("hyper_parameters")
+        if not isinstance(stored, dict) or not isinstance(stored.get("unroll"), int):
+            raise DataError(f"{path} is not a checkpoint of an emulator: it lacks hyperparameters, such as unroll.")
+        names = [field.name for field in dataclasses.fields(EmulatorRecipe)]
+        read_recipe({name: stored[name] for name in names if name in stored})
+        with bounded_network():
+            return load_module(path)
+    except (ConfigError, DataError) as error:
+        raise type(error)(one_line(error, 600)) from error
+    except Exception as error:  # values from anywhere may raise anything
+        reason = f"{type(error).__name__}: {one_line(error, 300)}"
+        raise DataError(f"{path} is not a checkpoint of an emulator of this version ({reason}).") from error
+
+
+def _report(path: Path) -> dict[str, Any]:
+    """The report of a run; empty if there is none that can be read, as a model rolls out without."""
+    try:
+        report = json.loads(read_bounded(path, 16 * TEXT_BYTES))
+    except (DataError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
+def read_recipe(plain: Mapping[str, Any]) -> EmulatorRecipe:
+    """The recipe that plain data describe, if its model is of a bounded size.
+
+    Raises:
+        ConfigError: if a number is not finite or too large, or grid or network exceed `nmpm._support.limits`. Data
+            that do not describe a recipe may raise any other exception.
+    """
+    _check_numbers(plain)
+    recipe = EmulatorRecipe.from_dict(plain)
+    for name, size, limit in (("cells", recipe.grid.size, CELLS), ("frames", recipe.frames, FRAMES)):
+        if size > limit:
+            raise ConfigError(f"{name}: {size:,} are more than {limit:,}, the most that is loaded.")
+    layout = GridLayout(
+        len(recipe.scene.input_channels), len(recipe.scene.output_channels), recipe.frames, recipe.scene.periodic
+    )
+    # Without memory for its parameters, which not all plugins support; the size is watched again in `build`.
+    with torch.device("meta"), bounded_network(), suppress(RuntimeError, NotImplementedError):
+        recipe.processor.build(layout)
+    return recipe
+
+
+def build(recipe: EmulatorRecipe) -> Emulator:
+    """The emulator of a recipe; raises as `bounded_network` where its network is too large."""
+    with bounded_network():
+        return recipe.build()
+
+
+def _check_numbers(value: Any, key: str = "the recipe") -> None:
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            _check_numbers(item, str(name))
+    elif isinstance(value, list):
+        for item in value:
+            _check_numbers(item, key)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{key}: {value} is not finite.")
+    elif isinstance(value, int) and abs(value) > INTEGER:
+        raise ConfigError(f"{key}: an integer is larger than {INTEGER:,}, the most that is loaded.")
+
+
+@contextmanager
+def bounded_network() -> Iterator[None]:
+    """Count parameters, their tensors and modules as networks are built; torch's random state stays as it was.
+
+    Raises:
+        ConfigError: at the first that is too many.
+    """
+    counts = {"parameters": 0, "tensors": 0, "modules": 0}
+    limits = {"parameters": PARAMETERS, "tensors": LAYERS, "modules": LAYERS}
+
+    def add(kind: str, number: int) -> None:
+        counts[kind] += number
+        if counts[kind] > limits[kind]:
+            raise ConfigError(f"processor: its network has more than {limits[kind]:,} {kind}, the most that is loaded.")
+
+    def add_parameter(_module: nn.Module, _name: str, parameter: nn.Parameter | None) -> None:
+        add("parameters", 0 if parameter is None else parameter.numel())
+        add("tensors", 1)
+
+    def add_module(_module: nn.Module, _name: str, _submodule: nn.Module | None) -> None:
+        add("modules", 1)
+
+    handles = [
+        hooks.register_module_parameter_registration_hook(add_parameter),
+        hooks.register_module_module_registration_hook(add_module),
+    ]
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        for handle in handles:
+            handle.remove()

@@ -21,15 +21,12 @@ from nmpm._support.bounded_files import read_bounded, read_yaml, to_yaml
 from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
-from nmpm.zoo.cards import MALFORMED, PICTURES, readme
-from nmpm.zoo.entries import CARD, load_entry, read_card, writing
-from nmpm.zoo.pretrained import SIMULATED
+from nmpm.zoo.card import CARD, SIMULATED
+from nmpm.zoo.entries import FILES, WEIGHTS, load_entry, read_card
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-FILES = (CARD, "config.yaml", "model.safetensors", "README.md", *PICTURES, "errors.csv")
-"""Files of an entry that are uploaded and downloaded."""
 ID = re.compile(r"(?P<repository>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})@(?P<revision>[\w./-]{1,100})")
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
 
@@ -85,7 +82,7 @@ def download(identifier: HubId) -> Path:
 def _is_whole(folder: Path) -> bool:
     """Whether the weights in a folder are those of its card."""
     try:
-        weights = read_bounded(folder / "model.safetensors", WEIGHT_BYTES)
+        weights = read_bounded(folder / WEIGHTS, WEIGHT_BYTES)
         return bool(hashlib.sha256(weights).hexdigest() == read_yaml(folder / CARD).get("sha256"))
     except DataError:
         return False
@@ -136,7 +133,7 @@ def pull(identifier: HubId, target: Path, name: str) -> Path:
     folder = download(identifier)
     load_entry(folder)
     card = read_card(folder) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
-    with writing(target), atomic_folder(target) as new:
+    with atomic_folder(target) as new:
         if target.is_dir():  # variants lie within it
             shutil.copytree(target, new, dirs_exist_ok=True)
         for file in FILES:
@@ -207,8 +204,10 @@ def _is_public(api: HfApi, repository: str) -> bool:
 
 def _page(card: Mapping[str, Any], entry: Path, load: str) -> str:
     """The README of an entry, by which `Zoo.load(load)` loads it; empty for a card without what it shows."""
+    from nmpm.zoo.pages import MALFORMED, entry_page  # imports matplotlib
+
     try:
-        return readme(card, [path.name for path in entry.iterdir()], load)
+        return entry_page(card, [path.name for path in entry.iterdir()], load)
     except MALFORMED:
         return ""
 

@@ -22,19 +22,12 @@ from nmpm.emulator.runtimes import Runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
+from nmpm.zoo.card import preset_of
 from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.states import Bodies, StateBuilder
 
 _EXAMPLE = 300
 """Particles of the example by which runtimes are compared."""
-SIMULATED = ", simulated by nmpm"
-"""What follows a preset's name in the description of its dataset."""
-
-
-def preset_of(card: Mapping[str, Any]) -> str | None:
-    """Name of the simulator preset that made the data of a card; None for recorded or unknown data."""
-    name, simulated, _ = str(card.get("dataset", "")).partition(SIMULATED)
-    return name if simulated else None
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,12 @@ from nmpm._support.limits import NAME_LENGTH
 from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
+from nmpm.zoo.card import CARD
 from nmpm.zoo.choice import Limits, choose, stated_milliseconds
-from nmpm.zoo.entries import CARD, load_entry, read_card
+from nmpm.zoo.entries import BEST, load_checkpoint, load_entry, read_card
 from nmpm.zoo.hub import HubId, download
+from nmpm.zoo.measures.speed import measure_speed
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.runs import BEST, load_checkpoint
-from nmpm.zoo.speed import measure_speed
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]*(/[a-z0-9][a-z0-9_-]*)?")
 
@@ -189,7 +189,7 @@ def _load_within(name: str, limits: Limits, root: Root, device: torch.device, ca
 
     def milliseconds(variant: str) -> float | None:
         if not calibrate:
-            return stated_milliseconds(cards[variant], machine)
+            return stated_milliseconds(cards[variant]).get(machine)
         try:
             return float(measure_speed(load_model(variant, device, root))["ms_per_frame"])
         except ZooError:  # damaged: the others can still be chosen

@@ -41,8 +41,8 @@ def test_models_are_those_of_the_dataset_and_damaged_ones_are_left_out(tmp_path,
     monkeypatch.setenv("NMPM_HOME", str(tmp_path))
     for name in ("bad", "other", "broken"):
         (tmp_path / "zoo" / name).mkdir(parents=True)
-    (tmp_path / "zoo" / "bad" / "card.yaml").write_text("dataset: goop, simulated by nmpm")
-    (tmp_path / "zoo" / "other" / "card.yaml").write_text("dataset: recorded")
+    (tmp_path / "zoo" / "bad" / "card.yaml").write_text("format: 1\ndataset: goop, simulated by nmpm")
+    (tmp_path / "zoo" / "other" / "card.yaml").write_text("format: 1\ndataset: recorded")
     (tmp_path / "zoo" / "broken" / "card.yaml").write_text("{")
     loaded = []
     monkeypatch.setattr("nmpm.zoo.load_model", lambda name: loaded.append(name) or load_model(name))

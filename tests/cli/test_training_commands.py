@@ -246,21 +246,22 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 0
     stress = {"size": "quick", "passed": 5, "failed": []}
     assert Zoo.card("drop/tiny", root=tmp_path / "zoo")["stress"] == stress
-    assert "held: 5 of 5 lines passed, quick; free: not run." in Path("zoo/drop/tiny/README.md").read_text()
+    assert "with these constraints: 5 of 5 pass, quick; with the" in Path("zoo/drop/tiny/README.md").read_text()
     assert main(["zoo", "--root", "zoo", "add", "run", "drop/tiny"]) == 1
     assert "exists" in capsys.readouterr().err
     model = Zoo.load("drop/tiny", root=tmp_path / "zoo")
     trained = EmulatorModule.load_from_checkpoint("run/checkpoints/best.ckpt", weights_only=True).emulator.eval()
     state = model.example(count=50)
     from nmpm import rollout
-    from nmpm.zoo.storage import NOTICED, round_network
+    from nmpm.zoo.publish import NOTICED, round_network
 
     assert model.card["weights"] == "float16"
     found, limit = model.rollout(state, 20), NOTICED * max(trained.grid.spacing)
     assert torch.equal(found, rollout(round_network(trained), state, 20))
     torch.testing.assert_close(found, rollout(trained, state, 20), atol=limit, rtol=0)
     assert {p.name for p in (tmp_path / "zoo/drop/tiny").iterdir()} == {
-        *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png", "errors.csv", "chart.png")
+        *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png", "errors.csv", "chart.png"),
+        *("scenes.csv", "training.csv"),
     }
 
 

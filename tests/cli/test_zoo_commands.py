@@ -42,11 +42,11 @@ def test_a_card_is_a_page_to_read_or_yaml_for_programs(home, capsys):
     page = capsys.readouterr().out
     assert page.startswith("# goop\n")
     assert "| nothing moves |" in page
-    assert len(page.splitlines()) < 50
+    assert len(page.splitlines()) < 70
     assert main(["zoo", "card", "goop", "--yaml"]) == 0
     assert yaml.safe_load(capsys.readouterr().out) == Zoo.card("goop")
     (home / "zoo" / "bare").mkdir(parents=True)
-    (home / "zoo" / "bare" / "card.yaml").write_text("name: bare\n")
+    (home / "zoo" / "bare" / "card.yaml").write_text("format: 1\nname: bare\n")
     assert main(["zoo", "card", "bare"]) != 0
     assert "`nmpm zoo card bare --yaml` shows what it has" in capsys.readouterr().err
 
@@ -55,7 +55,7 @@ def test_a_damaged_card_does_not_hide_the_others(home, capsys):
     copy("goop", home / "zoo" / "broken")
     (home / "zoo" / "broken" / "card.yaml").write_text("{")
     copy("goop", home / "zoo" / "bare")
-    (home / "zoo" / "bare" / "card.yaml").write_text("name: bare\n")
+    (home / "zoo" / "bare" / "card.yaml").write_text("format: 1\nname: bare\n")
     assert main(["zoo", "list"]) == 0
     said = capsys.readouterr().out
     assert "cannot be read" in said

@@ -40,7 +40,8 @@ def write_entry() -> Callable[..., Path]:
             weights = save({name: value.contiguous() for name, value in emulator.state_dict().items()})
         (folder / "model.safetensors").write_bytes(weights)
         (folder / "config.yaml").write_text(yaml.safe_dump(emulator.recipe.to_dict()))
-        facts = {"name": folder.name, "dataset": "made up", "sha256": hashlib.sha256(weights).hexdigest()}
+        facts = {"format": 1, "name": folder.name, "dataset": "made up"}
+        facts |= {"sha256": hashlib.sha256(weights).hexdigest()}
         (folder / "card.yaml").write_text(yaml.safe_dump(facts | {"test": {"mse": 0.1}} | card))
         return folder
 

@@ -53,7 +53,7 @@ def test_where_all_cards_are_damaged_one_is_named(root):
     path.write_text("{")
     with pytest.raises(ZooError, match=r"card\.yaml cannot be read"):
         Zoo.load("small", root, max_mse=1.0)
-    path.write_text(yaml.safe_dump({"test": None}))
+    path.write_text(yaml.safe_dump({"format": 1, "test": None}))
     for limit in ("max_mse", "max_ms_per_frame"):
         with pytest.raises(ZooError, match="None states an error"):
             Zoo.load("small", root, **{limit: 1.0})

@@ -17,7 +17,7 @@ from safetensors.torch import save
 from nmpm._support import limits
 from nmpm.errors import ConfigError, DataError, ZooError
 from nmpm.training.module import EmulatorModule
-from nmpm.zoo.building import build, read_recipe
+from nmpm.zoo.entries import build, read_recipe
 from nmpm.zoo.registry import Zoo, load_model
 from tests.data.fuzzing import FUZZ, VALUES, changed, places
 

@@ -13,7 +13,8 @@ from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import ZooError
 from nmpm.zoo import Zoo, load_model
-from nmpm.zoo.hub import FILES, HubId, download, hub_metadata, pull, push
+from nmpm.zoo.entries import FILES
+from nmpm.zoo.hub import HubId, download, hub_metadata, pull, push
 from tests.zoo.fake_hub import serve
 
 

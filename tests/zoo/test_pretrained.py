@@ -9,7 +9,7 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import UNet
 from nmpm.zoo import Pretrained, Zoo
-from nmpm.zoo.golden import golden_distance, golden_rollout
+from nmpm.zoo.verification import golden_distance, golden_rollout
 from tests.scenes import box, set_gravity_statistics
 
 

@@ -1,135 +1,204 @@
-"""Refreshed entries keep what their cards state and what others write meanwhile; incomplete cards are refused."""
+"""Measures, READMEs and tables of entries; what others write meanwhile stays, incomplete cards are refused."""
 
+import shutil
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import yaml
 
+from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
-from nmpm.errors import ZooError
-from nmpm.zoo import Zoo
-from nmpm.zoo import index as module
-from nmpm.zoo.entries import writing
-from nmpm.zoo.index import add_facts, refresh
-from nmpm.zoo.storage import halve
+from nmpm.errors import ConfigError, UnstableError, ZooError
+from nmpm.evaluation.stress import QUICK, Line
+from nmpm.sim import load_preset
+from nmpm.sim.predictability import nudge, twin_of
+from nmpm.zoo import Zoo, load_model
+from nmpm.zoo import refresh as module
+from nmpm.zoo.card import lifecycle, table_row
+from nmpm.zoo.measures import simulator
+from nmpm.zoo.measures.simulator import NUDGE, floor_facts, twin_facts
+from nmpm.zoo.pages import write_index
+from nmpm.zoo.refresh import add_facts, refresh
 
+SHIPPED = shipped_folder("zoo")
 COMPLETE = {
-    "test": {"mse": 0.1, "still/mse": 1.0, "free_fall/mse": 2.0},
-    "per_trajectory": [{"mse": 0.1}],
+    "test": {"mse": 0.1, "mse@100": 0.01, "still/mse": 1.0, "free_fall/mse": 2.0},
+    "interval": {"mse": [0.05, 0.15]},
+    "test_scenes": 2,
     "training": {"steps": 20, "seconds": 7200.0, "hardware": "a CPU", "precision": "32-true", "parameters": 1},
+    "constraints": {"energy": True, "bounds": "stop"},
+    "obstacles": False,
 }
 
 
 @pytest.fixture
-def entry(root, small, write_entry):
+def entry(root, small, write_entry) -> Path:
     return write_entry(root / "small", small, **COMPLETE)
 
 
 @pytest.fixture
-def replaced(entry, small, write_entry):
-    """Replaces the entry by one of other weights, and returns its card."""
-
-    def replace(*_args):
-        small.input_std.fill_(3.0)
-        write_entry(entry, small, **COMPLETE)
-        return {"seed": 0}
-
-    return replace
-
-
-def test_an_existing_golden_rollout_is_not_computed_again(entry, monkeypatch):
-    refresh(entry)
-    golden = Zoo.card("small", entry.parent)["golden"]
-    monkeypatch.setattr(module, "golden_rollout", lambda _emulator: pytest.fail("computed again"))
-    refresh(entry)
-    assert Zoo.card("small", entry.parent)["golden"] == golden
+def goop(tmp_path) -> Path:
+    """The shipped model with two short test scenes."""
+    folder = tmp_path / "zoo" / "goop"
+    shutil.copytree(SHIPPED / "goop", folder)
+    preset = load_preset("goop").with_frames(24)
+    simulation = {"preset": preset.to_dict(), "counts": {"train": 0, "valid": 0, "test": 2}, "seed": 0}
+    card = yaml.safe_load((folder / "card.yaml").read_text()) | {
+        "simulation": simulation | {"revision": preset.revision}
+    }
+    (folder / "card.yaml").write_text(yaml.safe_dump(card))
+    return folder
 
 
-def test_an_entry_that_is_replaced_meanwhile_keeps_its_own_card(entry, replaced, monkeypatch):
-    monkeypatch.setattr(module, "golden_rollout", replaced)
-    with pytest.raises(ZooError, match="were replaced while the golden rollout was measured; measure it again"):
-        refresh(entry)
-    assert "golden" not in Zoo.load("small", entry.parent).card  # it can be loaded
-    with pytest.raises(ZooError, match="were replaced"):
-        add_facts(entry, "0" * 64, {"twin": {}})
+def test_quality_floor_twin_and_pictures_are_on_the_card(goop):
+    former = (goop / "rollout.png").read_bytes()
+    words = ["zoo", "refresh", "goop", "--measure", "quality", "floor", "twin", "--root", str(goop.parent)]
+    assert main(words) == 0
+    card = Zoo.card("goop", goop.parent)
+    quality, floor, twin = card["quality"], card["floor"], card["twin"]
+    for name in ("emd", "kinetic", "height", "crowding"):
+        mean, low, high = quality[name]
+        assert 0 <= low <= mean <= high
+    assert 0 < quality["emd"][0] < 0.01  # of a domain of length 1, in the first frames
+    assert 0 < floor["mse"] < 1e-2 * quality["worst"]["mse"]
+    assert floor["nudge"] == NUDGE
+    assert (twin["substeps"], twin["own_substeps"]) == (6, 12)
+    assert floor["mse"] < twin["mse"] < card["test"]["mse@100"]
+    pictures = [(goop / name).read_bytes() for name in ("rollout.png", "worst.png")]
+    assert all(picture[:4] == b"\x89PNG" for picture in pictures)
+    assert former != pictures[0] != pictures[1]  # of the first scene, with a title in the other
+    text = (goop / "README.md").read_text()
+    assert "![the test scene with the largest error](worst.png)" in text
+    assert "| the simulator with 6 substeps a frame instead of 12 |" in text
+    assert f"(scene {quality['worst']['scene']})" in text
+
+
+def nudge_all_but(stable: set[int]):
+    """`nudge`, unstable in all scenes but these."""
+    scenes = iter(range(2))
+
+    def nudge_or_fail(preset, state, size, seed):
+        if next(scenes) not in stable:
+            raise UnstableError("The simulation has blown up.")
+        return nudge(preset, state, size, seed)
+
+    return nudge_or_fail
+
+
+def test_scenes_that_are_unstable_are_named(goop, monkeypatch):
+    model = load_model(goop)
+    monkeypatch.setattr(simulator, "nudge", nudge_all_but({1}))
+    assert main(["zoo", "refresh", "goop", "--measure", "floor", "--root", str(goop.parent)]) == 0
+    assert Zoo.card("goop", goop.parent)["floor"]["unstable"] == [0]
+    assert "Test scenes 0, which this makes unstable, are left out." in (goop / "README.md").read_text()
+    monkeypatch.setattr(simulator, "nudge", nudge_all_but(set()))
+    with pytest.raises(UnstableError, match="all test scenes of goop unstable"):
+        floor_facts(model, goop, None)
+
+    class Unstable:
+        substeps = 3
+
+        def simulate_from(self, state, frames):
+            raise UnstableError("The simulation has blown up.")
+
+    monkeypatch.setattr(simulator, "twin_of", lambda preset: Unstable())
+    with pytest.raises(UnstableError, match=r"With 3 substeps test scenes \[0, 1\] are unstable: goop has no twin"):
+        twin_facts(model, goop, None)
+
+
+def test_a_twin_has_half_the_substeps_where_that_is_stable_and_the_data_are_simulated(goop):
+    assert twin_of(load_preset("waterramps")).substeps == 13
+    dam, blocks = load_preset("dambreak2d"), load_preset("wbcsph")
+    assert twin_of(dam).substeps == dam.stable_substeps > 50  # half as many are too few for sound
+    assert twin_of(blocks).substeps == 2 * blocks.substeps  # there is no choice
+    card = Zoo.card("goop", goop.parent)
+    for simulation in (card["simulation"] | {"revision": -1}, None):
+        add_facts(goop, card["sha256"], {"simulation": simulation})
+        with pytest.raises(ConfigError, match=r"revision -1|recorded data"):
+            twin_facts(load_model(goop), goop, None)
+
+
+@pytest.mark.parametrize("measure", ["stress", "invariants"])
+def test_stress_tests_are_counted_and_settling_is_simulated_once(goop, monkeypatch, measure):
+    settled, presets = [], []
+
+    def long(subject, size):
+        assert size is QUICK
+        presets.append(subject.preset)
+        yield Line("long", "energy", subject.emulator.constraints.energy, {}, "")
+        yield Line("long", "speed", None, {}, "")
+
+    def settle(subject, size):
+        settled.append(subject.emulator.constraints.energy)
+        yield Line("settling", "with constraints", True, {}, "")
+        yield Line("settling", "without constraints", False, {}, "")
+
+    monkeypatch.setattr("nmpm.zoo.measures.model.GROUPS", {"long": long, "settling": settle})
+    refresh(goop, [measure])
+    card = Zoo.card("goop", goop.parent)
+    size = "quick" if measure == "stress" else "quick, without the simulator"
+    assert (settled, [preset is None for preset in presets]) == ([True], [measure != "stress"] * 2)
+    assert card["stress"] == {"size": size, "passed": 2, "failed": ["settling: without constraints"]}
+    free = ["long: energy", "settling: without constraints"]
+    assert card["stress_free"] == {"size": size, "passed": 0, "failed": free}
+
+
+def test_the_speed_is_measured_on_the_device_that_is_given(entry, monkeypatch, capsys):
+    devices = []
+    monkeypatch.setattr("nmpm.zoo.pretrained.Pretrained.to", lambda model, device: devices.append(device) or model)
+    refresh(entry, ["speed"], device="cuda")
+    assert devices == ["cuda"]
+    assert Zoo.card("small", entry.parent)["speed"][0]["ms_per_frame"] > 0
+    command = ["zoo", "refresh", "small", "--measure", "speed", "--root", str(entry.parent), "--device", "cuda:77"]
+    assert main(command) == 1
+    assert "has no device 'cuda:77'" in capsys.readouterr().err
+
+
+def test_what_others_write_to_the_card_during_a_measurement_stays(entry, monkeypatch):
+    elsewhere = {"hardware": "a GPU", "runtime": "eager float32", "particles": 9, "ms_per_frame": 1.0, "best_batch": 1}
+    elsewhere |= {"best_ms_per_frame": 1.0, "memory_mb": 2.0, "best_memory_mb": None}
+
+    def measure(model):
+        add_facts(entry, model.card["sha256"], {"speed": [elsewhere]})
+        refresh(entry, failures="Splashes become\n dust.")
+        return elsewhere | {"hardware": "a CPU"}
+
+    monkeypatch.setattr("nmpm.zoo.measures.speed.measure_speed", measure)
+    refresh(entry, ["speed"])
+    card = Zoo.card("small", entry.parent)
+    assert [time["hardware"] for time in card["speed"]] == ["a GPU", "a CPU"]
+    assert "- Seen in its pictures: Splashes become dust.\n" in (entry / "README.md").read_text()
+    refresh(entry, failures="")
+    assert "failures" not in Zoo.card("small", entry.parent)
 
 
 def test_facts_that_are_written_at_the_same_time_all_stay(entry):
     weights = Zoo.card("small", entry.parent)["sha256"]
-    start = threading.Barrier(6)
+    start = threading.Barrier(4)
 
     def write(number: int) -> None:
         start.wait()
         add_facts(entry, weights, {f"fact{number}": number})
 
-    with ThreadPoolExecutor(6) as pool:
-        list(pool.map(write, range(6)))
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(4)))
     card = Zoo.card("small", entry.parent)
-    assert [card.get(f"fact{number}") for number in range(6)] == list(range(6))
+    assert [card.get(f"fact{number}") for number in range(4)] == list(range(4))
     assert not list(entry.parent.glob("**/.*"))
 
 
-def test_a_variant_is_not_written_while_its_dataset_is(entry):
-    reached, done = threading.Event(), []
+def test_a_measure_of_weights_that_are_replaced_meanwhile_is_not_written(entry, small, write_entry, monkeypatch):
+    def measure(model, folder, data):
+        small.input_std.fill_(3.0)
+        write_entry(entry, small, **COMPLETE)
+        return {"floor": {"nudge": 1e-6, "mse": 0.25}}
 
-    def write() -> None:
-        reached.set()
-        with writing(entry / "fast"):
-            done.append("variant")
-
-    with ThreadPoolExecutor(1) as pool:
-        with writing(entry):
-            future = pool.submit(write)
-            reached.wait()
-            time.sleep(0.1)
-            done.append("dataset")
-        future.result()
-    assert done == ["dataset", "variant"]
-
-
-def test_text_that_could_not_be_read_again_is_not_written(entry):
-    before = (entry / "card.yaml").read_bytes()
-    with pytest.raises(ZooError, match=r"card.yaml: 'Late \\x96 dust' has a control character"):
-        refresh(entry, failures="Late \x96 dust")
-    assert (entry / "card.yaml").read_bytes() == before
-
-
-def test_times_of_other_hardware_that_are_written_during_the_measurement_stay(entry, monkeypatch):
-    elsewhere = {"hardware": "a GPU", "particles": 9, "ms_per_frame": 1.0, "best_batch": 1, "best_ms_per_frame": 1.0}
-
-    def measure(model):
-        add_facts(entry, model.card["sha256"], {"speed": [elsewhere]})
-        return elsewhere | {"hardware": "a CPU"}
-
-    monkeypatch.setattr("nmpm.zoo.speed.measure_speed", measure)
-    refresh(entry, ["speed"])
-    assert [time["hardware"] for time in Zoo.card("small", entry.parent)["speed"]] == ["a GPU", "a CPU"]
-
-
-@pytest.mark.parametrize(
-    ("measure", "change", "message"),
-    [
-        ("speed", {"particles": "many"}, "particles of its card should be their number, not 'many'"),
-        ("quality", {"per_trajectory": []}, "states no errors of single test scenes"),
-    ],
-)
-def test_a_card_that_a_measure_cannot_use_is_named(entry, measure, change, message):
-    path = entry / "card.yaml"
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
-    with pytest.raises(ZooError, match=message):
-        refresh(entry, [measure])
-
-
-def test_weights_that_are_replaced_while_they_are_rounded_stay(entry, replaced, monkeypatch):
-    def round_network(emulator):
-        return replaced() and emulator.rebuilt(emulator.recipe)
-
-    monkeypatch.setattr("nmpm.zoo.storage.round_network", round_network)
-    with pytest.raises(ZooError, match="were replaced"):
-        halve(entry)
-    assert (Zoo.load("small", entry.parent).emulator.input_std == 3.0).all()
+    monkeypatch.setattr(module, "MEASURES", {"floor": measure})
+    with pytest.raises(ZooError, match="replaced while floor was measured"):
+        refresh(entry, ["floor"])
+    assert "floor" not in Zoo.load("small", entry.parent).card  # it can be loaded
 
 
 @pytest.mark.parametrize(
@@ -139,8 +208,6 @@ def test_weights_that_are_replaced_while_they_are_rounded_stay(entry, replaced, 
         ({"test": None}, ""),
         ({"speed": [{"hardware": "x"}]}, ""),
         ({"speed": ["x"]}, ""),
-        ({"curve": [[1]]}, ""),
-        ({"curve": [["a", "b", "c"]]}, ""),
         ({}, "frame,model\nx,y\n"),
         ({}, "frame,model\n1,0.1\n"),
         ({}, "frame,model,still,free_fall\n1,0.1,0.2,0.3\n2,0."),
@@ -149,17 +216,66 @@ def test_weights_that_are_replaced_while_they_are_rounded_stay(entry, replaced, 
 )
 def test_an_incomplete_card_gets_one_line_and_nothing_is_rewritten(entry, change, errors, capsys):
     path = entry / "card.yaml"
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"golden": {}} | change))
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
     if errors:
         (entry / "errors.csv").write_text(errors)
     before = {file: file.read_bytes() for file in entry.rglob("*")}
     assert main(["zoo", "refresh", "small", "--root", str(entry.parent)]) == 1
     said = capsys.readouterr().err
-    assert "card.yaml or errors.csv beside it is not complete" in said
+    assert "card.yaml or a table beside it is not complete" in said
     assert said.count("\n") == 1
     assert {file: file.read_bytes() for file in entry.rglob("*")} == before
 
 
-def test_a_malformed_card_does_not_keep_the_table_from_being_written(entry, small, write_entry):
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["small", "--measure", "sped"], "--measure sped: what can be measured is speed, quality, twin, floor, stress"),
+        (["--measure", "quality", "--data", "."], "give the model's NAME too"),
+        (["--failures", "Dust."], "give the model's NAME too"),
+        (["small", "--failures", "Late \x96 dust"], "'Late \\x96 dust' has a control character"),
+    ],
+)
+def test_what_cannot_be_refreshed_is_named(entry, words, message, capsys):
+    before = (entry / "card.yaml").read_bytes()
+    assert main(["zoo", "refresh", *words, "--root", str(entry.parent)]) == 1
+    assert message in capsys.readouterr().err
+    assert (entry / "card.yaml").read_bytes() == before
+
+
+def test_the_table_of_a_zoo_names_every_model_whose_card_can_be_read(entry, small, write_entry):
     write_entry(entry.parent / "odd", small, **COMPLETE | {"test": {"mse": "x"}, "speed": [{}]})
-    assert "odd" not in module.write_index(entry.parent).read_text()
+    (entry.parent / "broken").mkdir()
+    (entry.parent / "broken" / "card.yaml").write_text("{")
+    (entry / "errors.csv").write_text("frame,model,still,free_fall\n1,0.1,0.2,0.3\n2,0.2,0.3,0.4\n")
+    assert main(["zoo", "refresh", "small", "--root", str(entry.parent)]) == 0
+    text = write_index(entry.parent, Zoo.list(entry.parent)).read_text()
+    assert "| [small](small/README.md) | made up | 10 | 100 (50 – 150) |  |  | 1e+03 | 2.0 h |" in text
+    assert "odd" not in text
+    assert "broken" not in text
+    assert "![errors over frames and over training](chart.png)" in (entry / "README.md").read_text()
+
+
+@pytest.mark.parametrize("name", Zoo.list(SHIPPED))
+def test_shipped_cards_are_short_and_make_rows_of_the_table(name):
+    row = table_row(Zoo.card(name, SHIPPED))
+    assert 0 < row.mse_100 < row.mse < row.trivial
+    assert row.interval[0] < row.mse < row.interval[1]
+    assert row.milliseconds["AMD EPYC, 1 thread"] > 0
+    assert (row.twins is None) == (name == "waterdrop")
+    assert len((SHIPPED / name / "card.yaml").read_text().splitlines()) <= 120
+
+
+@pytest.mark.parametrize(
+    ("card", "state"),
+    [
+        ({"test": {"mse": 0.1, "still/mse": 0.4, "free_fall/mse": 0.5}}, "active"),
+        ({"test": {"mse": 0.1, "still/mse": 0.5, "free_fall/mse": 0.39}}, "preview"),
+        ({"test": {"mse": 0.1}}, "preview"),
+        ({"test": {"mse": float("nan"), "still/mse": 0.5}}, "preview"),
+        ({}, "preview"),
+        ({"test": {"mse": 0.1, "still/mse": 0.5}, "superseded_by": "other"}, "superseded"),
+    ],
+)
+def test_the_lifecycle_follows_from_the_figures(card, state):
+    assert lifecycle(card) == state

@@ -1,0 +1,237 @@
+"""What is written for readers: an entry's README and chart, and the table of a zoo's models."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from nmpm._support.atomic import atomic_write
+from nmpm._support.bounded_files import read_yaml
+from nmpm.emulator import EmulatorRecipe
+from nmpm.errors import DataError, ZooError
+from nmpm.evaluation.figures import PREDICTORS, Unit, figures_unit, with_unit
+from nmpm.scene import Scene
+from nmpm.zoo.card import FACTOR, lifecycle, table_row
+from nmpm.zoo.choice import stated_milliseconds
+from nmpm.zoo.entries import CONFIG, read_card, read_recipe
+
+CHART = "chart.png"
+PICTURES = {
+    CHART: "errors over frames and over training",
+    "rollout.png": "rollout",
+    "worst.png": "the test scene with the largest error",
+}
+"""An entry's pictures, with their captions."""
+CONSTRAINTS = {
+    "energy": "energy never exceeds that of the first state",
+    "rest_speed": "particles on firm ground slower than {value:g} cells per frame stay where they are",
+    "solids": "no particle enters an obstacle",
+    "density_cap": "cells with a volume fraction above {value:g} spread",
+    "bounds": "no particle leaves the scene's bounds ({value})",
+}
+"""What each constraint enforces, by its key in the card."""
+QUALITY = {
+    "emd": ("earth mover's distance", 1e3, " ×10⁻³"),
+    "kinetic": ("kinetic energy off by", 100, "%"),
+    "height": ("height of the last frame's material off by", 100, "%"),
+    "crowding": ("particles per occupied cell off by", 100, "%"),
+}
+"""Further errors: name, factor and unit, by their key in the card."""
+OPTIONAL = (
+    "about",
+    "twin",
+    "floor",
+    "quality",
+    "speed",
+    "trade",
+    "stress",
+    "stress_free",
+    "failures",
+    "weights",
+    "license",
+    "sha256",
+)
+"""Keys that a card may lack."""
+COLUMNS = {"mse@100": "frames 1 – 100", "mse": "all frames"}
+MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, TemplateError)
+"""What pages and charts raise where a card or a table lacks something, or has other kinds of values."""
+_TEMPLATES = Environment(
+    loader=PackageLoader("nmpm.zoo"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    autoescape=False,  # noqa: S701 (Markdown)
+)
+
+
+def entry_page(card: Mapping[str, Any], files: Collection[str] = (), load: str | None = None) -> str:
+    """The README of an entry, as Markdown.
+
+    Args:
+        card: The content of `card.yaml`.
+        files: Names of the entry's files; pictures among them are shown.
+        load: What `Zoo.load` takes; the model's name when left out.
+    """
+    unit = figures_unit(card["test"])
+    return _TEMPLATES.get_template("entry.md").render(
+        card={**dict.fromkeys(OPTIONAL), **card},
+        state=lifecycle(card),
+        factor=f"{FACTOR:g}",
+        unit=str(unit),
+        unit_of=with_unit,
+        columns={name: text for name, text in COLUMNS.items() if name in card["test"]},
+        errors=list(_error_rows(card, unit)),
+        scenes=_scene_count(card),
+        unstable=(card.get("floor") or {}).get("unstable"),
+        quality=[_quality(card["quality"], name) for name in QUALITY if name in (card.get("quality") or {})],
+        fastest=min((card.get("trade") or {}).get("times", []), key=lambda time: time["ms_per_frame"], default=None),
+        training=card["training"],
+        constraints=_constraints(card),
+        stress=_stress,
+        digits=lambda value: f"{value:.3g}",
+        memory=lambda megabytes: "" if megabytes is None else f", {megabytes:.3g} MB",
+        duration=lambda seconds: f"{seconds / 3600:.1f} hours" if seconds >= 3600 else f"{seconds / 60:.1f} minutes",
+        pictures={name: text for name, text in PICTURES.items() if name in files},
+        load=load or card["name"],
+    )
+
+
+def _error_rows(card: Mapping[str, Any], unit: Unit) -> Iterator[tuple[str, list[str]]]:
+    """The rows of the table of errors: the model with its interval, the simulator, the trivial predictors."""
+    test, ends = card["test"], card.get("interval") or {}
+    names = [name for name in COLUMNS if name in test]
+
+    def cells(figures: Mapping[str, float], prefix: str = "") -> list[str]:
+        return [unit.show(figures[prefix + name], 3) if prefix + name in figures else "" for name in names]
+
+    between = [f" ({unit.show(ends[n][0], 3)} – {unit.show(ends[n][1], 3)})" if n in ends else "" for n in names]
+    yield "**the model**", [cell + text for cell, text in zip(cells(test), between, strict=True)]
+    if twin := card.get("twin"):
+        yield f"the simulator with {twin['substeps']} substeps a frame instead of {twin['own_substeps']}", cells(twin)
+    if floor := card.get("floor"):
+        yield "predictability limit", cells(floor)
+    for kind, label in PREDICTORS.items():
+        if kind != "model":
+            yield label, cells(test, f"{kind}/")
+
+
+def _scene_count(card: Mapping[str, Any]) -> str:
+    count = card["test_scenes"]
+    return "one test scene" if count == 1 else f"{count} test scenes"
+
+
+def _quality(quality: Mapping[str, Any], name: str) -> str:
+    (label, factor, unit), (mean, low, high) = QUALITY[name], quality[name]
+    return f"{label} {factor * mean:.3g} ({factor * low:.3g} – {factor * high:.3g}){unit}"
+
+
+def _constraints(card: Mapping[str, Any]) -> list[str]:
+    """What the constraints that act enforce."""
+    acting = {name: value for name, value in card["constraints"].items() if value}
+    if not card["obstacles"]:
+        acting.pop("solids", None)
+    return [CONSTRAINTS[name].format(value=value) for name, value in acting.items()]
+
+
+def _stress(digest: Mapping[str, Any] | None) -> str:
+    """The outcome of stress tests, such as `40 of 42 pass, quick (failed: 2 of "settling")`."""
+    if digest is None:
+        return "not run"
+    groups = Counter(name.partition(":")[0] for name in digest["failed"])
+    failed = ", ".join(f'{count} of "{group}"' for group, count in groups.items())
+    total = digest["passed"] + len(digest["failed"])
+    return f"{digest['passed']} of {total} pass, {digest['size']}{f' (failed: {failed})' if failed else ''}"
+
+
+def write_index(root: Path, names: Sequence[str]) -> Path:
+    """Write the table of a zoo's models, `README.md` in its folder; entries with a damaged card are left out."""
+    entries = []
+    for name in names:
+        try:
+            card = read_card(root / name)
+            recipe = read_recipe(read_yaml(root / name / CONFIG))
+            times = "; ".join(f"{time:.2g} ({hardware})" for hardware, time in stated_milliseconds(card).items())
+            entries.append((table_row({**card, "name": name}), times, _scene_cells(card, recipe)))
+        except (ZooError, DataError, *MALFORMED):
+            continue
+    text = _TEMPLATES.get_template("index.md").render(
+        entries=entries,
+        factor=f"{FACTOR:g}",
+        thousandths=lambda value: "" if value is None else f"{1e3 * value:.3g}",
+    )
+    with atomic_write(root / "README.md") as part:
+        part.write_text(text, encoding="utf-8")
+    return root / "README.md"
+
+
+def _scene_cells(card: Mapping[str, Any], recipe: EmulatorRecipe) -> list[str]:
+    scene = recipe.scene
+    return [
+        ", ".join(scene.materials),
+        " × ".join(f"{high - low:.3g}" for low, high in scene.bounds),
+        str(card.get("particles", "")),
+        f"{1e3 * scene.dt:.3g}",
+        _gravity(scene),
+        "yes" if scene.obstacles else "no",
+        " × ".join(str(count) for count in recipe.grid.shape),
+        str(recipe.frames),
+    ]
+
+
+def _gravity(scene: Scene) -> str:
+    if scene.gravity_varies:
+        return "any"
+    if scene.gravity is None:
+        return "unknown"
+    return "(" + ", ".join(f"{value:.3g}" for value in scene.gravity) + ")"
+
+
+def draw_chart(folder: Path, name: str) -> Figure | None:
+    """The chart of `errors.csv` and `training.csv` in an entry's folder; None where it has neither."""
+    errors, training = (_read_columns(folder / file) for file in ("errors.csv", "training.csv"))
+    drawn = [columns for columns in (errors, training) if columns]
+    if not drawn:
+        return None
+    figure = Figure(figsize=(4.6 * len(drawn), 3.0), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = iter(figure.subplots(1, len(drawn), squeeze=False)[0])
+    if errors:
+        _draw_errors(next(axes), errors, name)
+    if training:
+        _draw_training(next(axes), training)
+    return figure
+
+
+def _draw_errors(axes: Axes, errors: Mapping[str, Sequence[float]], name: str) -> None:
+    for kind, label in PREDICTORS.items():
+        axes.plot(errors["frame"], [1e3 * value for value in errors[kind]], label=label)
+    # Free fall is exact at first, by ten orders of magnitude more than what the curves are about.
+    lowest = min((1e3 * value for value in errors["model"] if value > 0), default=None)
+    axes.set(xlabel="frame", ylabel="squared error ×10⁻³", yscale="log", title=f"{name}: test scenes")
+    axes.set_ylim(bottom=lowest and lowest / 2)
+    axes.legend(frameon=False, fontsize="small")
+
+
+def _draw_training(axes: Axes, training: Mapping[str, Sequence[float]]) -> None:
+    values = [1e3 * value for value in training["mse"]]
+    axes.plot([seconds / 3600 for seconds in training["seconds"]], values, marker=".")
+    scale = "log" if max(values) > 10 * min(values) else "linear"
+    axes.set(xlabel="hours of training", ylabel="validation MSE ×10⁻³", yscale=scale, title="full rollouts")
+
+
+def _read_columns(path: Path) -> dict[str, list[float]]:
+    """The columns of a table; empty where there is none."""
+    if not path.is_file():
+        return {}
+    with path.open(encoding="utf-8-sig") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [float("nan" if row[name] == "" else row[name]) for row in rows] for name in rows[0]} if rows else {}

@@ -1,0 +1,130 @@
+"""Rewrite an entry's card with what is measured of it, and the README and chart that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from filelock import BaseFileLock, FileLock
+
+from nmpm._support.atomic import atomic_write
+from nmpm._support.bounded_files import check_characters, to_yaml
+from nmpm._support.messages import one_line
+from nmpm._support.shipped import user_home
+from nmpm.errors import DataError, ZooError
+from nmpm.zoo.card import CARD
+from nmpm.zoo.entries import load_entry, read_card
+from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts
+from nmpm.zoo.measures.simulator import floor_facts, twin_facts
+from nmpm.zoo.measures.speed import speed_facts
+from nmpm.zoo.pages import CHART, MALFORMED, draw_chart, entry_page
+from nmpm.zoo.pretrained import Pretrained
+
+Measure = Callable[[Pretrained, Path, Path | None], dict[str, Any]]
+
+MEASURES: Mapping[str, Measure] = MappingProxyType(
+    {
+        "speed": speed_facts,
+        "quality": quality_facts,
+        "twin": twin_facts,
+        "floor": floor_facts,
+        "stress": stress_facts,
+        "invariants": invariant_facts,
+    }
+)
+"""What `nmpm zoo refresh --measure` adds to cards.
+
+A measure takes a model, its entry's folder and the folder of its data, or None to simulate its test scenes from their
+seeds; it returns the keys of the card that it replaces, and may write pictures into the entry's folder.
+"""
+
+
+def writing() -> BaseFileLock:
+    """A lock that lets one process of this user at a time write to entries."""
+    user_home().mkdir(parents=True, exist_ok=True)
+    return FileLock(user_home() / "zoo.lock")
+
+
+def refresh(
+    folder: Path,
+    measures: Sequence[str] = (),
+    data: Path | None = None,
+    failures: str | None = None,
+    device: torch.device | str = "cpu",
+) -> None:
+    """Measure what is asked for, and rewrite an entry's card, README and chart.
+
+    The golden rollout is kept, as replacing it would hide a change of the results. The card is written after each
+    measure, with what others wrote to it meanwhile.
+
+    Args:
+        folder: Of the entry.
+        measures: Of `MEASURES`.
+        data: Folder of the dataset, which spares the simulation of the test scenes; needed for recorded data.
+        failures: What the entry's pictures show to be wrong in its rollouts, in sentences, for the card; empty to state
+            nothing, None to leave what the card states.
+        device: Where the speed is measured, as for `Zoo.load`; everything else is measured on the CPU.
+
+    Raises:
+        ZooError: if a file is missing or damaged, a measure is unknown, or the weights are replaced meanwhile.
+        ConfigError: if what is to be measured needs a simulator, data or a device that are not there.
+    """
+    unknown = sorted(set(measures) - set(MEASURES))
+    if unknown:
+        raise ZooError(f"--measure {' '.join(unknown)}: what can be measured is {', '.join(MEASURES)}.")
+    model = load_entry(folder)
+    weights = str(model.card["sha256"])
+    add_facts(folder, weights, {} if failures is None else {"failures": " ".join(failures.split())})
+    for name in measures:
+        measured = model.to(device) if name == "speed" else model
+        add_facts(folder, weights, MEASURES[name](measured, folder, data))
+
+
+def add_facts(folder: Path, weights: str, facts: Mapping[str, Any]) -> None:
+    """Write facts about an entry's weights to its card, beside what others wrote to it meanwhile.
+
+    Args:
+        folder: Of the entry.
+        weights: SHA-256 of the weights that the facts are about.
+        facts: Keys of the card, with their values; keys with an empty text are removed.
+
+    Raises:
+        ZooError: if the entry has other weights by now.
+    """
+    with writing():
+        card = read_card(folder)
+        if card.get("sha256") != weights:
+            measured = ", ".join(facts) or "its card"
+            raise ZooError(f"{folder}: its weights were replaced while {measured} was measured; measure it again.")
+        write_card(folder, {key: value for key, value in {**card, **facts}.items() if value != "" or key == "about"})
+
+
+def write_card(folder: Path, card: Mapping[str, Any]) -> None:
+    """Write an entry's card, and the chart and README that follow from it.
+
+    Raises:
+        ZooError: if they cannot be made, as something is missing; nothing is written.
+    """
+    try:
+        check_characters(card, folder / CARD)
+    except DataError as error:
+        raise ZooError(str(error)) from error
+    try:
+        chart = draw_chart(folder, card["name"])
+        pictures = {path.name for path in folder.iterdir()} | ({CHART} if chart else set())
+        page = entry_page(card, pictures)
+    except MALFORMED as error:
+        raise ZooError(
+            f"{folder / CARD} or a table beside it is not complete ({type(error).__name__}: {one_line(error)})."
+            " `nmpm zoo card NAME --yaml` shows what the card has; `nmpm zoo add` writes a new one from the run."
+        ) from error
+    with atomic_write(folder / CARD) as part:
+        part.write_text(to_yaml(card), encoding="utf-8")
+    if chart is not None:
+        with atomic_write(folder / CHART) as part:
+            chart.savefig(part, format="png")
+    with atomic_write(folder / "README.md") as part:
+        part.write_text(page, encoding="utf-8")
