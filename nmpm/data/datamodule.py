@@ -14,7 +14,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.pinning import pin_for
+from nmpm.data.loading.padded_batch import pin_for
 from nmpm.data.loading.sources import DataSource, FolderSource, HubSource, StatedFacts
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError, DataError

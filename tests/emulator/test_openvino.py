@@ -197,14 +197,14 @@ faulthandler.enable()
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells make it ignored in background jobs
 import torch
 from scenes import box, cloud
-from nmpm._support.signal_stack import _Stack
 from nmpm.emulator import EmulatorRecipe, stream
+from nmpm.emulator.runtimes.openvino import SignalStack
 from nmpm.processors import Pointwise
 from nmpm.transfer import without_kernels
 
 def signal_stack():
     import ctypes
-    stack = _Stack()
+    stack = SignalStack()
     ctypes.CDLL(None).sigaltstack(None, ctypes.byref(stack))
     return stack.pointer, stack.flags, stack.size
 

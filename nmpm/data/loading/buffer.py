@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from nmpm.data.loading.background import Task
+from nmpm._support.threads import Task
 from nmpm.data.loading.padded_batch import PaddedRecordings, displacements
 from nmpm.data.loading.recording import Recording
 from nmpm.data.loading.window_plan import Drawn, WindowPlan

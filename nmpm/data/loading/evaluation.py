@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import torch
 
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.pinning import pin_for
+from nmpm.data.loading.padded_batch import collate, pin_for
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.particles import Window
 

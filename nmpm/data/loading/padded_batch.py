@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -115,6 +115,11 @@ def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = 
     """
     frames = len(recordings[0].frames) if length is None else length
     return PaddedRecordings.stack(recordings, scene).gather(range(len(recordings)), [0] * len(recordings), frames)
+
+
+def pin_for(device: torch.device, batches: Iterator[Window]) -> Iterator[Window]:
+    """Pins batches in host memory where they will be copied to a GPU, so that its work overlaps with the copies."""
+    return map(Window.pin_memory, batches) if device.type == "cuda" else batches
 
 
 def unwrap(frames: Tensor, scene: Scene) -> None:

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import own_gravity
-from nmpm.data.loading.background import raise_if_abandoned
 from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Scene

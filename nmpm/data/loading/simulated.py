@@ -13,11 +13,10 @@ from threading import Lock
 from typing import Any
 
 from nmpm._support.progress import progress_bar
-from nmpm._support.threads import usable_cores
+from nmpm._support.threads import Task, raise_if_abandoned, usable_cores
 from nmpm.data import catalog
 from nmpm.data.format import SPLITS, Trajectory
 from nmpm.data.generate import preset_metadata
-from nmpm.data.loading.background import Task, raise_if_abandoned
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import Recording, RecordingReader
 from nmpm.data.loading.sources import DataSource

@@ -7,6 +7,7 @@ the order of the program's, which is that of the kernels of `nmpm.emulator.fused
 from __future__ import annotations
 
 import copy
+import ctypes
 import importlib.util
 import sys
 import warnings
@@ -20,7 +21,6 @@ import torch
 from torch import Tensor, nn
 
 from nmpm._support.messages import one_line
-from nmpm._support.signal_stack import kept_signal_stack
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.emulator.runtimes.runtime import Runtime, refuse_gradients
 from nmpm.errors import ConfigError
@@ -169,3 +169,27 @@ def _without_telemetry() -> Iterator[None]:
         yield
     finally:
         del sys.modules[name]
+
+
+class SignalStack(ctypes.Structure):
+    """`stack_t` of Linux."""
+
+    _fields_ = (("pointer", ctypes.c_void_p), ("flags", ctypes.c_int), ("size", ctypes.c_size_t))
+
+
+@contextmanager
+def kept_signal_stack() -> Iterator[None]:
+    """Restore this thread's alternate signal stack on leaving. No-op on systems other than Linux.
+
+    Python's handlers, Ctrl-C's among them, run on it. OpenVINO's CPU plugin installs one when it is loaded, too small
+    for them on processors with wide registers: the next signal ended the process by a segmentation fault.
+    """
+    if sys.platform != "linux":
+        yield
+        return
+    library, before = ctypes.CDLL(None), SignalStack()
+    library.sigaltstack(None, ctypes.byref(before))
+    try:
+        yield
+    finally:
+        library.sigaltstack(ctypes.byref(before), None)

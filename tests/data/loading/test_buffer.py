@@ -10,9 +10,9 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.background import raise_if_abandoned
 from nmpm.data.loading.buffer import MotionSampler, TrajectoryBuffer
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.window_plan import OPENING, WindowPlan

@@ -5,9 +5,9 @@ from itertools import islice
 import pytest
 import torch
 
+from nmpm._support.threads import AbandonedError, Task
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split
-from nmpm.data.loading.background import AbandonedError, Task
 from nmpm.data.loading.buffer import TrajectoryBuffer
 from nmpm.data.loading.simulated import SimulatedRecordings
 from nmpm.data.loading.window_plan import EndlessWindowPlan

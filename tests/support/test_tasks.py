@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from nmpm.data.loading.background import AbandonedError, Task, raise_if_abandoned
+from nmpm._support.threads import AbandonedError, Task, raise_if_abandoned
 
 
 def test_a_task_gives_the_value_or_the_error_of_its_function():
@@ -51,7 +51,7 @@ for _, window in zip(range(20), data.train_dataloader()):
 SIMULATES = """
 import dataclasses, time
 from nmpm.data import simulation
-from nmpm.data.loading.background import Task
+from nmpm._support.threads import Task
 from nmpm.data.loading.simulated import SimulatedRecordings
 from nmpm.sim import load_preset
 simulation.FRAMES_PER_PROCESS = 1
