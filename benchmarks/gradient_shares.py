@@ -24,10 +24,10 @@ from torch import Tensor
 from nmpm._support.shipped import find_config
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Rollout
-from nmpm.emulator.rollouts import recomputed
+from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.particles import Window
 from nmpm.training import EmulatorModule
-from nmpm.training.unrolling import Discount, unroll_training
+from nmpm.training.backpropagation import Discount
 from nmpm.zoo import Zoo
 
 LOSS = ("error_power", "density_weight")
@@ -35,7 +35,8 @@ LOSS = ("error_power", "density_weight")
 
 def gradient(module: EmulatorModule, window: Window, factor: float) -> Tensor:
     """(P,) that of a window's training error with respect to all weights, discounted, in float64."""
-    bundles = unroll_training(module.emulator, window.initial, module.unroll, recomputed, Discount(factor))
+    discount = Discount(factor)
+    bundles = unroll_with_gradients(module.emulator, window.initial, module.unroll, recomputed, discount.state_after)
     predicted = Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles])
     weights = list(module.emulator.parameters())
     slopes = torch.autograd.grad(module._error(predicted, window), weights)

@@ -5,7 +5,11 @@ In a single process they are no-ops. In several, every rank must call them, in t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import torch
@@ -112,3 +116,20 @@ def normal_like(values: Tensor) -> Tensor:
     # A meta tensor has no memory, but a memory order, which decides the order of the numbers drawn.
     layout = torch.cat([values.to("meta")] * world)
     return rank_slice(lambda _: torch.randn_like(layout, device=values.device), len(values))
+
+
+def is_lost_connection(error: RuntimeError) -> bool:
+    """Whether a collective failed as another rank had ended, as far as the error's text tells."""
+    return bool(re.search(r"gloo|NCCL|connection (was )?(closed|reset|refused)|broken pipe", str(error), re.IGNORECASE))
+
+
+def describe_ended_rank(processes: Sequence[subprocess.Popen[bytes]]) -> str:
+    """Which of rank 0's child processes, ranks 1 and up, has ended within 2 seconds, and how."""
+    end = time.monotonic() + 2.0
+    while processes and time.monotonic() < end:
+        for rank, process in enumerate(processes, 1):
+            if status := process.poll():
+                how = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+                return f"rank {rank} (process {process.pid}) {how}"
+        time.sleep(0.01)
+    return "another rank has ended or cannot be reached"

@@ -41,14 +41,8 @@ def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
         yield lines.step
         lines.end()
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-    )
+    times = (TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn())
+    columns = (BarColumn(bar_width=20), MofNCompleteColumn(), *times, TextColumn("{task.description}"))
     # Drawn once a second, as times are measured beside it.
     with Progress(*columns, console=console, transient=True, refresh_per_second=1) as progress:
         task = progress.add_task(what, total=total, completed=done)

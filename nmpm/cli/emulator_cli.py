@@ -19,6 +19,7 @@ from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.collectives import describe_ended_rank, is_lost_connection
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.early_checks import UsageError
@@ -29,21 +30,16 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
-from nmpm.training.callbacks.best_checkpoint import BestCheckpoint
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.forecast import Forecast
-from nmpm.training.callbacks.last_checkpoint import LastCheckpoint
-from nmpm.training.callbacks.prediction_writer import PredictionWriter
+from nmpm.training.callbacks.outputs import PredictionWriter, ReportWriter
 from nmpm.training.callbacks.progress import Progress
-from nmpm.training.callbacks.report import ReportWriter
+from nmpm.training.callbacks.savers import BestCheckpoint, LastCheckpoint
 from nmpm.training.callbacks.threads import Threads
-from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
-from nmpm.training.compatibility import check_same_recipe
-from nmpm.training.lost_rank import LostRankError, is_lost_connection, lost_rank
-from nmpm.training.module import OVERALL, EmulatorModule
+from nmpm.training.checkpoints import AtomicCheckpointIO, check_same_recipe, read_checkpoint
+from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.precision import fitting_precision
-from nmpm.training.preflight import Preflight, check_disk
+from nmpm.training.preflight import OVERALL, check_disk, fitting_precision
 from nmpm.training.run_folder import RunFolder
 from nmpm.zoo.registry import load_model
 
@@ -176,7 +172,7 @@ class EmulatorCLI(LightningCLI):
             table = CSVLogger(config["default_root_dir"], name="logs")
             kwargs["logger"] = [table, TensorBoardLogger(table.root_dir, name="", version=table.version)]
             callbacks.append(LearningRateMonitor("step"))
-        callbacks += [Preflight(), Forecast()]  # whose lines come before the bar's
+        callbacks.append(Forecast())  # whose lines come before the bar's
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(Progress())
         self.report = ReportWriter()
@@ -247,10 +243,7 @@ class EmulatorCLI(LightningCLI):
             f" {weights:,} parameters, on {hardware}.\n"
         )
         if self.replaced_precision:
-            sys.stdout.write(
-                f"Computed in {self.trainer.precision}: this processor has no instructions for bfloat16, without which"
-                f" {self.replaced_precision} takes many times as long.\n"
-            )
+            sys.stdout.write("bfloat16 is emulated on this processor; training in float32.\n")
         sys.stdout.flush()
 
     def before_validate(self) -> None:
@@ -286,7 +279,7 @@ class EmulatorCLI(LightningCLI):
 
         Raises:
             KeyboardInterrupt: at SIGINT and SIGTERM.
-            LostRankError: if another rank has ended.
+            NmpmError: if another rank has ended.
         """
         try:
             self.trainer.fit(**options)
@@ -300,8 +293,17 @@ class EmulatorCLI(LightningCLI):
         except RuntimeError as error:
             if not is_lost_connection(error):
                 raise
-            lost = lost_rank(self.trainer, self.parent)
-            raise LostRankError(f"{lost}: {self._how_to_go_on()}") if lost else SystemExit(1) from None
+            raise self._lost_rank_error() from None
+
+    def _lost_rank_error(self) -> BaseException:
+        """Names the rank that has ended, on one of those that are left: rank 0, or rank 1 where rank 0 has."""
+        if self.trainer.is_global_zero:
+            ended = describe_ended_rank(getattr(self.trainer.strategy.launcher, "procs", []))
+        elif self.trainer.global_rank == 1 and os.getppid() != self.parent:
+            ended = f"rank 0 (process {self.parent}) has ended"
+        else:
+            return SystemExit(1)
+        return NmpmError(f"{ended}: {self._how_to_go_on()}")
 
     def _how_to_go_on(self) -> str:
         last = self.run_folder.checkpoints["last"]

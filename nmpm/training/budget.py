@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
@@ -40,20 +39,14 @@ class Clock:
         ranks exchange it every `CLOCK_EVERY` steps only.
         """
         timers = _timers(trainer)
-        if not timers:
-            return 0.0
-        if trainer.world_size == 1 or step % CLOCK_EVERY == 0:
+        if timers and (trainer.world_size == 1 or step % CLOCK_EVERY == 0):
             elapsed = max(timer.time_elapsed() / (timer._duration or 1.0) for timer in timers)
             self._share = broadcast_from_rank0(min(elapsed, 1.0), trainer.strategy.root_device)
         return self._share
 
 
 def check_end(trainer: Trainer) -> None:
-    """Make sure that a training ends. Loads its data.
-
-    Raises:
-        ConfigError: if neither its steps nor its time are limited.
-    """
+    """Raise ConfigError if neither the steps nor the time of a training are limited. Loads its data."""
     if math.isinf(total_steps(trainer)) and not _stops_by_time(trainer):
         raise ConfigError(ENDLESS)
 
@@ -78,41 +71,6 @@ def check_endless_batches(trainer: Trainer) -> None:
     counted = isinstance(limit, int) and (trainer.max_epochs or -1) > 0
     if trainer.max_steps == -1 and not counted and not _stops_by_time(trainer):
         raise ConfigError(ENDLESS)
-
-
-class TimeLeft(NamedTuple):
-    """How far a training is.
-
-    Attributes:
-        share: That is over, of steps or time, whichever is further; in [0, 1].
-        seconds: Until it ends; None before the first step where only steps are limited.
-        ends_by: "max_time" or "the last step", whichever comes first; empty where only one of them is limited.
-    """
-
-    share: float
-    seconds: float | None
-    ends_by: str
-
-
-def time_left(trainer: Trainer, first_step: int, elapsed: float) -> TimeLeft:
-    """How far a training is, by steps or by time, whichever ends first.
-
-    Args:
-        trainer: Training.
-        first_step: Step at which this process began.
-        elapsed: Seconds since then.
-    """
-    total, taken, remaining = total_steps(trainer), trainer.global_step - first_step, seconds_left(trainer)
-    share, left = trainer.global_step / max(total, 1), math.inf
-    if taken and math.isfinite(total):
-        left = elapsed / taken * (total - trainer.global_step)
-    for timer in _timers(trainer):
-        share = max(share, timer.time_elapsed() / (timer._duration or 1.0))
-    ends_by = ""
-    if math.isfinite(remaining) and math.isfinite(total):
-        ends_by = "max_time" if remaining < left else "the last step"
-    seconds = min(left, remaining)
-    return TimeLeft(min(share, 1.0), seconds if math.isfinite(seconds) else None, ends_by)
 
 
 def seconds_left(trainer: Trainer) -> float:
@@ -140,9 +98,9 @@ def validation_interval(trainer: Trainer, pace: float) -> float:
 
 
 def _timers(trainer: Trainer) -> list[Timer]:
-    """Those that limit the training: the trainer's `max_time`, and timers among its callbacks."""
+    """The timers that limit a training: the trainer's `max_time`, and others among its callbacks."""
     callbacks = trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
-    return [one for one in callbacks if isinstance(one, Timer) and one._duration is not None]
+    return [callback for callback in callbacks if isinstance(callback, Timer) and callback._duration is not None]
 
 
 def _stops_by_time(trainer: Trainer) -> bool:

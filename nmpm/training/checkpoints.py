@@ -1,22 +1,32 @@
-"""Read checkpoints as tensors and plain data, without executing anything in them; write them atomically."""
+"""Checkpoints: read as tensors and plain data, written atomically, compared with the model that goes on from them."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from torch import Tensor
+from torch.optim import Optimizer
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
-from nmpm.errors import DataError, NmpmError
-from nmpm.training.module import EmulatorModule
+from nmpm._support.plain_data import class_path, to_plain
+from nmpm.emulator import EmulatorRecipe
+from nmpm.errors import ConfigError, DataError, NmpmError
+from nmpm.scene import Scene
 
-FORMER_ARGUMENTS = frozenset({"horizons", "emd"})
-"""Hyperparameters of version 0.1.0 that the model no longer has: metrics are now chosen for each evaluation."""
+if TYPE_CHECKING:
+    from nmpm.training.module import EmulatorModule
+
+COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
+"""Parts of a recipe that its weights were trained for; constraints and noise may change."""
+UNREPORTED = ("scene", "recompute", "compile")
+"""Hyperparameters that are compared elsewhere, or without influence on the result."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -49,23 +59,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain data, which"
             f" is never executed. Use another, such as best.ckpt or last.ckpt beside it. ({reason})"
         ) from error
-    if not isinstance(content, dict) or "state_dict" not in content:
+    if not isinstance(content, dict) or not isinstance(weights := content.get("state_dict"), dict):
         raise DataError(f"{path} is not a checkpoint of a training: it has no state_dict.")
-    _check_digest(content, path)
-    return content
-
-
-def _check_digest(content: dict[str, Any], path: Path) -> None:
-    """Make sure that the weights are those that were saved; checkpoints of version 0.1.0 state no digest."""
-    stated, weights = content.get("nmpm_digest"), content["state_dict"]
-    if stated is None:
-        return
-    whole = isinstance(weights, dict) and all(isinstance(values, Tensor) for values in weights.values())
-    if not whole or weights_digest(weights) != stated:
+    tensors = all(isinstance(values, Tensor) for values in weights.values())
+    if "nmpm_digest" in content and not (tensors and weights_digest(weights) == content["nmpm_digest"]):
         raise DataError(
             f"{path} is damaged: its weights are not those that were saved. Use another checkpoint, such as best.ckpt"
             " or last.ckpt beside it."
         )
+    return content
 
 
 def load_module(path: Path) -> EmulatorModule:
@@ -75,13 +77,14 @@ def load_module(path: Path) -> EmulatorModule:
         DataError: if the file cannot be read, or is not a checkpoint of an emulator.
         ConfigError: if a newer nmpm wrote it, or it names an unknown part.
     """
+    from nmpm.training.module import EmulatorModule  # (which imports this module)
+
     content = read_checkpoint(path)
     stored = content.get("hyper_parameters", {})
     if not isinstance(stored, dict) or not isinstance(stored.get("scene", {}), dict):
         raise DataError(f"{path} is not a checkpoint of an emulator: its hyperparameters are not named values.")
-    arguments = {key: value for key, value in stored.items() if key not in FORMER_ARGUMENTS}
     try:
-        module = EmulatorModule(**arguments)
+        module = EmulatorModule(**stored)
         module.on_load_checkpoint(content)
         module.load_state_dict(content["state_dict"])
     except NmpmError:
@@ -90,3 +93,124 @@ def load_module(path: Path) -> EmulatorModule:
         reason = f"{type(error).__name__}: {one_line(error)}"
         raise DataError(f"{path} is not a checkpoint of an emulator of this version ({reason}).") from error
     return module
+
+
+def check_horizon(frames: int, unroll: int, horizon: int) -> None:
+    """Raise ConfigError if training windows are shorter than what a training step predicts; longer ones are cut."""
+    if horizon < frames * unroll:
+        raise ConfigError(
+            f"data.horizon = {horizon} is shorter than the {frames * unroll} frames that a training step predicts"
+            f" (model.frames = {frames} times model.unroll = {unroll}): give TrajectoryDataModule"
+            f" horizon={frames * unroll}, or unroll less."
+        )
+
+
+def check_same_scene(model: Scene, data: Scene) -> None:
+    """Raise ConfigError, naming the facts in which they differ, if a model's scene is not that of its data."""
+    different = model.differences(data)
+    if different:
+        facts = "; ".join(f"{name} = {getattr(model, name)}, not {getattr(data, name)}" for name in different)
+        raise ConfigError(
+            f"The model was made for other scenes than the data's: {facts}. For another box, or other particles, take"
+            " EmulatorModule.of(emulator.over(data.scene)); what else differs needs a model of its own."
+        )
+
+
+def check_same_recipe(hyper_parameters: Mapping[str, Any], recipe: EmulatorRecipe) -> None:
+    """Make sure that a checkpoint's weights suit the recipe of the model that is to load them.
+
+    Raises:
+        ConfigError: naming the parts that differ with both values, or if the stored recipe cannot be read.
+    """
+    names = {field.name for field in dataclasses.fields(EmulatorRecipe)}
+    stored = EmulatorRecipe.from_dict({name: value for name, value in hyper_parameters.items() if name in names})
+    check_same_scene(stored.scene, recipe.scene)
+    if stored.scene.output_channels != recipe.scene.output_channels or stored.scene.fields != recipe.scene.fields:
+        raise ConfigError(
+            f"The checkpoint was trained with the fields {_listed(stored.scene.fields)}, the model has"
+            f" {_listed(recipe.scene.fields)}. Declare the same (data.fields); nmpm test, predict and rollout run it on"
+            " scenes with more or fewer."
+        )
+    old, new = stored.to_dict(), recipe.to_dict()
+    differences = [
+        f"{name} = {before}, not {after}"
+        for part in COMPARED
+        for name, before, after in _differences(old[part], new[part], f"model.{part}")
+    ]
+    if differences:
+        raise ConfigError(
+            f"The checkpoint has {'; '.join(differences)}. Give the checkpoint's values, or train the new form in"
+            " another folder (--trainer.default_root_dir)."
+        )
+
+
+def adopt_arguments(checkpoint: Mapping[str, Any], current: Mapping[str, Any], optimizer: Optimizer) -> list[str]:
+    """Let a training go on from a checkpoint with other arguments, those of its optimizer among them.
+
+    Args:
+        checkpoint: Changed in place; the optimizer's state is kept.
+        current: The hyperparameters to go on with.
+        optimizer: With the arguments to go on with.
+
+    Returns:
+        What has changed, such as "model.optimizer.lr = 0.001 (was 0.003)".
+
+    Raises:
+        ConfigError: if the checkpoint has the state of another kind of optimizer.
+    """
+    kind, stored = class_path(type(optimizer)), checkpoint["hyper_parameters"]
+    stored_kind = checkpoint.get("nmpm_optimizer", kind)
+    if stored_kind != kind:
+        raise ConfigError(
+            f"The checkpoint has model.optimizer = {stored_kind}, not {kind}. Give the checkpoint's optimizer to go on;"
+            " to train its weights by another, use EmulatorModule.of."
+        )
+    changed = [
+        f"{name} = {new} (was {old})"
+        for argument in current.keys() - {*COMPARED, *UNREPORTED}
+        for name, old, new in _differences(stored.get(argument), current[argument], f"model.{argument}")
+    ]
+    return sorted(changed) + _adopt_optimizer_arguments(checkpoint, optimizer)
+
+
+def _adopt_optimizer_arguments(checkpoint: Mapping[str, Any], optimizer: Optimizer) -> list[str]:
+    """Replace the optimizer's arguments in a checkpoint; the learning rate keeps its place in the schedule.
+
+    Without it, the arguments of a resumed training would silently be the checkpoint's, whatever the user gives.
+    """
+    states, schedules = checkpoint.get("optimizer_states") or [], checkpoint.get("lr_schedulers") or []
+    if not states:
+        return []
+    changed: dict[str, None] = {}
+    for stored, current in zip(states[0]["param_groups"], optimizer.param_groups, strict=False):
+        for name in sorted(optimizer.defaults.keys() & stored.keys() & current.keys()):
+            key, new = "initial_lr" if name == "lr" and "initial_lr" in stored else name, current[name]
+            if to_plain(stored[key]) == to_plain(new):
+                continue
+            changed[f"model.optimizer.{name} = {new} (was {stored[key]})"] = None
+            if key == "initial_lr":
+                stored["lr"] *= new / stored[key]
+            stored[key] = new
+    rates = [group["initial_lr"] for group in states[0]["param_groups"] if "initial_lr" in group]
+    for schedule in schedules:
+        if rates and len(schedule.get("base_lrs", ())) == len(rates):
+            schedule["base_lrs"] = rates
+    return list(changed)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _differences(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
+    """(name, old, new) for each value that differs; classes that differ stand for their arguments."""
+    if old == new:
+        return
+    if not (isinstance(old, Mapping) and isinstance(new, Mapping)):
+        yield name, old, new
+    elif old.get("class_path") != new.get("class_path"):
+        yield name, old.get("class_path"), new.get("class_path")
+    else:
+        for key in {**old, **new}:
+            inner = name if key == "init_args" else f"{name}.{key}"
+            yield from _differences(old.get(key), new.get(key), inner)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch import Callback, LightningModule
+from lightning.pytorch import Callback
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
@@ -18,47 +18,29 @@ from torch import Tensor
 from nmpm._support.collectives import global_mean
 from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
-from nmpm.emulator import Emulator, EmulatorRecipe, Rollout, predict_rollout
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.emulator import Emulator, EmulatorRecipe, Rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import compile_network
 from nmpm.emulator.recipe import FORMAT, check_format
-from nmpm.emulator.rollouts import recomputed
+from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
-from nmpm.evaluation.comparison import Comparison
-from nmpm.metrics import MSE, RolloutMetric, overall_error
+from nmpm.metrics import RolloutMetric
 from nmpm.particles import Window
 from nmpm.scene import Scene
+from nmpm.training import checkpoints, preflight
 from nmpm.training.augmentation import Augmentation
+from nmpm.training.backpropagation import Discount, direct, mean_over_parts
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.compatibility import (
-    adopt_optimizer_arguments,
-    changed_arguments,
-    check_horizon,
-    check_same_optimizer,
-    check_same_recipe,
-    check_same_scene,
-)
+from nmpm.training.evaluation import EvaluatedModule
 from nmpm.training.losses import FieldError, TrainingError
-from nmpm.training.optimization import OptimizerCallable, adam, build_optimizer, with_learning_rate
-from nmpm.training.parts import MOST_PARTS, mean_over_parts, on_threads, split_rows
-from nmpm.training.precision import warn_of_slow_precision
-from nmpm.training.schedules import Schedule
-from nmpm.training.trainer_checks import (
-    check_evaluating_trainer,
-    check_new,
-    check_resuming_trainer,
-    check_trainer,
-)
-from nmpm.training.unrolling import Discount, direct, unroll_training
+from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 
 CALIBRATION_BATCHES = 4
 
-OVERALL = "overall"
-"""Name of the validation error by which the best checkpoint is chosen, see `overall_error`."""
 
-
-class EmulatorModule(LightningModule):
+class EmulatorModule(EvaluatedModule):
     """Trains an emulator on windows; validates and tests it by full rollouts.
 
     Args:
@@ -70,8 +52,7 @@ class EmulatorModule(LightningModule):
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
         density_weight: Weight of the density error at each bundle's last frame, beside the position error; 0 for none.
-        field_weight: Weight of the error of evolving fields, such as a temperature, in units of their spread; 0 for
-            none.
+        field_weight: Weight of the error of evolving fields, such as a temperature, in units of their spread.
         error_power: Power, in (0, 1], to which the position error, in cells², of each window and bundle is raised
             before the mean, as are those of fields. At 0.5, calm windows and early bundles weigh as much as splashes;
             at 1, mean squares.
@@ -81,16 +62,10 @@ class EmulatorModule(LightningModule):
             wall layer: where cells lie is chance, on which little should depend.
         metrics: Errors that validations and tests report, see `nmpm.metrics`.
         recompute: Whether gradients recompute each bundle instead of keeping its activations: the memory of one bundle
-            instead of K, for the time of one more forward pass.
-        compile: Whether to compile the network by torch.compile, where that works. It takes half a minute or more at
-            the start; on a CPU it gains next to nothing.
+            instead of K, for one more forward pass.
+        compile: Whether to compile the network by torch.compile, which takes half a minute or more; no gain on a CPU.
         seed: Of the noise.
         recipe: The emulator's form: the further arguments of `EmulatorRecipe`.
-
-    Attributes:
-        parts: In how many parts a batch is computed on a CPU; None for as many as torch has threads, at most 4. Other
-            numbers change results by rounding.
-        threads: How many threads compute them; None for one each. Changes no result.
     """
 
     def __init__(
@@ -113,9 +88,8 @@ class EmulatorModule(LightningModule):
         seed: int = 0,
         **recipe: Any,
     ) -> None:
-        super().__init__()
-        self.emulator = EmulatorRecipe(scene, **recipe).build()
-        scene = self.emulator.scene
+        emulator = EmulatorRecipe(scene, **recipe).build()
+        super().__init__(emulator, emulator.frames * unroll, metrics)
         if not 0 <= unroll_growth <= 1:
             raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
         self.unroll, self.unroll_growth = unroll, unroll_growth
@@ -125,14 +99,10 @@ class EmulatorModule(LightningModule):
         self.error = TrainingError(density_weight, error_power)
         self.field_error = FieldError(field_weight, error_power)
         self.augmentation = Augmentation(tuple(mirror), jitter, position_noise)
-        self.augmentation.check(scene, self.emulator.grid)
+        self.augmentation.check(emulator.scene, emulator.grid)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
-        self.parts: int | None = None
-        self.threads: int | None = None
-        plain = self.emulator.recipe.to_dict()
-        del plain["format"]  # (of the checkpoint, see on_save_checkpoint)
-        own = {
+        arguments = emulator.recipe.to_dict() | {
             "unroll": unroll,
             "unroll_growth": unroll_growth,
             "gradient_discount": gradient_discount,
@@ -147,10 +117,8 @@ class EmulatorModule(LightningModule):
             "compile": compile,
             "seed": seed,
         }
-        self.save_hyperparameters(plain | own, logger=False)
-        chosen = [MSE()] if metrics is None else list(metrics)
-        self.valid_errors = Comparison(scene, [metric for metric in chosen if metric.cheap])
-        self.test_errors = Comparison(scene, chosen)
+        del arguments["format"]  # (of the checkpoint, see on_save_checkpoint)
+        self.save_hyperparameters(arguments, logger=False)
         self._clock = Clock()
         self._steps_before = 0  # of the trainer, in other trainings
         self._configured = self._rate_changed = False
@@ -164,10 +132,9 @@ class EmulatorModule(LightningModule):
         Args:
             emulator: Trained before; of the zoo, or `load_module(path).emulator`.
             options: Arguments of the constructor, such as `unroll` and `optimizer`; those of the recipe replace the
-                emulator's own, for example its `constraints`.
+                emulator's, for example its `constraints`.
         """
-        recipe = {field.name: getattr(emulator.recipe, field.name) for field in dataclasses.fields(emulator.recipe)}
-        module = cls(**(recipe | options))
+        module = cls(**(vars(emulator.recipe) | options))
         module.emulator.load_state_dict(emulator.state_dict())
         return module
 
@@ -183,24 +150,19 @@ class EmulatorModule(LightningModule):
         self._rate_changed = True
 
     def configure_callbacks(self) -> Sequence[Callback] | Callback:
-        """No further callbacks; Lightning asks for them before it prepares data, the moment to check the trainer.
-
-        Raises:
-            ConfigError: naming an option of the trainer that does not work, and what to do instead.
-        """
-        fitting = self.trainer.state.fn == TrainerFn.FITTING
-        if fitting:
-            check_trainer(self.trainer, self)
+        """No further callbacks; Lightning asks for them before it prepares data, the moment to check the trainer."""
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            preflight.check_trainer(self.trainer, self)
         else:
-            check_evaluating_trainer(self.trainer)
+            preflight.check_evaluating_trainer(self.trainer)
         self._steps_before, self._configured = self.trainer.global_step, False
         return super().configure_callbacks()
 
     def setup(self, stage: str) -> None:
-        """Make sure that the data are of the model's scene, and training windows as long as its horizon.
+        """Check that data, model and metrics suit each other.
 
         Raises:
-            ConfigError: naming the facts in which they differ, or both horizons.
+            ConfigError: naming what does not.
 
         Warns:
             UserWarning: naming the fields that the model was trained without.
@@ -208,10 +170,12 @@ class EmulatorModule(LightningModule):
         data = getattr(self.trainer, "datamodule", None)
         scene, horizon = getattr(data, "scene", None), getattr(data, "horizon", None)
         if isinstance(scene, Scene):
-            check_same_scene(self.emulator.scene, scene)
+            checkpoints.check_same_scene(self.emulator.scene, scene)
             warn_of_ignored(self.emulator.scene, scene.fields)
         if stage == TrainerFn.FITTING and isinstance(horizon, int):
-            check_horizon(self.emulator.frames, self.unroll, horizon)
+            checkpoints.check_horizon(self.emulator.frames, self.unroll, horizon)
+        if stage == TrainerFn.FITTING and isinstance(data, TrajectoryDataModule):
+            preflight.check_evaluations(self.trainer, self, data)
 
     def on_fit_start(self) -> None:
         """Compile the network, once the strategy has moved it to the device."""
@@ -222,8 +186,7 @@ class EmulatorModule(LightningModule):
             compile_network(self.emulator.processor, example)
 
     def on_train_start(self) -> None:
-        """Warn of a precision that the processor has no instructions for."""
-        warn_of_slow_precision(self.trainer)
+        preflight.warn_of_slow_precision(self.trainer)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """State the format, the digest of the weights, and which optimizer the stored state belongs to."""
@@ -233,42 +196,29 @@ class EmulatorModule(LightningModule):
             checkpoint["nmpm_optimizer"] = class_path(type(self.trainer.optimizers[0]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Compare the checkpoint with this model, and with its optimizer if a training goes on.
-
-        A training goes on with this model's arguments; those that the checkpoint has otherwise are logged.
+        """Compare the checkpoint with this model; a training goes on with this model's arguments.
 
         Raises:
             ConfigError: if a newer version wrote it, a part differs, or a callback of the trainer cannot go on.
         """
-        check_format(checkpoint.get("nmpm_format", 0), "The checkpoint")
-        check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
-        if self._trainer is not None:  # Lightning does so after loading the weights, which would be rounded
-            self._trainer.precision_plugin.convert_module(self)
-        if self._trainer is not None and self._trainer.state.fn == TrainerFn.FITTING:
+        check_format(checkpoint.get("nmpm_format"), "The checkpoint")
+        checkpoints.check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
+        trainer = self._trainer
+        if trainer is None:
+            return
+        trainer.precision_plugin.convert_module(self)  # Lightning does so after loading the weights, which rounds them
+        if trainer.state.fn == TrainerFn.FITTING:
             if not self._configured:  # (finders load their own checkpoint later)
-                check_resuming_trainer(self._trainer)
+                preflight.check_resuming_trainer(trainer)
                 self._steps_before = 0
-            changed = self.adopt_arguments(checkpoint)
-            if changed:
+            if changed := self.adopt_arguments(checkpoint):
                 step = checkpoint.get("global_step")
                 rank_zero_info(f"Going on from step {step} with changed arguments: {'; '.join(changed)}.")
 
     def adopt_arguments(self, checkpoint: Mapping[str, Any]) -> list[str]:
-        """Make a training go on from a checkpoint with this model's arguments, those of its optimizer among them.
-
-        Args:
-            checkpoint: Changed in place.
-
-        Returns:
-            What differs, such as "model.optimizer.lr = 0.001 (was 0.003)".
-
-        Raises:
-            ConfigError: if its optimizer state is of another optimizer.
-        """
+        """Let a training go on from a checkpoint, changed in place, with this model's arguments; list what differs."""
         optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
-        check_same_optimizer(checkpoint, optimizer)
-        changed = changed_arguments(checkpoint["hyper_parameters"], dict(self.hparams))
-        return changed + adopt_optimizer_arguments(checkpoint, optimizer)
+        return checkpoints.adopt_arguments(checkpoint, dict(self.hparams), optimizer)
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         """Seed the batch's random numbers by its index, so that a resumed run repeats them.
@@ -291,7 +241,8 @@ class EmulatorModule(LightningModule):
         count, call = self.bundles(self._progress()), recomputed if self.recompute else direct
 
         def mean_error(rows: slice) -> Tensor:
-            bundles = unroll_training(emulator, particles.scenes(rows), count, call, self.discount)
+            start = particles.scenes(rows)
+            bundles = unroll_with_gradients(emulator, start, count, call, self.discount.state_after)
             predicted = Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles])
             return self._error(predicted, batch.scenes(rows))
 
@@ -312,53 +263,6 @@ class EmulatorModule(LightningModule):
             spread = emulator.field_scales.spread
             return error + self.field_error(predicted.fields, batch, spread, emulator.frames)
 
-    def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
-        predicted = self._predict(batch)
-        self.valid_errors.update(batch, predicted.position, predicted.fields)
-
-    def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
-        with torch.autocast(self.device.type, enabled=False):  # in the precision that trained models are used in
-            predicted = self._predict(batch)
-        self.test_errors.update(batch, predicted.position, predicted.fields)
-        return predicted.position
-
-    def predict_step(self, batch: Window, batch_idx: int) -> Tensor | Rollout:  # noqa: ARG002
-        """(B, T - 2, N, D) predicted positions; with the fields where the scene has any that evolve."""
-        predicted = self._predict(batch)
-        return predicted if predicted.fields else predicted.position
-
-    def _predict(self, batch: Window) -> Rollout:
-        start, frames, rows = batch.initial, batch.target.shape[1], self.rows(batch)
-        if len(rows) == 1:
-            return predict_rollout(self.emulator, start, frames)
-        parts = on_threads(
-            lambda part: predict_rollout(self.emulator, start.scenes(part), frames), rows, self.threads or len(rows)
-        )
-        return Rollout.stack(parts)
-
-    def rows(self, batch: Window) -> list[slice]:
-        """The rows of the parts of a batch that a thread each computes, on a CPU.
-
-        All in one where torch compiles for a shape, or noise is drawn for all windows together.
-        """
-        compiled = self.compiled or self.emulator.shapes_are_compiled
-        whole = self.device.type != "cpu" or compiled or self.emulator.recipe.grid_noise > 0
-        return split_rows(len(batch.frames), 1 if whole else self.parts or min(torch.get_num_threads(), MOST_PARTS))
-
-    def on_validation_epoch_start(self) -> None:
-        self.valid_errors.reset()
-
-    def on_test_epoch_start(self) -> None:
-        self.test_errors.reset()
-
-    def on_validation_epoch_end(self) -> None:
-        errors = self.valid_errors.compute()
-        overall = overall_error(errors, self.emulator.frames * self.unroll)
-        self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
-
-    def on_test_epoch_end(self) -> None:
-        self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
-
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimizer, and the schedule of its learning rate. A new emulator is calibrated first.
 
@@ -368,7 +272,11 @@ class EmulatorModule(LightningModule):
             ConfigError: if the learning rate is not a positive number, the training has no end, or the trainer has
                 been used for another one.
         """
-        check_new(self._steps_before)
+        if self._steps_before:
+            raise ConfigError(
+                f"This Trainer has taken {self._steps_before} steps already, and counts on from there: make a new"
+                " Trainer for another training, or give ckpt_path to go on with this one."
+            )
         check_end(self.trainer)
         if not self.emulator.calibrated:
             self.trainer.fit_loop.setup_data()
@@ -389,7 +297,7 @@ class EmulatorModule(LightningModule):
         return 1 + int((self.unroll - 1) * progress / self.unroll_growth)
 
     def _progress(self) -> float:
-        """Share of the training that is over, by steps or by the clock, whichever is further."""
+        """Share of the training that is over, by steps or by the clock; 1 where the number of bundles is constant."""
         if not self.unroll_growth:
             return 1.0
         step = self.global_step

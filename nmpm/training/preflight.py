@@ -1,17 +1,34 @@
-"""Checks, before the first step, of what a training needs at its end: metrics, monitors and disk space."""
+"""Checks before the first step: options of the Trainer, precision, metrics, monitored errors and disk space.
+
+Lightning itself rejects further options when the Trainer is made. `docs/lightning.md` lists what works.
+"""
 
 from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import (
+    BackboneFinetuning,
+    BatchSizeFinder,
+    GradientAccumulationScheduler,
+    LearningRateFinder,
+    ModelCheckpoint,
+    ModelPruning,
+    SpikeDetection,
+    StochasticWeightAveraging,
+    WeightAveraging,
+)
+from lightning.pytorch.strategies import ModelParallelStrategy
 from lightning.pytorch.utilities import rank_zero_warn
 from torchmetrics import Metric
 
+from nmpm._support.devices import computes_bfloat16
 from nmpm._support.messages import one_line, suggestion
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.loading.padded_batch import collate
@@ -19,44 +36,143 @@ from nmpm.data.loading.recording import SplitRecordings
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.baselines import still
 from nmpm.evaluation.comparison import Comparison
-from nmpm.training.module import OVERALL, EmulatorModule
-from nmpm.training.trainer_checks import may_log_more
 
+if TYPE_CHECKING:
+    from nmpm.training.module import EmulatorModule
+
+OVERALL = "overall"
+"""Name of the validation error by which the best checkpoint is chosen, see `overall_error`."""
+FLOAT32, BFLOAT16 = "32-true", ("bf16", "bf16-mixed")
+"""Lightning's names of precisions."""
+PACKAGES = ("nmpm.", "lightning.")
+"""Packages whose modules and callbacks log nothing but the training's loss and the errors of evaluations."""
 CHECKPOINT_SIZE = 5
 """Bytes of a checkpoint for each of the weights', at most: averaged ones and the state of SOAP or Adam with them."""
-
 REPORT_BYTES = 32 * 2**20
 """Of the report with its pictures, and of logs."""
 
+_COUNT_EPOCHS = "needs epochs that end, and batches are endless: give limit_train_batches=N and max_epochs"
 
-class Preflight(Callback):
-    """Tries the metrics on a trajectory of each split, and looks for the errors by which callbacks choose.
+
+# Options of the Trainer
+
+
+def check_trainer(trainer: Trainer, module: LightningModule) -> None:
+    """Raise ConfigError, naming the option and what to do instead, if a module cannot be trained by a trainer."""
+    for reason in (*_trainer_reasons(trainer, module), *_callback_reasons(trainer, module)):
+        raise ConfigError(reason)
+    _check_precision(trainer)
+
+
+def check_evaluating_trainer(trainer: Trainer) -> None:
+    """Raise ConfigError if a module cannot be evaluated by a trainer."""
+    _check_precision(trainer)
+    if any(isinstance(callback, BatchSizeFinder) for callback in _callbacks(trainer)):
+        raise ConfigError(
+            "BatchSizeFinder changes data.batch_size, which is that of trainings: evaluate by another Trainer."
+        )
+
+
+def check_resuming_trainer(trainer: Trainer) -> None:
+    """Raise ConfigError if a callback of a trainer cannot go on from a checkpoint."""
+    for callback in _callbacks(trainer):
+        if isinstance(callback, LearningRateFinder | BatchSizeFinder | SpikeDetection):
+            raise ConfigError(
+                f"{type(callback).__name__} cannot go on from a checkpoint: leave it out, and give what it has found."
+            )
+
+
+def _trainer_reasons(trainer: Trainer, module: LightningModule) -> Iterator[str]:
+    if module._compiler_ctx is not None:
+        yield (
+            "torch.compile of an EmulatorModule is not supported: give it compile=True, by which the network is"
+            " compiled."
+        )
+    if trainer.accumulate_grad_batches < 1:
+        yield f"accumulate_grad_batches={trainer.accumulate_grad_batches} must be at least 1."
+    if isinstance(trainer.strategy, ModelParallelStrategy):
+        yield 'ModelParallelStrategy splits networks that are too large for one device: give strategy="ddp".'
+    if trainer.fit_loop.min_epochs and not _counts_epochs(trainer):
+        option = "min_epochs" if trainer.fit_loop.min_steps is None else "min_steps"  # (which sets min_epochs to 1)
+        yield f"{option}={getattr(trainer.fit_loop, option)} {_COUNT_EPOCHS}, or leave it out."
+
+
+def _callback_reasons(trainer: Trainer, module: LightningModule) -> Iterator[str]:
+    endless = not _counts_epochs(trainer)
+    for callback in _callbacks(trainer):
+        name = type(callback).__name__
+        if isinstance(callback, BackboneFinetuning) and not hasattr(module, "backbone"):
+            yield f"{name} needs a module with a backbone: train a pretrained emulator by EmulatorModule.of instead."
+        if isinstance(callback, ModelPruning):
+            yield f"{name}: masks on weights are not supported; choose a network with fewer channels."
+        if isinstance(callback, StochasticWeightAveraging) and endless:
+            yield f"{name} {_COUNT_EPOCHS}, or take EMAWeightAveraging(use_buffers=False)."
+        if isinstance(callback, GradientAccumulationScheduler) and endless and max(callback.scheduling) > 0:
+            yield f"{name} from epoch {max(callback.scheduling)} on {_COUNT_EPOCHS}, or accumulate_grad_batches."
+        if (
+            isinstance(callback, WeightAveraging)
+            and callback._use_buffers
+            and not (callback._kwargs.get("avg_fn") or callback._kwargs.get("multi_avg_fn"))
+        ):
+            yield f"{name}: give use_buffers=False; normalisation statistics are constants, which have no average."
+
+
+def _counts_epochs(trainer: Trainer) -> bool:
+    return isinstance(trainer.limit_train_batches, int)
+
+
+def _callbacks(trainer: Trainer) -> list[object]:
+    return list(trainer.callbacks)  # type: ignore[attr-defined]  # (Lightning sets it)
+
+
+# Precision
+
+
+def fitting_precision(precision: str, device: torch.device) -> str:
+    """The precision itself, or float32 in place of mixed bfloat16 on a device that emulates it."""
+    return FLOAT32 if precision in BFLOAT16 and not computes_bfloat16(device) else precision
+
+
+def warn_of_slow_precision(trainer: Trainer) -> None:
+    """Warn where a trainer is about to train in emulated bfloat16."""
+    if fitting_precision(str(trainer.precision), trainer.strategy.root_device) != trainer.precision:
+        rank_zero_warn(
+            f"bfloat16 is emulated on this processor, so that {trainer.precision} takes many times as long as float32:"
+            f' give the trainer precision="{FLOAT32}".'
+        )
+
+
+def _check_precision(trainer: Trainer) -> None:
+    converted = trainer.precision_plugin.convert_input(torch.zeros(1, dtype=torch.float32)).dtype
+    if torch.finfo(converted).bits < 32:
+        name = str(converted).removeprefix("torch.")
+        raise ConfigError(
+            f"precision={trainer.precision}: positions in {name} would be off by whole cells. Give"
+            ' precision="bf16-mixed", in which only the network computes in bfloat16, or "32-true".'
+        )
+
+
+# Evaluations and monitored errors
+
+
+def check_evaluations(trainer: Trainer, module: EmulatorModule, data: TrajectoryDataModule) -> None:
+    """Compute the metrics on a trajectory of each split, and look for the errors that callbacks monitor.
 
     Raises:
         ConfigError: if a metric does not take the data, a share of a split's batches is none, or the error that a
-            callback monitors is never logged.
+            callback monitors is never logged. Lightning would find out in the first validation, or after the training.
     """
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        data = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
-        if stage != "fit" or not isinstance(pl_module, EmulatorModule) or not isinstance(data, TrajectoryDataModule):
-            return
-        if trainer.enable_validation:
-            check_share("limit_val_batches", trainer.limit_val_batches, len(data.val_dataloader()))
-            names = _try_metrics(pl_module.valid_errors, data.data_source.recordings("valid"))
-            check_monitors(trainer, pl_module, {*names, OVERALL})
-        if data.has_test and trainer.limit_test_batches:
-            check_share("limit_test_batches", trainer.limit_test_batches, len(data.test_dataloader()))
-            # Two frames and one to predict: the metrics of a test may take minutes for a whole trajectory.
-            _try_metrics(pl_module.test_errors, data.data_source.recordings("test"), frames=3)
+    if trainer.enable_validation:
+        _check_share("limit_val_batches", trainer.limit_val_batches, len(data.val_dataloader()))
+        errors = _try_metrics(module.valid_errors, data.data_source.recordings("valid"))
+        _check_monitors(trainer, module, {*errors, OVERALL})
+    if data.has_test and trainer.limit_test_batches:
+        _check_share("limit_test_batches", trainer.limit_test_batches, len(data.test_dataloader()))
+        # Two frames and one to predict: the metrics of a test may take minutes for a whole trajectory.
+        _try_metrics(module.test_errors, data.data_source.recordings("test"), frames=3)
 
 
-def check_share(option: str, share: float, batches: int) -> None:
-    """Make sure that a share of a split's batches is at least one; Lightning finds out when it evaluates.
-
-    Raises:
-        ConfigError: if it is none.
-    """
+def _check_share(option: str, share: float, batches: int) -> None:
     if isinstance(share, float) and 0 < share * batches < 1:
         raise ConfigError(
             f"--trainer.{option} {share} of {batches} batches is none: give a larger share, or a whole number of"
@@ -64,23 +180,12 @@ def check_share(option: str, share: float, batches: int) -> None:
         )
 
 
-def check_monitors(trainer: Trainer, module: EmulatorModule, errors: set[str]) -> None:
-    """Make sure that what callbacks monitor is logged; Lightning finds out after the first validation.
-
-    Not where the user's callbacks or module may log more.
-
-    Args:
-        trainer: With the callbacks.
-        module: Logs the errors.
-        errors: Names of those that validations find.
-
-    Raises:
-        ConfigError: naming the errors that there are.
-    """
-    if may_log_more(trainer, module):
+def _check_monitors(trainer: Trainer, module: EmulatorModule, errors: set[str]) -> None:
+    """Raise ConfigError if what callbacks monitor is never logged; the user's callbacks or module may log anything."""
+    if not all(type(part).__module__.startswith(PACKAGES) for part in (module, *_callbacks(trainer))):
         return
     names = ["train/loss", *sorted(f"valid/{name}" for name in errors)]
-    for callback in trainer.callbacks:  # type: ignore[attr-defined]  # (Lightning sets it)
+    for callback in _callbacks(trainer):
         monitor = getattr(callback, "monitor", None)
         if monitor is not None and monitor not in names:
             raise ConfigError(
@@ -89,41 +194,14 @@ def check_monitors(trainer: Trainer, module: EmulatorModule, errors: set[str]) -
             )
 
 
-def check_disk(trainer: Trainer, module: LightningModule) -> None:
-    """Make sure that checkpoints and report fit on the disk.
-
-    Raises:
-        ConfigError: if they do not.
-
-    Warns:
-        UserWarning: if they fit only once.
-    """
-    savers = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
-    # Each file is written beside the one that it replaces.
-    files = 1 + sum(max(saver.save_top_k, 1) + bool(saver.save_last) for saver in savers)
-    weights = sum(weight.numel() * weight.element_size() for weight in module.parameters())
-    needed = files * CHECKPOINT_SIZE * weights + REPORT_BYTES
-    for folder in {Path(trainer.default_root_dir), *(Path(saver.dirpath) for saver in savers if saver.dirpath)}:
-        existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.is_dir())
-        free = shutil.disk_usage(existing).free
-        said = (
-            f"{folder}: {free >> 20} MB of disk are free; checkpoints and report need up to {needed >> 20} MB. Free"
-            " some, or write elsewhere with --trainer.default_root_dir."
-        )
-        if free < needed:
-            raise ConfigError(said)
-        if free < 2 * needed:
-            rank_zero_warn(said)
-
-
 def _try_metrics(errors: Comparison, recordings: SplitRecordings, frames: int | None = None) -> Sequence[str]:
-    """Names of the errors of a rollout of the longest trajectory, the smallest of such, in which nothing moves.
+    """Names of the errors of a motionless rollout of the longest trajectory, the smallest of such.
 
     Raises:
         ConfigError: if a metric does not take it.
     """
     split = recordings.split
-    index = min(range(len(split)), key=lambda one: (-split.frames(one), split.particles(one)))
+    index = min(range(len(split)), key=lambda number: (-split.frames(number), split.particles(number)))
     window = collate([recordings[index]], recordings.scene, frames)
     count = window.target.shape[1]
     fields = {name: values.unsqueeze(1).expand(-1, count, -1) for name, values in window.initial.fields.items()}
@@ -139,3 +217,26 @@ def _try_metrics(errors: Comparison, recordings: SplitRecordings, frames: int | 
     except Exception as error:  # metrics of users raise anything
         reason = f"{type(error).__name__}: {one_line(error)}"
         raise ConfigError(f"model.metrics cannot be computed on {split.where(index)} ({reason}).") from error
+
+
+# Disk space
+
+
+def check_disk(trainer: Trainer, module: LightningModule) -> None:
+    """Raise ConfigError if checkpoints and report do not fit on the disk; warn if they fit only once."""
+    savers = [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]
+    # Each file is written beside the one that it replaces.
+    files = 1 + sum(max(saver.save_top_k, 1) + bool(saver.save_last) for saver in savers)
+    weights = sum(weight.numel() * weight.element_size() for weight in module.parameters())
+    needed = files * CHECKPOINT_SIZE * weights + REPORT_BYTES
+    for folder in {Path(trainer.default_root_dir), *(Path(saver.dirpath) for saver in savers if saver.dirpath)}:
+        existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.is_dir())
+        free = shutil.disk_usage(existing).free
+        message = (
+            f"{folder}: {free >> 20} MB of disk are free; checkpoints and report need up to {needed >> 20} MB. Free"
+            " some, or write elsewhere with --trainer.default_root_dir."
+        )
+        if free < needed:
+            raise ConfigError(message)
+        if free < 2 * needed:
+            rank_zero_warn(message)

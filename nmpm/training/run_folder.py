@@ -53,27 +53,22 @@ class RunFolder:
 
     def remove_unfinished(self) -> None:
         """Delete files that a process was writing when it was killed. Needs the folder's lock."""
-        folders = {path.parent for path in self.checkpoints.values() if path.is_relative_to(self.root)}
-        for left in [file for folder in {self.root, *folders} for file in temporary_files(folder)]:
-            left.unlink(missing_ok=True)
+        inner = {path.parent for path in self.checkpoints.values() if path.is_relative_to(self.root)}
+        for unfinished in [file for folder in {self.root, *inner} for file in temporary_files(folder)]:
+            unfinished.unlink(missing_ok=True)
 
     def holds(self, checkpoint: Path) -> bool:
         """Whether a checkpoint is one of this run, whatever path leads to it."""
         return checkpoint.resolve().parent in {path.resolve().parent for path in self.checkpoints.values()}
 
     def check_new(self) -> None:
-        """Make sure that no run is written over.
-
-        Raises:
-            ConfigError: if there is a checkpoint or a report. (A run that was killed before its first checkpoint leaves
-                logs alone: there is nothing to lose, and the next run logs beside them.)
-        """
-        last = self.checkpoints["last"]
+        """Raise ConfigError if there is a checkpoint or a report, which a new run would write over."""
         folders = {path.parent for path in self.checkpoints.values()}
         old = [path for folder in folders for path in folder.glob("*.ckpt")]
         old += [path for path in [self.root / "report.json"] if path.is_file()]
         if old:
-            resume = f"Go on with it by nmpm fit --resume {self.root}" if last.is_file() else "Remove it"
+            last = self.checkpoints["last"].is_file()
+            resume = f"Go on with it by nmpm fit --resume {self.root}" if last else "Remove it"
             raise ConfigError(
                 f"{self.root} already holds a run ({old[0].name}). {resume}, or choose another folder with"
                 " --trainer.default_root_dir."

@@ -159,7 +159,7 @@ def test_the_console_shows_the_run_and_the_users_warnings_alone(make_dataset):
     assert len(run.stderr.splitlines()) <= 2  # the warning and its line of code
     lines = run.stdout.replace("\r", "\n").splitlines()
     assert lines.pop(0).startswith("Data: dataset. Model: UNet, ")
-    assert computes_bfloat16(torch.device("cpu")) or lines.pop(0).startswith("Computed in 32-true: ")
+    assert computes_bfloat16(torch.device("cpu")) or lines.pop(0).startswith("bfloat16 is emulated ")
     assert lines.pop(0).startswith("Files: run.")
     assert lines[-1].startswith("written to run: report.json")
     assert not re.search(JUNK, run.stdout + run.stderr)
@@ -224,7 +224,7 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 4
     checked = ["--config", "waterdrop.yaml", *TINY, *data, "--ckpt_path", "run/checkpoints/best.ckpt"]
     trained = json.loads(Path("run/report.json").read_text())["training"]
-    best = torch.load("run/checkpoints/best.ckpt", weights_only=True)["callbacks"]["Report"]
+    best = torch.load("run/checkpoints/best.ckpt", weights_only=True)["callbacks"]["ReportWriter"]
     assert trained["seconds"] >= round(best["trained_seconds"], 1)
     capsys.readouterr()
     for command, title, end in (

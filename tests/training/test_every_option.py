@@ -20,7 +20,7 @@ from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.processors import UNet
 from nmpm.training import module as training_module
-from nmpm.training.schedules import Schedule
+from nmpm.training.optimization import Schedule
 from nmpm.transfer import Nearest
 
 TINY = UNet(width=4, depth=1, perceptron=(4,))

@@ -4,9 +4,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from test_training import module_of, trainer_of
 
-from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError
 from nmpm.metrics import FieldMSE
 from nmpm.particles import Window
@@ -14,15 +12,12 @@ from nmpm.training import EmulatorModule
 from nmpm.training.checkpoints import load_module
 from nmpm.training.losses import FieldError
 from nmpm.zoo.pretrained import Pretrained
+from tests.trainings import data_of, module_of, trainer_of
 
 
 @pytest.fixture
 def heated(make_dataset):
     return make_dataset(fields=("temperature",))
-
-
-def data_of(folder, **options):
-    return TrajectoryDataModule(path=str(folder), horizon=4, batch_size=2, **options)
 
 
 def window_of(target, mask):

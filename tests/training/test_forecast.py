@@ -4,11 +4,11 @@ import re
 
 import lightning
 import pytest
-from test_training import module_of
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.training.callbacks import forecast
 from nmpm.training.callbacks.forecast import MEASURED, SKIPPED, Forecast
+from tests.trainings import module_of
 
 DECIDED = SKIPPED + MEASURED + 1
 

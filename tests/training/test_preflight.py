@@ -1,4 +1,4 @@
-"""What would fail at the end of a training is refused before its first step, in one line."""
+"""A training that would fail at its end is refused before its first step, in one line."""
 
 import shutil
 from collections import namedtuple
@@ -9,34 +9,19 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
-from test_training import data_of, module_of
 
 from nmpm.data.format import write_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.metrics import MSE, RolloutMetric
-from nmpm.training.preflight import Preflight, check_disk
+from nmpm.training import preflight
 from tests.made_up import made_up_trajectory
-
-
-class Steps(lightning.Callback):
-    """Counts the steps that are begun."""
-
-    def __init__(self):
-        self.begun = 0
-
-    def on_train_batch_start(self, *_):
-        self.begun += 1
+from tests.trainings import QUIET, data_of, module_of, trainer_of
 
 
 def fit(folder, *callbacks: lightning.Callback, metrics=None, **options) -> lightning.Trainer:
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    quiet |= {"check_val_every_n_epoch": None, "val_check_interval": 2, "num_sanity_val_steps": 0, "max_steps": 2}
-    trainer = lightning.Trainer(
-        accelerator="cpu",
-        default_root_dir=folder.parent / "run",
-        callbacks=[*callbacks, Preflight()],
-        **(quiet | options),
-    )
+    steps = {"check_val_every_n_epoch": None, "val_check_interval": 2, "max_steps": 2}
+    given = {"accelerator": "cpu", "default_root_dir": folder.parent / "run", **QUIET, **steps, **options}
+    trainer = lightning.Trainer(callbacks=list(callbacks), **given)
     data = data_of(folder)
     trainer.fit(module_of(data, **({} if metrics is None else {"metrics": metrics})), data)
     return trainer
@@ -51,14 +36,14 @@ def refusal(error: type[Exception], *arguments, **options) -> str:
 
 def test_without_a_valid_split_it_trains_without_validations_alone(make_dataset):
     folder = make_dataset(valid=())
-    assert "no valid.h5 there" in (said := refusal(DataError, folder))
-    assert "--trainer.limit_val_batches 0" in said
+    message = refusal(DataError, folder)
+    assert "no valid.h5 there" in message
+    assert "--trainer.limit_val_batches 0" in message
     assert fit(folder, limit_val_batches=0).global_step == 2
 
 
 @pytest.mark.parametrize("split", ["train", "valid", "test"])
-@pytest.mark.parametrize("frame", [0, 11])
-@pytest.mark.parametrize(("value", "complaint"), [(np.nan, "must be finite"), (9.0, "outside the domain")])
+@pytest.mark.parametrize(("frame", "value", "complaint"), [(0, np.nan, "be finite"), (11, 9.0, "outside the domain")])
 def test_the_ends_of_every_trajectory_are_looked_at(make_dataset, split, frame, value, complaint):
     folder = make_dataset(**{split: ((12, 5), (12, 5))})
     data = data_of(folder)
@@ -69,14 +54,10 @@ def test_the_ends_of_every_trajectory_are_looked_at(make_dataset, split, frame, 
         data.setup("fit")
 
 
-@pytest.mark.parametrize("split", ["valid", "test"])
-def test_a_trajectory_with_nothing_to_predict_is_refused(make_dataset, split):
-    assert "an evaluation needs 3" in refusal(DataError, make_dataset(**{split: ((12, 5), (2, 5))}))
-
-
-def test_a_test_split_of_another_material_is_refused(make_dataset):
-    folder = make_dataset()
-    strange = made_up_trajectory(12, 5, 0, 0, 2)
+def test_trajectories_that_cannot_be_tested_are_refused(make_dataset):
+    folder = make_dataset(test=((12, 5), (2, 5)))
+    assert "an evaluation needs 3" in refusal(DataError, folder)
+    strange = made_up_trajectory(12, 5)
     strange.particle_type[:] = 99
     write_split(folder / "test.h5", [strange])
     assert "99" in refusal(DataError, folder)
@@ -85,13 +66,13 @@ def test_a_test_split_of_another_material_is_refused(make_dataset):
 @pytest.mark.parametrize("kind", [ModelCheckpoint, EarlyStopping])
 def test_an_error_that_is_never_logged_is_not_monitored(make_dataset, kind):
     folder = make_dataset()
-    said = refusal(ConfigError, folder, kind(monitor="valid/mse@40"))
-    assert f"{kind.__name__} monitors valid/mse@40, which is never logged; there are " in said
-    assert "valid/mse@4" in said
+    message = refusal(ConfigError, folder, kind(monitor="valid/mse@40"))
+    assert f"{kind.__name__} monitors valid/mse@40, which is never logged; there are " in message
+    assert "Did you mean valid/mse@4" in message
     assert fit(folder, kind(monitor="valid/mse@4")).global_step == 2
 
 
-def test_what_a_users_callback_may_log_can_be_monitored(make_dataset):
+def test_values_that_a_users_callback_logs_can_be_monitored(make_dataset):
     class Logs(lightning.Callback):
         def on_validation_epoch_end(self, trainer, pl_module):
             pl_module.log("mine", 1.0)
@@ -110,10 +91,8 @@ class Picky(RolloutMetric):
 
 
 def test_a_metric_that_does_not_take_the_data_is_refused(make_dataset):
-    steps = Steps()
-    said = refusal(ConfigError, make_dataset(), steps, metrics=[MSE(), Picky()])
-    assert "test.h5, trajectory 00001 (IndexError: no such particle)" in said
-    assert steps.begun == 0
+    message = refusal(ConfigError, make_dataset(), metrics=[MSE(), Picky()])
+    assert "test.h5, trajectory 00001 (IndexError: no such particle)" in message
 
 
 @pytest.mark.parametrize("option", ["limit_val_batches", "limit_test_batches"])
@@ -131,7 +110,22 @@ def test_a_full_disk_is_refused_and_a_nearly_full_one_is_warned_of(make_dataset,
 
     leave(10)
     with pytest.raises(ConfigError, match=r"run: 10 MB of disk are free; checkpoints and report need up to 32 MB"):
-        check_disk(trainer, module)
+        preflight.check_disk(trainer, module)
     leave(50)
     with pytest.warns(UserWarning, match="50 MB"):
-        check_disk(trainer, module)
+        preflight.check_disk(trainer, module)
+
+
+@pytest.mark.parametrize("emulated", [True, False])
+def test_mixed_bfloat16_is_replaced_or_warned_of_where_it_is_emulated(emulated, make_dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(preflight, "computes_bfloat16", lambda device: device.type != "cpu" or not emulated)
+    for name in ("bf16-mixed", "bf16", "32-true", "64-true"):
+        replaced = emulated and "bf16" in name
+        assert preflight.fitting_precision(name, torch.device("cpu")) == ("32-true" if replaced else name)
+        assert preflight.fitting_precision(name, torch.device("cuda")) == name
+    warnings = []
+    monkeypatch.setattr(preflight, "rank_zero_warn", warnings.append)
+    for precision in ("bf16-mixed", "32-true"):
+        preflight.warn_of_slow_precision(trainer_of(tmp_path, 1, precision=precision))
+    assert len(warnings) == emulated
+    assert all("emulated on this processor" in text and 'precision="32-true"' in text for text in warnings)

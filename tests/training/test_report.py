@@ -5,16 +5,16 @@ import torch
 
 from nmpm._support.devices import device_name
 from nmpm.evaluation.figures import no_better_than_trivial
-from nmpm.training.callbacks.report import ReportWriter
+from nmpm.training.callbacks.outputs import ReportWriter
 
 TRIVIAL = {"still/mse": 0.02, "free_fall/mse": 0.01}
 
 
-@pytest.mark.parametrize("error", [0.01, 0.5, float("nan")])
+@pytest.mark.parametrize("error", [0.01, float("nan")])
 def test_a_model_that_is_no_better_than_a_trivial_predictor_is_said_to_be_so(error):
-    said = no_better_than_trivial({"mse": error, "mse@8": 0.0} | TRIVIAL)
-    assert said.startswith("The model is no better than a trivial predictor")
-    assert "'free fall, stopped at walls' 10 ×10⁻³" in said
+    remark = no_better_than_trivial({"mse": error, "mse@8": 0.0} | TRIVIAL)
+    assert remark.startswith("The model is no better than a trivial predictor")
+    assert "'free fall, stopped at walls' 10 ×10⁻³" in remark
     assert no_better_than_trivial({"mse": 0.009} | TRIVIAL) == no_better_than_trivial({"mse": error}) == ""
 
 
@@ -32,27 +32,10 @@ def trainer_on(device: str) -> SimpleNamespace:
     )
 
 
-def test_a_gpu_that_is_there_but_not_used_is_not_named(monkeypatch):
+def test_a_report_names_all_devices_that_a_training_ran_on_and_not_the_one_that_tests_it(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    assert device_name(torch.device("cpu")).endswith(", 2 threads")
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    assert device_name(torch.device("cpu")).endswith(", 1 thread")
-    assert device_name(torch.device("cuda", 1)) == "GPU of cuda:1"
-    assert device_name(torch.device("mps")) == "mps"
-
-
-@pytest.mark.parametrize(("device", "name"), [("cpu", "thread"), ("cuda:0", "GPU of cuda:0")])
-def test_a_report_names_the_device_that_the_trainer_used(monkeypatch, device, name):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
-    figures = ReportWriter()._figures(trainer_on(device), MODULE, {})
-    assert name in figures["training"]["hardware"]
-
-
-def test_a_report_names_all_that_a_training_ran_on_and_not_what_tests_it(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: f"GPU of {device}")
+    assert device_name(torch.device("cpu"), 2).endswith(", 2 threads")
     written = ReportWriter()
     for device in ("cuda:0", "cuda:1", "cuda:0"):
         writer = ReportWriter()
@@ -61,5 +44,5 @@ def test_a_report_names_all_that_a_training_ran_on_and_not_what_tests_it(monkeyp
         written = writer
     tested = ReportWriter()
     tested.load_state_dict(written.state_dict())
-    figures = tested._figures(trainer_on("cpu"), MODULE, {})
-    assert figures["training"]["hardware"] == "GPU of cuda:0; GPU of cuda:1"
+    assert tested._figures(trainer_on("cpu"), MODULE, {})["training"]["hardware"] == "GPU of cuda:0; GPU of cuda:1"
+    assert "thread" in ReportWriter()._figures(trainer_on("cpu"), MODULE, {})["training"]["hardware"]

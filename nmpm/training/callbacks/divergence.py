@@ -43,14 +43,7 @@ class DivergenceGuard(Callback):
         self._recent: deque[float] = deque(maxlen=RECENT)
         self._least, self._warned = math.inf, False
 
-    def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,  # noqa: ARG002
-        outputs: Any,
-        batch: Any,  # noqa: ARG002
-        batch_idx: int,  # noqa: ARG002
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any) -> None:
         if trainer.global_step % max(1, trainer.log_every_n_steps):  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         loss = outputs["loss"] if isinstance(outputs, dict) else outputs
@@ -62,20 +55,15 @@ class DivergenceGuard(Callback):
                 trainer, f"the loss is {value}" if broken else "the loss of another rank is not finite"
             )
         if value is not None:
-            self._follow(trainer, value)
+            self._warn_of_rise(trainer, value)
 
-    def on_save_checkpoint(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,  # noqa: ARG002
-        checkpoint: dict[str, Any],
-    ) -> None:
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         self._check_weights(trainer, checkpoint["state_dict"].items())
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._check_weights(trainer, pl_module.named_parameters())
 
-    def _follow(self, trainer: Trainer, loss: float) -> None:
+    def _warn_of_rise(self, trainer: Trainer, loss: float) -> None:
         """Warn, once, where the median of the recent losses is far above its least."""
         self._recent.append(loss)
         if len(self._recent) < RECENT or self._warned:
@@ -113,5 +101,4 @@ class DivergenceGuard(Callback):
 
 
 def _savers(trainer: Trainer) -> list[ModelCheckpoint]:
-    """The callbacks that write checkpoints."""
     return [saver for saver in trainer.checkpoint_callbacks if isinstance(saver, ModelCheckpoint)]

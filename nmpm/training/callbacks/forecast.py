@@ -45,28 +45,21 @@ class Forecast(Callback):
         self._estimate: float | None = None
         self._measured: list[float] = []
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._seconds, self._step, self._since = [], trainer.global_step, math.nan
 
-    def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,  # noqa: ARG002
-        batch: Any,  # noqa: ARG002
-        batch_idx: int,  # noqa: ARG002
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if len(self._seconds) == SKIPPED + MEASURED or trainer.global_step == self._step:
             return
         self._step, former, self._since = trainer.global_step, self._since, time.monotonic()
         if math.isnan(former):
-            return  # the first step, or one that a validation came before
+            return  # the first step, or the one after a validation
         self._seconds.append(self._since - former)
         if len(self._seconds) == SKIPPED + MEASURED:
             pace = statistics.median(self._seconds[SKIPPED:])
             self._decide(trainer, pl_module, broadcast_from_rank0(pace, trainer.strategy.root_device))
 
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._since = math.nan
         data = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         if isinstance(data, TrajectoryDataModule) and data.validated is None and not trainer.sanity_checking:
@@ -76,13 +69,7 @@ class Forecast(Callback):
         self._batch_start = time.monotonic()
 
     def on_validation_batch_end(
-        self,
-        trainer: Trainer,  # noqa: ARG002
-        pl_module: LightningModule,  # noqa: ARG002
-        outputs: Any,  # noqa: ARG002
-        batch: Window,
-        batch_idx: int,  # noqa: ARG002
-        dataloader_idx: int = 0,  # noqa: ARG002
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Window, *_: Any
     ) -> None:
         scenes, frames = batch.target.shape[:2]
         if scenes:

@@ -10,8 +10,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from nmpm._support.devices import processor_name
 from nmpm._support.threads import ThreadChoice, usable_cores
 from nmpm.particles import Window
+from nmpm.training.backpropagation import MOST_PARTS
 from nmpm.training.module import EmulatorModule
-from nmpm.training.parts import MOST_PARTS
 
 
 class Threads(Callback):
@@ -25,12 +25,12 @@ class Threads(Callback):
     """
 
     def __init__(self, stated: int | None) -> None:
-        self.stated, self._parts, self._said = stated, 0, False
+        self.stated, self._parts, self._printed = stated, 0, False
         self.choice = ThreadChoice(stated, self._apply)
         self._module: EmulatorModule | None = None
         self._in_parts = False
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: ARG002
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if not isinstance(pl_module, EmulatorModule) or trainer.strategy.root_device.type != "cpu":
             return
         self.choice, self._module = self._make_choice(trainer), pl_module
@@ -60,24 +60,17 @@ class Threads(Callback):
         if self._module is not None:
             self._module.parts = self._parts
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:  # noqa: ARG002
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         if self._module is not None:
             self._in_parts = isinstance(batch, Window) and len(self._module.rows(batch)) > 1
             self.choice.start()
 
-    def on_train_batch_end(
-        self,
-        trainer: Trainer,  # noqa: ARG002
-        pl_module: LightningModule,  # noqa: ARG002
-        outputs: Any,  # noqa: ARG002
-        batch: Any,  # noqa: ARG002
-        batch_idx: int,  # noqa: ARG002
-    ) -> None:
+    def on_train_batch_end(self, *_: Any) -> None:
         if self._module is None:
             return
         self.choice.stop()
-        if self.choice.medians and not self._said:
-            self._said = True
+        if self.choice.medians and not self._printed:
+            self._printed = True
             times = "; ".join(f"{1e3 * seconds:.0f} ms by {n}" for n, seconds in self.choice.medians.items())
             self._module.print(f"Threads: {self.choice.threads} (a step takes {times}).")
 

@@ -1,4 +1,8 @@
-"""A training step's batch in parts, each the work of one thread: forward, backward, and the sum of the gradients.
+"""Gradients of a training step: discounted from bundle to bundle, and computed in parts of the batch by threads.
+
+The flow of a splash parts neighbours exponentially, and so do gradients grow that go back through it: what a later
+bundle says of an earlier one is mostly noise (`benchmarks/gradient_shares.py`). Discounted, it counts less, and later
+bundles still train the weights by their own errors in full.
 
 Threads inside of operations as small as those of a 2-D grid gain nothing; threads that compute scenes of their own do.
 The parts do not depend on how many threads work on them, and their gradients are added in order, so that neither do
@@ -8,6 +12,7 @@ results.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -16,11 +21,67 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nmpm._support.threads import map_ranges
+from nmpm.emulator import Bundle, Emulator, RolloutContext
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
 
 T = TypeVar("T")
 
 MOST_PARTS = 4
 """Of a batch: with more, threads wait for Python's interpreter lock, which a part holds for about 15 ms."""
+
+
+def direct(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+    """A call of the emulator that keeps its activations for the backward pass."""
+    bundle: Bundle = emulator(particles, context)
+    return bundle
+
+
+@dataclass(frozen=True)
+class Discount:
+    """Multiplies the gradients that come back through the state between two bundles.
+
+    Args:
+        factor: In [0, 1]: 1 changes nothing, 0 cuts gradients.
+
+    Raises:
+        ConfigError: if the factor is not in that range.
+    """
+
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.factor <= 1:
+            raise ConfigError(f"model.gradient_discount = {self.factor} must be in [0, 1].")
+
+    def __call__(self, particles: Particles) -> Particles:
+        """The same values, whose gradients are multiplied by the factor."""
+        if self.factor == 1:
+            return particles
+        moved = particles.with_motion(self._discount(particles.position), self._discount(particles.velocity))
+        fields = {name: self._discount(values) for name, values in particles.fields.items()}
+        return moved.with_fields(fields) if fields else moved
+
+    def state_after(self, bundle: Bundle, start: Particles) -> Particles:
+        """The state that the next bundle starts from."""
+        return self(bundle.state_after(start))
+
+    def _discount(self, values: Tensor) -> Tensor:
+        if self.factor == 0:
+            return values.detach()
+        discounted: Tensor = _Scale.apply(values, self.factor)  # type: ignore[no-untyped-call]  # (torch's stubs)
+        return discounted
+
+
+class _Scale(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factor: float) -> Tensor:
+        ctx.factor = factor
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
+        return ctx.factor * slope, None
 
 
 def split_rows(count: int, parts: int) -> list[slice]:

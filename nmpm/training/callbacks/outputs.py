@@ -1,9 +1,10 @@
-"""The report of a test: a table on the screen, the figures as JSON and CSV, a picture and an animation."""
+"""What a test and a prediction write: report, curves of errors, picture and animation; trajectories."""
 
 from __future__ import annotations
 
 import json
 import platform
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,21 +12,27 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
 from lightning.pytorch.trainer.states import TrainerFn
 from rich.console import Console
 from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.collectives import all_gather
+from nmpm._support.collectives import all_gather, gather_to_rank0, rank_and_world_size
 from nmpm._support.devices import device_name, join_hardware
 from nmpm._support.digests import float32_digest
 from nmpm._support.version import __version__
+from nmpm.data.format import Trajectory, write_split
 from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.predictions import predicted_trajectory
+from nmpm.emulator import Rollout
 from nmpm.evaluation.figures import error_table, no_better_than_trivial
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.metrics import MSE
 from nmpm.particles import Window
-from nmpm.training.module import OVERALL, EmulatorModule
+from nmpm.scene import Scene
+from nmpm.training.module import EmulatorModule
+from nmpm.training.preflight import OVERALL
 from nmpm.viz import write_animation, write_snapshots
 
 
@@ -44,12 +51,8 @@ class ReportWriter(Callback):
         self.trained_hardware = ""
         self.curve: list[list[float]] = []  # seconds of training, steps, MSE and overall error of each validation
         self._since: float | None = None
-        self._trained = False
+        self._fitting = False
         self._first_rollout: tuple[Window, Tensor] | None = None
-
-    @property
-    def state_key(self) -> str:
-        return "Report"  # its name in checkpoints of earlier versions
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -61,16 +64,16 @@ class ReportWriter(Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        if self._trained:
-            return  # the test after a fit loads the best checkpoint, which is often older than the training's end
-        self.trained_seconds = float(state_dict["trained_seconds"])
-        self.trained_steps = int(state_dict.get("trained_steps", 0))
-        self.trained_precision = str(state_dict.get("trained_precision", ""))
-        self.trained_hardware = str(state_dict.get("trained_hardware", ""))
-        self.curve = list(state_dict.get("curve", []))
+        if not self._fitting:  # the test after a fit loads the best checkpoint, often older than the training's end
+            self.trained_seconds, self.trained_steps = state_dict["trained_seconds"], state_dict["trained_steps"]
+            self.trained_precision, self.trained_hardware = (
+                state_dict["trained_precision"],
+                state_dict["trained_hardware"],
+            )
+            self.curve = list(state_dict["curve"])
 
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        self._trained = True  # also where no step is left to take
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._fitting = True  # also where no step is left to take
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._since = time.monotonic()
@@ -78,36 +81,23 @@ class ReportWriter(Callback):
         hardware = device_name(trainer.strategy.root_device, getattr(pl_module, "threads", None))
         self.trained_hardware = join_hardware(self.trained_hardware, hardware)
 
-    def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,  # noqa: ARG002
-        outputs: Any,  # noqa: ARG002
-        batch: Any,  # noqa: ARG002
-        batch_idx: int,  # noqa: ARG002
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
         self.trained_steps = trainer.global_step
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
-        found = trainer.callback_metrics
-        errors = [float(found[name]) for name in ("valid/mse", f"valid/{OVERALL}") if name in found]
-        if self._trained and not trainer.sanity_checking and errors:
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        logged = trainer.callback_metrics
+        errors = [float(logged[name]) for name in ("valid/mse", f"valid/{OVERALL}") if name in logged]
+        if self._fitting and not trainer.sanity_checking and errors:
             self.curve.append([round(self._elapsed(), 1), self.trained_steps, *errors])
-        if trainer.state.fn == TrainerFn.VALIDATING and not self._trained and trainer.is_global_zero:
+        if trainer.state.fn == TrainerFn.VALIDATING and not self._fitting and trainer.is_global_zero:
             dataset = trainer.datamodule.description  # type: ignore[attr-defined]  # (Lightning sets it)
             _print_table(f"{dataset}: validation", _logged(trainer, "valid/"))
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: ARG002
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.trained_seconds, self._since = self._elapsed(), None
 
     def on_test_batch_end(
-        self,
-        trainer: Trainer,  # noqa: ARG002
-        pl_module: LightningModule,  # noqa: ARG002
-        outputs: Any,
-        batch: Window,
-        batch_idx: int,
-        dataloader_idx: int = 0,  # noqa: ARG002
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Window, batch_idx: int, *_: Any
     ) -> None:
         if batch_idx == 0:
             self._first_rollout = (batch.to("cpu"), outputs.cpu())
@@ -115,7 +105,7 @@ class ReportWriter(Callback):
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not isinstance(pl_module, EmulatorModule):
             return
-        order = _tested(trainer)
+        order = _tested_indices(trainer)
         errors = {kind: _gather_ranks(metric, order) for kind, metric in pl_module.test_errors.errors.items()}
         if not trainer.is_global_zero:
             return
@@ -175,19 +165,20 @@ def _simulation(datamodule: Any) -> dict[str, Any]:
     return {"simulation": stated} if isinstance(stated, dict) else {}
 
 
-def _tested(trainer: Trainer) -> list[int]:
+def _tested_indices(trainer: Trainer) -> list[int]:
     """Indices of the tested trajectories of all processes, in the order in which metrics join them."""
     loader = trainer.test_dataloaders
     batches = loader.batches[: int(trainer.num_test_batches[0])] if isinstance(loader, EvaluationLoader) else ()
-    return [index for own in all_gather([index for batch in batches for index in batch]) for index in own]
+    by_rank = all_gather([index for batch in batches for index in batch])
+    return [index for indices in by_rank for index in indices]
 
 
 def _gather_ranks(metric: MSE, order: Sequence[int]) -> tuple[list[dict[str, float]], list[Tensor]]:
     """MSE per trajectory and curves, from all processes, in the order of the split."""
     with metric.sync_context():
         rows, curves = metric.per_trajectory(), [curve.cpu() for curve in metric.curves()]
-    places = sorted(range(len(rows)), key=order.__getitem__) if order else range(len(rows))
-    return [rows[place] for place in places], [curves[place] for place in places]
+    ranked = sorted(range(len(rows)), key=order.__getitem__) if order else range(len(rows))
+    return [rows[index] for index in ranked], [curves[index] for index in ranked]
 
 
 def _write_report(folder: Path, figures: Mapping[str, Any]) -> None:
@@ -205,12 +196,58 @@ def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
 
 
 def _logged(trainer: Trainer, prefix: str) -> dict[str, float]:
-    """What an evaluation has logged, by names without the prefix."""
+    """Values that an evaluation has logged, by names without the prefix."""
     logged = sorted(trainer.callback_metrics.items())
     return {key.removeprefix(prefix): float(value) for key, value in logged if key.startswith(prefix)}
 
 
-def _print_table(what: str, errors: Mapping[str, float]) -> None:
-    Console().print(error_table(what, errors))
+def _print_table(title: str, errors: Mapping[str, float]) -> None:
+    Console().print(error_table(title, errors))
     if remark := no_better_than_trivial(errors):
         Console().print(remark, soft_wrap=True)
+
+
+class PredictionWriter(BasePredictionWriter):
+    """Writes what `nmpm predict` predicts to `predictions.h5` in the run's folder.
+
+    Rank 0 writes the predictions of all ranks, in the order of the test split.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(write_interval="batch")
+        self._predicted: dict[int, Trajectory] = {}
+
+    def write_on_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        prediction: Any,
+        indices: Any,
+        batch: Window,
+        number: int,
+        *_: Any,
+    ) -> None:
+        scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
+        source = f"{trainer.ckpt_path or 'the model'}"
+        fields = prediction.fields if isinstance(prediction, Rollout) else {}
+        positions = prediction.position if isinstance(prediction, Rollout) else prediction
+        for row, index in enumerate(self._split_indices(trainer.predict_dataloaders, number, len(positions))):
+            self._predicted[index] = predicted_trajectory(scene, batch.initial, positions, source, row, fields)
+
+    def _split_indices(self, loader: object, batch: int, count: int) -> Sequence[int]:
+        """Where the trajectories of a batch belong in the file."""
+        if isinstance(loader, EvaluationLoader):
+            return loader.batches[batch]
+        rank, world = rank_and_world_size()  # of another loader: in the order of arrival, ranks in turn
+        first = rank + world * len(self._predicted)
+        return range(first, first + world * count, world)
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        predicted = {
+            index: trajectory for rank in gather_to_rank0(self._predicted) for index, trajectory in rank.items()
+        }
+        if trainer.is_global_zero:
+            path = Path(trainer.default_root_dir) / "predictions.h5"
+            write_split(path, [predicted[index] for index in sorted(predicted)])
+            sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
+        self._predicted = {}

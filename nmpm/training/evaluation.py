@@ -1,0 +1,89 @@
+"""Validation, test and prediction: full rollouts of trajectories, beside the trivial predictors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor
+
+from nmpm.emulator import Emulator, Rollout, predict_rollout
+from nmpm.evaluation.comparison import Comparison
+from nmpm.metrics import MSE, RolloutMetric, overall_error
+from nmpm.particles import Window
+from nmpm.training.backpropagation import MOST_PARTS, on_threads, split_rows
+from nmpm.training.preflight import OVERALL
+
+
+class EvaluatedModule(LightningModule):
+    """Rolls an emulator out over whole trajectories and logs the errors; training is the subclass's.
+
+    Args:
+        emulator: To be evaluated.
+        horizon: Frames of a training step, from which on the overall error counts, see `overall_error`.
+        metrics: Errors that validations and tests report; None for the MSE.
+
+    Attributes:
+        parts: In how many parts a batch is computed on a CPU; None for as many as torch has threads, at most 4. Other
+            numbers change results by rounding.
+        threads: How many threads compute them; None for one each. Changes no result.
+        compiled: Whether torch compiles the network, so that batches are not computed in parts.
+    """
+
+    def __init__(self, emulator: Emulator, horizon: int, metrics: Sequence[RolloutMetric] | None) -> None:
+        super().__init__()
+        self.emulator, self.horizon = emulator, horizon
+        self.parts: int | None = None
+        self.threads: int | None = None
+        self.compiled = False
+        reported = [MSE()] if metrics is None else list(metrics)
+        self.valid_errors = Comparison(emulator.scene, [metric for metric in reported if metric.cheap])
+        self.test_errors = Comparison(emulator.scene, reported)
+
+    def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
+        predicted = self._predict(batch)
+        self.valid_errors.update(batch, predicted.position, predicted.fields)
+
+    def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        with torch.autocast(self.device.type, enabled=False):  # in the precision that trained models are used in
+            predicted = self._predict(batch)
+        self.test_errors.update(batch, predicted.position, predicted.fields)
+        return predicted.position
+
+    def predict_step(self, batch: Window, batch_idx: int) -> Tensor | Rollout:  # noqa: ARG002
+        """(B, T - 2, N, D) predicted positions; with the fields where the scene has any that evolve."""
+        predicted = self._predict(batch)
+        return predicted if predicted.fields else predicted.position
+
+    def _predict(self, batch: Window) -> Rollout:
+        start, frames, rows = batch.initial, batch.target.shape[1], self.rows(batch)
+        if len(rows) == 1:
+            return predict_rollout(self.emulator, start, frames)
+        parts = on_threads(
+            lambda part: predict_rollout(self.emulator, start.scenes(part), frames), rows, self.threads or len(rows)
+        )
+        return Rollout.stack(parts)
+
+    def rows(self, batch: Window) -> list[slice]:
+        """The rows of the parts of a batch that a thread each computes, on a CPU.
+
+        All in one where torch compiles for a shape, or noise is drawn for all windows together.
+        """
+        compiled = self.compiled or self.emulator.shapes_are_compiled
+        whole = self.device.type != "cpu" or compiled or self.emulator.recipe.grid_noise > 0
+        return split_rows(len(batch.frames), 1 if whole else self.parts or min(torch.get_num_threads(), MOST_PARTS))
+
+    def on_validation_epoch_start(self) -> None:
+        self.valid_errors.reset()
+
+    def on_test_epoch_start(self) -> None:
+        self.test_errors.reset()
+
+    def on_validation_epoch_end(self) -> None:
+        errors = self.valid_errors.compute()
+        overall = overall_error(errors, self.horizon)
+        self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
+
+    def on_test_epoch_end(self) -> None:
+        self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
