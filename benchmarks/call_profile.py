@@ -21,7 +21,7 @@ from timing import clock_for, describe_machine, make_timing_parser, time_alterna
 from nmpm.emulator import Emulator, RolloutContext
 from nmpm.emulator.fused.direct import DirectCall
 from nmpm.errors import ConfigError
-from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress import ModelUnderTest
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
@@ -34,7 +34,7 @@ BUNDLES = 20
 @torch.no_grad()
 def late_state(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext]:
     """A scene of the model's own, `BUNDLES` bundles into its rollout, and what the rollout knows of its start."""
-    particles = Subject(name, emulator, 32, load_preset(name)).starts(1)
+    particles = ModelUnderTest(name, emulator, 32, load_preset(name)).starts(1)
     context = emulator.context(particles)
     return roll_to_end(lambda state: emulator(state, context), particles, BUNDLES), context
 

@@ -18,7 +18,7 @@ from timing import Clock, add_device_option, clock_for, make_parser, time_altern
 from nmpm.emulator import Bundle, Emulator, rollout
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import Monitor, Policy
-from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress import ModelUnderTest
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
@@ -53,7 +53,7 @@ def measure_monitor(emulator: Emulator, state: Particles, frames: int, repeats: 
 def measure_model(name: str, frames: int, repeats: int, device: torch.device) -> None:
     """Print ratios for a zoo model, on one scene of its simulator."""
     emulator = Zoo.load(name, device=device).emulator
-    state = Subject(name, emulator, 32, load_preset(name)).starts(1)
+    state = ModelUnderTest(name, emulator, 32, load_preset(name)).starts(1)
 
     def roll_out(constraints: Constraints) -> Callable[[], object]:
         return partial(rollout, emulator.with_constraints(constraints), state, frames)

@@ -19,7 +19,7 @@ from scaling import build_case
 from timing import Spread, describe_machine, make_timing_parser, write_json
 
 from nmpm.emulator import Emulator
-from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress import ModelUnderTest
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.transfer import without_kernels
@@ -81,7 +81,7 @@ def main() -> None:
     figures: dict[str, Any] = {}
     for name in chosen.zoo:
         emulator = Zoo.load(name).with_network("bfloat16").emulator
-        state = Subject(name, emulator, 32, load_preset(name)).starts(1)
+        state = ModelUnderTest(name, emulator, 32, load_preset(name)).starts(1)
         figures[name] = measure(emulator, state, chosen.bundles, chosen.rounds)
         figures[f"{name}, unconstrained"] = measure(
             Zoo.load(name).with_network("bfloat16").emulator.unconstrained(), state, chosen.bundles, chosen.rounds

@@ -44,8 +44,8 @@ from nmpm.data.catalog import dataset_home
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Emulator, rollout
 from nmpm.evaluation.bootstrap import ratio_interval
-from nmpm.evaluation.stress.settling import compare_shapes
-from nmpm.evaluation.stress.subject import Subject, simulate_window
+from nmpm.evaluation.stress.long import predicted_shapes, recorded_shapes, shape_ratios
+from nmpm.evaluation.stress.model import ModelUnderTest, simulate_window
 from nmpm.metrics import MSE, earth_mover_of_materials
 from nmpm.particles import Window
 from nmpm.sim import load_preset
@@ -161,8 +161,8 @@ def simulated_window(run: Run, scenes: int) -> Window:
     path = dataset_home() / "recipes" / f"{name}-{scenes}-{run.frames[-1]}.pt"
     if path.is_file():
         return Window(**torch.load(path, weights_only=True))
-    subject = Subject(name, run.emulator, 0, load_preset(name))
-    window = simulate_window(subject, load_preset(name), scenes, run.frames[-1])
+    model = ModelUnderTest(name, run.emulator, 0, load_preset(name))
+    window = simulate_window(model, load_preset(name), scenes, run.frames[-1])
     with atomic_write(path) as part:
         torch.save(dict(vars(window)), part)
     return window
@@ -171,9 +171,11 @@ def simulated_window(run: Run, scenes: int) -> Window:
 def measure_shapes(run: Run, chosen: Namespace) -> dict[str, Any]:
     """Height and crowding over the simulator's, by frame, with the run's constraints and without them."""
     window, frames = simulated_window(run, chosen.shape_scenes), run.frames
+    simulated = recorded_shapes(run.emulator, window, frames)
+    forms = {"held": run.emulator, "free": run.emulator.unconstrained()}
     return {
-        "held": compare_shapes(run.emulator, window, frames),
-        "free": compare_shapes(run.emulator.unconstrained(), window, frames),
+        name: shape_ratios(predicted_shapes(emulator, window.initial, frames), simulated)
+        for name, emulator in forms.items()
     }
 
 

@@ -28,7 +28,7 @@ from workloads import simulate_windows
 
 from nmpm.emulator import Emulator, rollout
 from nmpm.evaluation.comparison import Comparison
-from nmpm.evaluation.stress import Subject
+from nmpm.evaluation.stress import ModelUnderTest
 from nmpm.metrics import MSE
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
@@ -50,7 +50,7 @@ def make_forms(name: str) -> dict[str, Emulator]:
 
 def grid_of(name: str, emulator: Emulator) -> Tensor:
     """(1, C_in, *S), the network's input for a scene of the model's preset."""
-    state = Subject(name, emulator, 8, load_preset(name)).starts(1)
+    state = ModelUnderTest(name, emulator, 8, load_preset(name)).starts(1)
     seen: list[Tensor] = []
     hook = emulator.processor.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     emulator(state)

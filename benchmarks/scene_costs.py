@@ -33,7 +33,7 @@ from workloads import DEFAULT_SETUP, SETUPS
 from workloads import build_emulator as build_untrained
 
 from nmpm.emulator import Bundle, Emulator, unroll
-from nmpm.evaluation.stress.subject import Subject, simulate_scenes
+from nmpm.evaluation.stress.model import ModelUnderTest, simulate_beside
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.transfer import without_kernels
@@ -158,7 +158,7 @@ def sweep_rest(case: str, chosen: argparse.Namespace) -> Iterator[Row]:
     if case != "goop":
         return
     emulator = CASES[case]().requires_grad_(False)
-    starts = Subject(case, emulator, 32, load_preset(case)).starts(LATE + 1)
+    starts = ModelUnderTest(case, emulator, 32, load_preset(case)).starts(LATE + 1)
     states = states_before_rest(emulator, starts.scenes(slice(LATE, LATE + 1)))
     for index in sorted({max(0, len(states) - 1 - bundles) for bundles in (0, 10, 20, 30, 50)}, reverse=True):
         actions = {
@@ -177,7 +177,7 @@ def measure_errors(case: str, scenes: int) -> Row:
     emulator = Zoo.load(preset.name).emulator.over(preset.scene).requires_grad_(False)
     frames = ERROR_FRAMES[case]
     errors: dict[str, list[float]] = {"on": [], "off": [], "nudged": []}
-    for window in simulate_scenes(Subject(case, emulator, 32, preset), preset, scenes, frames):
+    for (window,) in simulate_beside(ModelUnderTest(case, emulator, 32, preset), preset, scenes, frames, ()):
         count = -(-frames // emulator.frames)
         paths = {
             "on": unroll(emulator, window.initial, count),

@@ -26,8 +26,8 @@ from timing import make_parser, write_json
 from nmpm._support.progress import progress_bar
 from nmpm.emulator import Emulator
 from nmpm.evaluation.bootstrap import ratio_interval
-from nmpm.evaluation.stress.settling import Shapes, predicted_shapes, recorded_shapes
-from nmpm.evaluation.stress.subject import Subject, simulate_beside
+from nmpm.evaluation.stress.long import Shapes, predicted_shapes, recorded_shapes
+from nmpm.evaluation.stress.model import ModelUnderTest, simulate_beside
 from nmpm.sim import load_preset
 from nmpm.sim.predictability import twin_of
 
@@ -55,7 +55,9 @@ def list_rows(runs: Sequence[Run], forms: Sequence[str]) -> dict[str, Emulator]:
 def measure(rows: dict[str, Emulator], name: str, frames: Sequence[int], scenes: int) -> Iterator[dict[str, Array]]:
     """Scene by scene, the measures (frames, 3) of the simulator, of its twin and of each emulator."""
     preset, one = load_preset(name), next(iter(rows.values()))
-    for truth, twin in simulate_beside(Subject(name, one, 0, preset), preset, scenes, max(frames), [twin_of(preset)]):
+    for truth, twin in simulate_beside(
+        ModelUnderTest(name, one, 0, preset), preset, scenes, max(frames), [twin_of(preset)]
+    ):
         found = {TRUTH: recorded_shapes(one, truth, frames), TWIN: recorded_shapes(one, twin, frames)}
         found |= {label: predicted_shapes(emulator, truth.initial, frames) for label, emulator in rows.items()}
         yield {label: as_array(shapes, frames) for label, shapes in found.items()}

@@ -22,7 +22,7 @@ from nmpm.cli.options import (
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from nmpm.evaluation.stress import Line, Size, Subject
+    from nmpm.evaluation.stress import Effort, ModelUnderTest, TestResult
 
 DESCRIPTION = """Test a trained model at the extremes: long rollouts, settling, fast and slow, many and few particles,
 other boxes and grids, precision, sensitivity, obstacles that training never showed, non-finite input. Prints one line
@@ -40,21 +40,21 @@ examples:
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["stress", "goop"]."""
-    chosen = _parser().parse_args(words[1:])
-    check_device(chosen.device)
-    check_at_least("--threads", chosen.threads, 1)
-    if chosen.report is not None:
-        check_folder("--report", chosen.report)
+    arguments = _parser().parse_args(words[1:])
+    check_device(arguments.device)
+    check_at_least("--threads", arguments.threads, 1)
+    if arguments.report is not None:
+        check_folder("--report", arguments.report)
     from nmpm.evaluation.stress import FULL, GROUPS, QUICK
 
-    unknown = sorted(set(chosen.groups or ()) - set(GROUPS))
+    unknown = sorted(set(arguments.groups or ()) - set(GROUPS))
     if unknown:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
-    subject = _subject(chosen)
+    model = _load(arguments)
     start = time.monotonic()
-    lines = _run_groups(subject, FULL if chosen.full else QUICK, chosen.groups or list(GROUPS))
-    _print_report(subject, lines, "full" if chosen.full else "quick", time.monotonic() - start, chosen)
-    if any(line.passed is False for line in lines):
+    results = _run_groups(model, FULL if arguments.full else QUICK, arguments.groups or list(GROUPS))
+    _print_report(model, results, "full" if arguments.full else "quick", time.monotonic() - start, arguments)
+    if any(result.passed is False for result in results):
         raise SystemExit(1)
 
 
@@ -89,44 +89,48 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _subject(chosen: argparse.Namespace) -> Subject:
-    from nmpm.evaluation.stress import Subject
+def _load(arguments: argparse.Namespace) -> ModelUnderTest:
+    from nmpm.evaluation.stress import ModelUnderTest
     from nmpm.sim import load_preset, preset_names
     from nmpm.zoo import load_model
 
-    model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime)
-    choose_threads(model, chosen.threads)
+    model = load_model(arguments.model, arguments.device, arguments.root).optimized(arguments.runtime)
+    choose_threads(model, arguments.threads)
     known = model.preset if model.preset in preset_names() else None
-    preset = chosen.preset or known
-    emulator = model.emulator.unconstrained() if chosen.free else model.emulator
-    return Subject(chosen.model, emulator, model.horizon, load_preset(preset) if preset else None, chosen.seed)
+    preset = arguments.preset or known
+    emulator = model.emulator.unconstrained() if arguments.free else model.emulator
+    return ModelUnderTest(
+        arguments.model, emulator, model.horizon, load_preset(preset) if preset else None, arguments.seed
+    )
 
 
-def _run_groups(subject: Subject, size: Size, groups: list[str]) -> list[Line]:
+def _run_groups(model: ModelUnderTest, effort: Effort, groups: list[str]) -> list[TestResult]:
     from nmpm._support.progress import progress_bar
     from nmpm.evaluation.stress import GROUPS, battery
 
-    lines: list[Line] = []
+    results: list[TestResult] = []
     with progress_bar("stress", len(groups)) as step:
         for name in groups:
             step(f"stress, {name}", by=0)
-            lines += battery(subject, size, {name: GROUPS[name]})
+            results += battery(model, effort, {name: GROUPS[name]})
             step()
-    return lines
+    return results
 
 
-def _print_report(subject: Subject, lines: list[Line], size: str, seconds: float, chosen: argparse.Namespace) -> None:
+def _print_report(
+    model: ModelUnderTest, results: list[TestResult], size: str, seconds: float, arguments: argparse.Namespace
+) -> None:
     from rich.console import Console
 
-    from nmpm.evaluation.stress.report import as_json, summary, table, write
+    from nmpm.evaluation.stress.results import as_json, summary, table, write
 
-    text = as_json(subject.name, size, seconds, lines)
-    if chosen.json:
+    text = as_json(model.name, size, seconds, results)
+    if arguments.json:
         sys.stdout.write(text + "\n")
     else:
         console = Console()
-        console.print(table(f"{subject.name}, {size}, {seconds:.0f} s", lines))
-        console.print(summary(lines))
-    if chosen.report is not None:
-        paths = write(chosen.report, text, lines, "stress_free" if chosen.free else "stress")
+        console.print(table(f"{model.name}, {size}, {seconds:.0f} s", results))
+        console.print(summary(results))
+    if arguments.report is not None:
+        paths = write(arguments.report, text, results, "stress_free" if arguments.free else "stress")
         sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")

@@ -21,6 +21,7 @@ def test_a_table_for_people(capsys):
     assert "5 passed, 0 failed." in out
 
 
+@pytest.mark.slow
 def test_by_another_runtime(capsys):
     if find_spec("openvino") is None:  # importing it would report to its makers
         pytest.skip("openvino is not installed")
@@ -44,9 +45,11 @@ def test_what_cannot_be_is_said(words, message, capsys):
 
 def test_a_failing_line_is_an_exit_status(monkeypatch, capsys):
     from nmpm.cli import stress
-    from nmpm.evaluation.stress import Line
+    from nmpm.evaluation.stress import results
 
-    monkeypatch.setattr(stress, "_run_groups", lambda *_, **__: [Line("long", "one", False, {}, "nothing")])
+    monkeypatch.setattr(
+        stress, "_run_groups", lambda *_, **__: [results.TestResult("long", "one", False, {}, "nothing")]
+    )
     with pytest.raises(SystemExit) as exit_:
         main(["stress", "goop"])
     assert exit_.value.code == 1

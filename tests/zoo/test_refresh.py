@@ -11,7 +11,7 @@ import yaml
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import ConfigError, UnstableError, ZooError
-from nmpm.evaluation.stress import QUICK, Line
+from nmpm.evaluation.stress import QUICK, results
 from nmpm.sim import load_preset
 from nmpm.sim.predictability import nudge, twin_of
 from nmpm.zoo import Zoo, load_model
@@ -127,13 +127,13 @@ def test_stress_tests_are_counted_and_settling_is_simulated_once(goop, monkeypat
     def long(subject, size):
         assert size is QUICK
         presets.append(subject.preset)
-        yield Line("long", "energy", subject.emulator.constraints.energy, {}, "")
-        yield Line("long", "speed", None, {}, "")
+        yield results.TestResult("long", "energy", subject.emulator.constraints.energy, {}, "")
+        yield results.TestResult("long", "speed", None, {}, "")
 
     def settle(subject, size):
         settled.append(subject.emulator.constraints.energy)
-        yield Line("settling", "with constraints", True, {}, "")
-        yield Line("settling", "without constraints", False, {}, "")
+        yield results.TestResult("settling", "with constraints", True, {}, "")
+        yield results.TestResult("settling", "without constraints", False, {}, "")
 
     monkeypatch.setattr("nmpm.zoo.measures.model.GROUPS", {"long": long, "settling": settle})
     refresh(goop, [measure])

@@ -1,7 +1,7 @@
-"""The stress battery: a trained emulator at the extremes, one line of pass or fail for each."""
+"""The stress battery: a trained emulator at the extremes, one result of pass or fail for each."""
 
 from nmpm.evaluation.stress.battery import GROUPS, battery
-from nmpm.evaluation.stress.lines import FULL, QUICK, Line, Size
-from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress.model import ModelUnderTest
+from nmpm.evaluation.stress.results import FULL, QUICK, Effort, TestResult
 
-__all__ = ["FULL", "GROUPS", "QUICK", "Line", "Size", "Subject", "battery"]
+__all__ = ["FULL", "GROUPS", "QUICK", "Effort", "ModelUnderTest", "TestResult", "battery"]

@@ -1,25 +1,43 @@
-"""All groups of tests, one after the other."""
+"""All groups of tests, one after the other, and those that constraints make pass, without constraints."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 
 import torch
 
-from nmpm.evaluation.stress.counts import counts
-from nmpm.evaluation.stress.duration import duration
-from nmpm.evaluation.stress.free import free
-from nmpm.evaluation.stress.lines import Line, Size
+from nmpm.evaluation.stress.long import duration, energy_and_rest, settling
+from nmpm.evaluation.stress.model import ModelUnderTest
+from nmpm.evaluation.stress.numerics import poison, precision, sensitivity
 from nmpm.evaluation.stress.obstacles import obstacles
-from nmpm.evaluation.stress.poison import poison
-from nmpm.evaluation.stress.precision import precision, sensitivity
-from nmpm.evaluation.stress.settling import settling
-from nmpm.evaluation.stress.sizes import sizes
-from nmpm.evaluation.stress.speeds import speeds
-from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress.results import Effort, TestResult
+from nmpm.evaluation.stress.scenes import counts, sizes, speeds
 
-Group = Callable[[Subject, Size], Iterator[Line]]
+Group = Callable[[ModelUnderTest, Effort], Iterator[TestResult]]
+
+
+def network_alone(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
+    """Energy, rest and obstacles where the emulator's constraints enforce them, without constraints.
+
+    There is no verdict, as the rollouts that users get are constrained: the figure `holds` is 1 where the test would
+    pass. Particles never leave the bounds, in either form. `settling` has results of both forms.
+    """
+    constraints, bare = model.emulator.constraints, model.with_emulator(model.emulator.unconstrained())
+    if constraints.energy or constraints.rest_speed:
+        yield from map(_without_verdict, energy_and_rest(bare, effort))
+    if constraints.energy:
+        yield from map(_without_verdict, speeds(bare, effort))
+    if constraints.solids and not bare.emulator.constraints.solids:
+        yield from map(_without_verdict, obstacles(bare, effort))
+
+
+def _without_verdict(result: TestResult) -> TestResult:
+    verdict = {} if result.passed is None else {"holds": float(result.passed)}
+    figures = {**verdict, **result.figures}
+    return dataclasses.replace(result, group="the network alone", passed=None, needs="", figures=figures)
+
 
 GROUPS: Mapping[str, Group] = MappingProxyType(
     {
@@ -32,22 +50,19 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
         "sensitivity": sensitivity,
         "obstacles": obstacles,
         "poison": poison,
-        "free": free,
+        "free": network_alone,
     }
 )
 
 
-def battery(subject: Subject, size: Size, groups: Mapping[str, Group] = GROUPS) -> Iterator[Line]:
-    """Run the tests of an emulator.
+def battery(model: ModelUnderTest, effort: Effort, groups: Mapping[str, Group] = GROUPS) -> Iterator[TestResult]:
+    """Run the tests of an emulator, and yield each result as soon as it is known.
 
     Args:
-        subject: The emulator, and its simulator where there is one.
-        size: Amount of work.
+        model: The emulator, and its simulator where there is one.
+        effort: Amount of work.
         groups: The tests to run, by name.
-
-    Yields:
-        Each line as soon as it is known.
     """
     with torch.no_grad():
         for group in groups.values():
-            yield from group(subject, size)
+            yield from group(model, effort)

@@ -16,11 +16,11 @@ from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
-from nmpm.evaluation.stress.lines import Line, Size
-from nmpm.evaluation.stress.subject import Subject
+from nmpm.evaluation.stress.model import ModelUnderTest
+from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import is_lost
 from nmpm.particles import Particles
-from nmpm.scene import Interval, Scene
+from nmpm.scene import Interval
 
 Forbidden = Callable[[Tensor, int], Tensor]
 """Given (N, D) positions and the index of the bundle: which particles are in a forbidden place, (N,) bool."""
@@ -32,39 +32,39 @@ _GROUP = "unseen scenes"
 _DEEP = 0.5  # cells: penetration of a solid that is tolerated
 
 
-def obstacles(subject: Subject, size: Size) -> Iterator[Line]:
+def obstacles(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
     """Walls, obstacles and sources added to a model that never saw them."""
-    scene = subject.emulator.scene
-    bundles = max(1, size.compared // subject.emulator.frames)
+    scene = model.emulator.scene
+    bundles = max(1, effort.compared // model.emulator.frames)
     if scene.walled and scene.dim > 1 and not any(scene.periodic):
-        emulator = subject.emulator.over(dataclasses.replace(scene, obstacles=True))
+        emulator = model.emulator.over(dataclasses.replace(scene, obstacles=True))
         for cells in (3, 1):
             yield _floor(emulator, f"a floor {cells} cells thick", cells, 0.0, bundles)
         yield _floor(emulator, "2 cells per frame against one cell", 1, 2.0, bundles)
         yield _hole(emulator, bundles)
         yield _moving_bar(emulator, bundles)
-    yield _inlet(subject.emulator, bundles)
+    yield _inlet(model.emulator, bundles)
 
 
-def _floor(emulator: Emulator, name: str, cells: int, speed: float, bundles: int) -> Line:
+def _floor(emulator: Emulator, name: str, cells: int, speed: float, bundles: int) -> TestResult:
     """A block falls onto a slab from wall to wall."""
     scene, slab = emulator.scene, _slab(emulator, cells)
-    state = _block(emulator, slab, speed, bar(scene, slab))
+    state = _block(emulator, slab, speed, lattice(slab, scene.particle_spacing))
     low, high = slab[1]
     deep = high - _DEEP * emulator.grid.spacing[1]
     most = _max_violations(emulator, state, bundles, lambda position, _: position[:, 1] < deep)
     below = _max_violations(emulator, state, bundles, lambda position, _: position[:, 1] < low)
     figures = {"in_or_below": most, "below": below, "of": state.position.shape[1]}
-    return Line(_GROUP, name, most == 0, _floats(figures), "no particle half a cell deep in it, none below")
+    return TestResult(_GROUP, name, most == 0, _floats(figures), "no particle half a cell deep in it, none below")
 
 
-def _hole(emulator: Emulator, bundles: int) -> Line:
+def _hole(emulator: Emulator, bundles: int) -> TestResult:
     """The slab has a hole eight cells wide under the block."""
     scene, slab = emulator.scene, _slab(emulator, 3)
     (left, right), (low, high), *rest = slab
     middle, half = (left + right) / 2, 4 * emulator.grid.spacing[0]
     sides = [((left, middle - half), (low, high), *rest), ((middle + half, right), (low, high), *rest)]
-    state = _block(emulator, slab, 0.0, torch.cat([bar(scene, side) for side in sides]))
+    state = _block(emulator, slab, 0.0, torch.cat([lattice(side, scene.particle_spacing) for side in sides]))
     deep = [_DEEP * h for h in emulator.grid.spacing]
 
     def within(position: Tensor, _: int) -> Tensor:
@@ -74,36 +74,38 @@ def _hole(emulator: Emulator, bundles: int) -> Line:
     most = _max_violations(emulator, state, bundles, within)
     passed = _max_violations(emulator, state, bundles, lambda position, _: position[:, 1] < low)
     figures = {"in_the_floor": most, "through_the_hole": passed, "of": state.position.shape[1]}
-    return Line(_GROUP, "a hole in the floor", most == 0, _floats(figures), "no particle half a cell deep in the floor")
+    return TestResult(
+        _GROUP, "a hole in the floor", most == 0, _floats(figures), "no particle half a cell deep in the floor"
+    )
 
 
-def _moving_bar(emulator: Emulator, bundles: int) -> Line:
+def _moving_bar(emulator: Emulator, bundles: int) -> TestResult:
     """A bar three cells thick and half as high as the box sweeps from the left, 0.4 cells per bundle."""
     scene, h = emulator.scene, emulator.grid.spacing[0]
     (left, right), (low, high), *rest = scene.bounds
     first = (left, left + 3 * h)
-    still = bar(scene, (first, (low, (low + high) / 2), *rest))
+    still = lattice((first, (low, (low + high) / 2), *rest), scene.particle_spacing)
     block = lattice(((left + 6 * h, (left + right) / 2), (low, (3 * low + high) / 4), *rest), scene.particle_spacing)
     state = _at_rest(emulator, block, still)
     still = state.obstacle[0]
 
-    def place(bundle: int) -> float:
+    def offset(bundle: int) -> float:
         return min(0.4 * bundle * h, (right - left) / 2)
 
     def sweep(state: Particles, bundle: int) -> Particles:
-        shift = still.new_tensor([place(bundle)] + [0.0] * (scene.dim - 1))
+        shift = still.new_tensor([offset(bundle)] + [0.0] * (scene.dim - 1))
         return dataclasses.replace(state, obstacle=(still + shift)[None])
 
     def within(position: Tensor, bundle: int) -> Tensor:
-        along = (position[:, 0] - place(bundle) - sum(first) / 2).abs() < (1.5 - 2 * _DEEP) * h
+        along = (position[:, 0] - offset(bundle) - sum(first) / 2).abs() < (1.5 - 2 * _DEEP) * h
         return along & (position[:, 1] < (low + high) / 2 - h)
 
     most = _max_violations(emulator, state, bundles, within, sweep)
     figures = {"in_the_bar": most, "of": state.position.shape[1]}
-    return Line(_GROUP, "a bar that moves", most == 0, _floats(figures), "no particle a cell deep in it")
+    return TestResult(_GROUP, "a bar that moves", most == 0, _floats(figures), "no particle a cell deep in it")
 
 
-def _inlet(emulator: Emulator, bundles: int) -> Line:
+def _inlet(emulator: Emulator, bundles: int) -> TestResult:
     """Every fifth bundle a small block enters at the top."""
     scene, h = emulator.scene, emulator.grid.spacing
     sides = [
@@ -115,22 +117,17 @@ def _inlet(emulator: Emulator, bundles: int) -> Line:
     fresh = _at_rest(emulator, lattice(tuple(sides), scene.particle_spacing))
 
     def feed(state: Particles, bundle: int) -> Particles:
-        return concatenate_particles(state, fresh) if bundle % 5 == 0 and bundle else state
+        return _concatenate(state, fresh) if bundle % 5 == 0 and bundle else state
 
     most = _max_violations(emulator, fresh, bundles, lambda position, _: is_lost(scene, position), feed)
-    return Line(_GROUP, "an inlet", most == 0, {"lost": float(most)}, "no particle lost")
+    return TestResult(_GROUP, "an inlet", most == 0, {"lost": float(most)}, "no particle lost")
 
 
-def concatenate_particles(one: Particles, other: Particles) -> Particles:
+def _concatenate(one: Particles, other: Particles) -> Particles:
     """The particles of two states, with the obstacles of the first, and without fields, which only one may have."""
     names = ("position", "velocity", "material", "mask")
     both: dict[str, Any] = {name: torch.cat([getattr(one, name), getattr(other, name)], dim=1) for name in names}
     return dataclasses.replace(one, **both, fields={})
-
-
-def bar(scene: Scene, box: tuple[Interval, ...]) -> Tensor:
-    """(M, D) obstacle particles that fill a box."""
-    return lattice(box, scene.particle_spacing)
 
 
 def _max_violations(

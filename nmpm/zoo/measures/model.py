@@ -13,9 +13,8 @@ from torch import Tensor
 from nmpm._support.progress import progress_bar
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
-from nmpm.evaluation.stress import GROUPS, Line, Subject, battery
-from nmpm.evaluation.stress.lines import QUICK
-from nmpm.evaluation.stress.report import as_json
+from nmpm.evaluation.stress import GROUPS, QUICK, ModelUnderTest, TestResult, battery
+from nmpm.evaluation.stress.results import as_json
 from nmpm.evaluation.trade.errors import GAIN, Measures, measure_errors
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_names
@@ -67,24 +66,26 @@ def invariant_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[
 
 
 def _stress(model: Pretrained, preset: Preset | None, size: str) -> dict[str, Any]:
-    constrained = Subject(model.name, model.emulator, model.horizon, preset, 0)
+    constrained = ModelUnderTest(model.name, model.emulator, model.horizon, preset, 0)
     free = constrained.with_emulator(model.emulator.unconstrained())
     others = [name for name in GROUPS if name != _SETTLING]
     with progress_bar(f"stress of {model.name}", len(GROUPS) + len(others)) as advance:
-        lines = _run_groups(constrained, GROUPS, advance)
-        # The last line of this group is the one without constraints; its simulations are most of the battery's time.
-        free_lines = _run_groups(free, others, advance) | {_SETTLING: lines[_SETTLING][-1:]}
-    return {"stress": _digest(model, lines, size), "stress_free": _digest(model, free_lines, size)}
+        results = _run_groups(constrained, GROUPS, advance)
+        # The last result of this group is the one without constraints; its simulations are most of the battery's time.
+        free_results = _run_groups(free, others, advance) | {_SETTLING: results[_SETTLING][-1:]}
+    return {"stress": _digest(model, results, size), "stress_free": _digest(model, free_results, size)}
 
 
-def _run_groups(subject: Subject, names: Iterable[str], advance: Callable[[], object]) -> dict[str, list[Line]]:
-    lines = {}
+def _run_groups(
+    model: ModelUnderTest, names: Iterable[str], advance: Callable[[], object]
+) -> dict[str, list[TestResult]]:
+    results = {}
     for name in names:
-        lines[name] = list(battery(subject, QUICK, {name: GROUPS[name]}))
+        results[name] = list(battery(model, QUICK, {name: GROUPS[name]}))
         advance()
-    return lines
+    return results
 
 
-def _digest(model: Pretrained, lines: dict[str, list[Line]], size: str) -> dict[str, Any]:
-    ordered = [line for name in GROUPS for line in lines[name]]
+def _digest(model: Pretrained, results: dict[str, list[TestResult]], size: str) -> dict[str, Any]:
+    ordered = [result for name in GROUPS for result in results[name]]
     return stress_digest(json.loads(as_json(model.name, size, 0.0, ordered)))

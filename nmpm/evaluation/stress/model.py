@@ -23,7 +23,7 @@ _STREAM = 7
 
 
 @dataclass(frozen=True)
-class Subject:
+class ModelUnderTest:
     """A trained emulator under test.
 
     Args:
@@ -62,16 +62,16 @@ class Subject:
         """Numbers that the seeds of scenes outside of any dataset are derived from, see `nmpm.data.simulation`."""
         return [(self.seed, _STREAM, index) for index in range(count)]
 
-    def with_emulator(self, emulator: Emulator) -> Subject:
+    def with_emulator(self, emulator: Emulator) -> ModelUnderTest:
         """The same test of another emulator."""
         return replace(self, emulator=emulator)
 
 
-def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -> Window:
-    """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the subject's device.
+def simulate_window(model: ModelUnderTest, preset: Preset, count: int, frames: int) -> Window:
+    """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the model's device.
 
     Args:
-        subject: Says which scenes.
+        model: Says which scenes.
         preset: Draws their initial states and simulates them.
         count: Scenes.
         frames: Frames after the first two.
@@ -79,28 +79,20 @@ def simulate_window(subject: Subject, preset: Preset, count: int, frames: int) -
     Raises:
         UnstableError: if the simulator does not stay stable from several seeds in a row.
     """
-    recordings = [
-        recording for entropy in subject.entropies(count) for recording in _record(preset, entropy, frames, ())
-    ]
-    return collate(recordings, preset.scene).to(subject.device)
-
-
-def simulate_scenes(subject: Subject, preset: Preset, count: int, frames: int) -> Iterator[Window]:
-    """The scenes of `simulate_window` one by one, which bounds the memory of long ones."""
-    for (window,) in simulate_beside(subject, preset, count, frames, ()):
-        yield window
+    recordings = [recording for entropy in model.entropies(count) for recording in _record(preset, entropy, frames, ())]
+    return collate(recordings, preset.scene).to(model.device)
 
 
 def simulate_beside(
-    subject: Subject, preset: Preset, count: int, frames: int, others: Sequence[Preset]
+    model: ModelUnderTest, preset: Preset, count: int, frames: int, others: Sequence[Preset]
 ) -> Iterator[list[Window]]:
-    """The scenes of `simulate_window` one by one, each as the preset and as others simulate it.
+    """The scenes of `simulate_window` one by one, which bounds memory, each as the preset and as others simulate it.
 
     A scene in which any of them becomes unstable is replaced by another.
     """
-    for entropy in subject.entropies(count):
+    for entropy in model.entropies(count):
         recordings = _record(preset, entropy, frames, others)
-        yield [collate([recording], preset.scene).to(subject.device) for recording in recordings]
+        yield [collate([recording], preset.scene).to(model.device) for recording in recordings]
 
 
 def _record(preset: Preset, entropy: tuple[int, ...], frames: int, others: Sequence[Preset]) -> list[Recording]:
@@ -108,11 +100,9 @@ def _record(preset: Preset, entropy: tuple[int, ...], frames: int, others: Seque
     reader = RecordingReader(preset_metadata(preset), preset.scene)
 
     def simulate(seed: int) -> list[Recording]:
-        start, found = preset.draw(seed), []
-        for solver in (preset, *others):
-            run = solver.simulate_from(start, frames + 1)
-            stored = Trajectory(run.position, run.particle_type, run.attributes)
-            found.append(reader.recording(stored, f"{preset.name}, seed {seed}"))
-        return found
+        start = preset.draw(seed)
+        runs = [solver.simulate_from(start, frames + 1) for solver in (preset, *others)]
+        stored = [Trajectory(run.position, run.particle_type, run.attributes) for run in runs]
+        return [reader.recording(each, f"{preset.name}, seed {seed}") for each in stored]
 
     return try_seeds(entropy, simulate)
