@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from nmpm._support.version import __version__
 
 if TYPE_CHECKING:
-    from nmpm.data.convert.arrays import write_trajectories as write_trajectories
+    from nmpm.data.arrays import write_trajectories as write_trajectories
     from nmpm.data.datamodule import TrajectoryDataModule as TrajectoryDataModule
     from nmpm.data.format import Trajectory as Trajectory
     from nmpm.emulator import Emulator as Emulator
@@ -34,7 +34,7 @@ _MODULE_OF = {
     "differentiable_rollout": "nmpm.emulator",
     "rollout": "nmpm.emulator",
     "view": "nmpm.viz.viewer",
-    "write_trajectories": "nmpm.data.convert.arrays",
+    "write_trajectories": "nmpm.data.arrays",
 }
 
 __all__ = [

@@ -1,20 +1,57 @@
-"""Small files from anywhere: only regular files are opened, none is read beyond a limit, YAML holds plain data only."""
+"""Files from anywhere: only regular files are opened, and what they hold is bounded before it is read or built."""
 
 from __future__ import annotations
 
 import os
 import re
+import struct
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from nmpm._support.limits import ALIASED, DIGITS, TEXT_BYTES, TEXT_DEPTH
 from nmpm._support.messages import one_line
-from nmpm._support.regular_files import check_mode
 from nmpm.errors import DataError
+
+FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""Names in files of others that become names of files: none is hidden or leads to another folder."""
+TEXT_BYTES = 2**20
+"""Size of a card, configuration or report."""
+DEPTH = 32
+"""Nesting of lists and mappings in YAML and JSON."""
+YAML_VALUES = 100_000
+"""Values in a YAML file; those that an alias repeats count again."""
+PLAIN_VALUES = 10**6
+"""Values in a JSON file or a pickle's metadata."""
+INTEGER = 2**63
+"""Integers in YAML and JSON are smaller."""
+EXPANSION = 200
+"""Bytes that a compressed file may unpack to, per stored byte; floats compress to a tenth at best."""
+
+ZIP_ERRORS: tuple[type[Exception], ...] = (
+    OSError,
+    EOFError,
+    RuntimeError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+"""Raised by zipfile for damaged, encrypted or unknown archives."""
+NPZ_ERRORS: tuple[type[Exception], ...] = (
+    *ZIP_ERRORS,
+    KeyError,
+    ValueError,
+    TypeError,
+    MemoryError,
+    tokenize.TokenError,
+)
+"""Raised for damaged `.npz` files, by NumPy too."""
+
+_CONTROL = re.compile(r"[^\n\r\t\x20-\x7e\xa0-\ud7ff\ue000-\U0010ffff]")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # (its type is not known)
@@ -29,40 +66,39 @@ for _kind in (_Loader, _Dumper):
     _kind.add_implicit_resolver(
         "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
     )
-_LOADER = _Loader
-_CONTROL = re.compile(r"[^\n\r\t\x20-\x7e\xa0-\ud7ff\ue000-\U0010ffff]")
-_NUMBER = re.compile(r"[-+0-9_.:eE]+")
+
+
+def expansion_limit(stored: int) -> int:
+    """Bytes that `stored` bytes may unpack to; 256 MiB are always allowed."""
+    return 2**28 + EXPANSION * stored
+
+
+def check_regular(path: Path) -> None:
+    """Raises an error unless a path is a file or a link to one: opening a pipe would wait, a device may never end.
+
+    Raises:
+        DataError: naming the path.
+    """
+    if not os.path.isfile(path):
+        reason = "is not a regular file; give a file" if os.path.exists(path) else "No such file"
+        raise DataError(f"{path} cannot be read: {reason}.")
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """The content of a regular file of at most `limit` bytes; pipes and devices are not opened.
+    """The content of a regular file of at most `limit` bytes.
 
     Raises:
-        DataError: if there is no such file, or it cannot be read, is not a regular file, or is larger.
+        DataError: if there is no such file, or it cannot be read or is larger.
     """
+    check_regular(path)
     try:
-        # Before opening, as that would block on a named pipe.
-        status = os.stat(path)
-        check_mode(path, status.st_mode)
-        if status.st_size > limit:
+        size = os.path.getsize(path)
+        if size > limit:
             raise DataError(f"{path} cannot be read: it has more than {limit:,} bytes.")
         with path.open("rb") as file:
-            return file.read(status.st_size)
-    except DataError:
-        raise
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise DataError(f"{path} cannot be read: {reason}.") from error
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping that a YAML file holds, of strings, numbers, truth values, lists and mappings.
-
-    Raises:
-        DataError: if the file cannot be read or is too large, too deep or not YAML, its aliases repeat too much, it
-            has tags, or holds other values, such as dates, or control characters.
-    """
-    return parse_yaml(read_text(path), path)
+            return file.read(size)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def read_text(path: Path) -> str:
@@ -77,25 +113,26 @@ def read_text(path: Path) -> str:
         raise DataError(f"{path} cannot be read: {error}") from error
 
 
-def parse_yaml(text: str, where: Path | str) -> dict[str, Any]:
-    """As `read_yaml`, of a file's text; a text without content is an empty mapping.
-
-    Args:
-        text: In YAML.
-        where: Its file, for messages.
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds, of texts, numbers, truth values, lists and mappings.
 
     Raises:
-        DataError: as `read_yaml`.
+        DataError: as `read_text`, or if it is too deep, not YAML, or holds anything else.
     """
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, where: Path | str) -> dict[str, Any]:
+    """As `read_yaml`, of a text; one without content is an empty mapping. Errors name `where`."""
     try:
         check_yaml(text)
-        plain = yaml.load(text, _LOADER)  # noqa: S506 (a safe loader)
+        plain = yaml.load(text, _Loader)  # noqa: S506 (a safe loader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         raise DataError(f"{where} cannot be read: {one_line(error)}") from error
     plain = {} if plain is None else plain
     if not isinstance(plain, dict):
         raise DataError(f"{where} should hold keys and values.")
-    _check_plain(plain, where)
+    check_plain(plain, where)
     return plain
 
 
@@ -106,83 +143,53 @@ def to_yaml(content: Mapping[str, Any]) -> str:
     )
 
 
-@dataclass
-class _Extent:
-    """How large a node is, its aliases written out: values in it, and levels below it."""
-
-    anchor: str | None
-    values: int = 1
-    depth: int = 0
-
-    def add(self, inner: _Extent) -> None:
-        self.values += inner.values
-        self.depth = max(self.depth, inner.depth + 1)
-
-
 def check_yaml(text: str) -> None:
-    """Refuse what makes a short text a large or slow one, before anything is built.
+    """Refuses YAML that is nested too deep, or whose aliases repeat too much, before it is built.
 
     Raises:
-        ValueError: naming it and its line.
+        ValueError: naming the line.
         yaml.YAMLError: if it is not YAML.
     """
-    anchors: dict[str, _Extent] = {}
-    open_nodes, repeated = [_Extent("")], 0
-    for event in yaml.parse(text, _LOADER):
-        line = event.start_mark.line + 1 if event.start_mark else 0
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in anchors:
-                raise ValueError(f"line {line}: *{one_line(event.anchor, 60)} stands for nothing before it.")
-            open_nodes[-1].add(anchors[event.anchor])
-            repeated += anchors[event.anchor].values
+    values, sizes = 0, dict[str | None, int]()
+    opened: list[tuple[str | None, int]] = []
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.AliasEvent):  # also refuses those within what they repeat
+            values += sizes.get(event.anchor, YAML_VALUES + 1)
         elif isinstance(event, yaml.CollectionStartEvent):
-            open_nodes.append(_Extent(event.anchor))
+            opened.append((event.anchor, values))
         elif isinstance(event, yaml.CollectionEndEvent | yaml.ScalarEvent):
-            ended = open_nodes.pop() if isinstance(event, yaml.CollectionEndEvent) else _Extent(event.anchor)
-            open_nodes[-1].add(ended)
-            if ended.anchor:
-                anchors[ended.anchor] = ended
-        if len(open_nodes) + open_nodes[-1].depth > TEXT_DEPTH + 2:
-            raise ValueError(f"line {line} is nested more than {TEXT_DEPTH} deep.")
-        if repeated > ALIASED:
-            raise ValueError(f"line {line}: aliases stand for more than {ALIASED:,} values; write fewer.")
-        tag = getattr(event, "tag", None)
-        if tag is not None:
-            raise ValueError(f"line {line} has the tag {one_line(tag, 60)}; only plain values are read.")
-        if isinstance(event, yaml.ScalarEvent) and len(event.value) > DIGITS and _NUMBER.fullmatch(event.value):
-            raise ValueError(f"line {line} has a number of more than {DIGITS} digits.")
+            anchor, before = opened.pop() if isinstance(event, yaml.CollectionEndEvent) else (event.anchor, values)
+            values += 1
+            sizes[anchor] = values - before
+        if len(opened) > DEPTH or values > YAML_VALUES:
+            line = event.start_mark.line + 1 if event.start_mark else 0
+            raise ValueError(f"line {line}: nested more than {DEPTH} deep, or aliases repeat too much.")
 
 
-def check_characters(value: object, path: Path | str) -> None:
-    """Refuse control characters but line breaks and tabs, as they reach terminals, and halves of characters.
-
-    Args:
-        value: Text, or lists and mappings of it; other values are left out.
-        path: Of the file that the text is of.
+def check_plain(value: Any, where: Path | str) -> None:
+    """Refuses all but texts, numbers, truth values, None, lists, and mappings with texts as keys.
 
     Raises:
-        DataError: naming the text.
+        DataError: naming `where` and the value; also for control characters, and where it is nested too deep.
     """
-    if isinstance(value, Mapping):
-        value = [*value.keys(), *value.values()]
-    if isinstance(value, list | tuple):
-        for item in value:
-            check_characters(item, path)
-    elif isinstance(value, str) and _CONTROL.search(value):
-        raise DataError(f"{path}: {one_line(repr(value), 60)} has a control character.")
-
-
-def _check_plain(value: Any, path: Path | str) -> None:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            if not isinstance(key, str):
-                raise DataError(f"{path} cannot be read: its key {one_line(repr(key), 60)} is not a string; quote it.")
-            _check_plain(key, path)
-            _check_plain(item, path)
-    elif isinstance(value, list):
-        for item in value:
-            _check_plain(item, path)
-    elif isinstance(value, str):
-        check_characters(value, path)
-    elif value is not None and not isinstance(value, int | float):
-        raise DataError(f"{path} cannot be read: it holds the {type(value).__name__} {one_line(value, 60)}; quote it.")
+    pending, count = [(value, 0)], 0
+    while pending:
+        item, depth = pending.pop()
+        count += 1
+        if depth > DEPTH or count > PLAIN_VALUES:
+            raise DataError(f"{where} cannot be read: its lists and mappings are nested more than {DEPTH} deep.")
+        if isinstance(item, Mapping):
+            wrong = next((key for key in item if not isinstance(key, str)), None)
+            if wrong is not None:
+                raise DataError(f"{where} cannot be read: the key {one_line(wrong, 60)} is not a string; quote it.")
+            pending += [(inner, depth + 1) for inner in (*item.keys(), *item.values())]
+        elif isinstance(item, list | tuple):
+            pending += [(inner, depth + 1) for inner in item]
+        elif isinstance(item, str) and _CONTROL.search(item):
+            raise DataError(f"{where}: {one_line(repr(item), 60)} has a control character.")
+        elif isinstance(item, int) and abs(item) >= INTEGER:
+            raise DataError(f"{where} cannot be read: it holds an integer of more than 63 bits.")
+        elif item is not None and not isinstance(item, str | int | float):
+            raise DataError(
+                f"{where} cannot be read: it holds the {type(item).__name__} {one_line(item, 60)}; quote it."
+            )

@@ -44,9 +44,9 @@ def run(words: list[str]) -> None:
     parser.add_argument("--format", metavar="NAME", help="format of the source (default: detected)")
     parser.add_argument("--ids", metavar="OLD=NEW,...", help="new type ids in the written files, e.g. 5=0,3=1")
     add_data_options(parser)
-    chosen = parser.parse_args(words[1:])
-    check_folder("DESTINATION", chosen.destination)
-    options, ids = data_options(chosen), new_ids(chosen.ids)
-    for note in convert(chosen.source, chosen.destination, chosen.format, options, ids):
+    arguments = parser.parse_args(words[1:])
+    check_folder("DESTINATION", arguments.destination)
+    options, ids = data_options(arguments), new_ids(arguments.ids)
+    for note in convert(arguments.source, arguments.destination, arguments.format, options, ids):
         sys.stdout.write(f"- {note}\n")
-    sys.stdout.write(f"wrote {chosen.destination}; to look at it: nmpm inspect {chosen.destination}\n")
+    sys.stdout.write(f"wrote {arguments.destination}; to look at it: nmpm inspect {arguments.destination}\n")

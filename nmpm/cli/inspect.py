@@ -8,7 +8,7 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +18,7 @@ from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
-    from nmpm.data.inspection import Inspection
-    from nmpm.data.inspection.facts import Range
+    from nmpm.data.inspection.report import Inspection, Range
     from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
@@ -47,61 +46,63 @@ def run(words: list[str]) -> None:
     parser.add_argument("--out", type=Path, help="picture to write (default: inspect-NAME.png)")
     parser.add_argument("--no-picture", action="store_true", help="do not draw")
     add_data_options(parser)
-    chosen = parser.parse_args(words[1:])
-    check_at_least("--trajectories", chosen.trajectories, 1)
-    if chosen.out is not None:
-        check_picture("--out", chosen.out)
-    if not chosen.path.exists():
-        raise ConfigError(f"{chosen.path}: there is no such file or folder.")
-    options = data_options(chosen)
+    arguments = parser.parse_args(words[1:])
+    check_at_least("--trajectories", arguments.trajectories, 1)
+    if arguments.out is not None:
+        check_picture("--out", arguments.out)
+    if not arguments.path.exists():
+        raise ConfigError(f"{arguments.path}: there is no such file or folder.")
+    options = data_options(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        native = Path(folder) / (chosen.path.resolve().stem or "dataset")
-        _inspect(*_origin(chosen.path, chosen.format, options, native), chosen)
+        native = Path(folder) / (arguments.path.resolve().stem or "dataset")
+        _inspect(*_open(arguments.path, arguments.format, options, native), arguments)
 
 
-def _inspect(origin: FolderSource, damage: list[str], chosen: argparse.Namespace) -> None:
+def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namespace) -> None:
     from nmpm.data.inspection import inspect
-    from nmpm.data.inspection.tolerance import with_guessed_family
 
-    inspection = inspect(origin, chosen.trajectories)
-    inspection = replace(inspection, path=str(chosen.path), findings=(*damage, *inspection.findings))
-    if chosen.json:
-        sys.stdout.write(json.dumps(inspection.to_dict(), indent=1) + "\n")
+    inspection = inspect(source, arguments.trajectories)
+    inspection = replace(inspection, path=str(arguments.path), findings=(*damage, *inspection.findings))
+    if arguments.json:
+        sys.stdout.write(json.dumps(asdict(inspection), indent=1) + "\n")
         return
-    sys.stdout.write("\n".join(lines(inspection)) + "\n")
-    if chosen.no_picture:
+    sys.stdout.write("\n".join(_lines(inspection)) + "\n")
+    if arguments.no_picture:
         return
     try:
-        _draw(with_guessed_family(origin), inspection, chosen.out or Path(f"inspect-{chosen.path.resolve().stem}.png"))
+        _draw(source, inspection, arguments.out or Path(f"inspect-{arguments.path.resolve().stem}.png"))
     except (NmpmError, OSError) as error:
         sys.stdout.write(f"\nno picture: {error}\n")
 
 
-def _origin(path: Path, format_name: str | None, options: Options, native: Path) -> tuple[FolderSource, list[str]]:
+def _open(path: Path, format_name: str | None, options: Options, native: Path) -> tuple[FolderSource, list[str]]:
     """The dataset, converted where it is foreign, and what could not be converted.
 
     Args:
         path: Of the dataset.
         format_name: Its format; detected when left out.
-        options: What the user states.
+        options: Facts that the user states.
         native: A folder for conversions that are not kept.
     """
     from nmpm.data.convert import convert
     from nmpm.data.format import split_paths
-    from nmpm.data.inspection.tolerance import convert_readable
-    from nmpm.data.loading.sources import FolderSource
+    from nmpm.data.loading.sources import FolderSource, StatedFacts
 
     path = _dataset_of(path)
     changed = options.types or options.static is not None or options.dt is not None
     if split_paths(path) and not changed and format_name is None:
-        return _native_origin(path, options), []
-    try:
-        if format_name is None:
+        boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
+        facts = StatedFacts(options.family, options.gravity, boundary, options.bounds, options.fields)  # type: ignore[arg-type]  # (argparse gives plain lists)
+        return FolderSource(path, facts), []
+    problems: list[str] = []
+    if format_name is None:
+        try:
             return _converted(path, options)
-        convert(path, native, format_name, options)
-        return FolderSource(native), []
-    except DataError as error:
-        return FolderSource(native), convert_readable(path, native, format_name, options) or [str(error)]
+        except DataError as error:
+            convert(path, native, options=options, problems=problems)
+            return FolderSource(native), problems or [str(error)]
+    convert(path, native, format_name, options, problems=problems)
+    return FolderSource(native), problems
 
 
 def _dataset_of(path: Path) -> Path:
@@ -136,18 +137,10 @@ def _converted(path: Path, options: Options) -> tuple[FolderSource, list[str]]:
         return FolderSource(native_folder(path, replace(options, gravity=None))), [str(error)]
 
 
-def _native_origin(path: Path, options: Options) -> FolderSource:
-    from nmpm.data.loading.sources import FolderSource, StatedFacts
-
-    boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
-    facts = StatedFacts(options.family, options.gravity, boundary, options.bounds, options.fields)  # type: ignore[arg-type]  # (argparse gives plain lists)
-    return FolderSource(path, facts)
-
-
-def lines(found: Inspection) -> Iterator[str]:
+def _lines(inspection: Inspection) -> Iterator[str]:
     """The lines of the summary, at most 100 characters wide."""
-    yield f"{found.path}: {found.dim}-D, {found.dt:g} s between frames"
-    for name, split in found.splits.items():
+    yield f"{inspection.path}: {inspection.dim}-D, {inspection.dt:g} s between frames"
+    for name, split in inspection.splits.items():
         trajectories = "trajectory" if split.trajectories == 1 else "trajectories"
         read = "" if split.inspected == split.trajectories else f" ({split.inspected} read)"
         static = f" + {_span(split.static)} at rest" if split.static[1] else ""
@@ -155,41 +148,39 @@ def lines(found: Inspection) -> Iterator[str]:
             f"  {name:<6}{split.trajectories:>5} {trajectories}{read} of {_span(split.frames)} frames,"
             f" {_span(split.particles)} particles{static}"
         )
-    yield _format_label("materials", ", ".join(f"{name} ({_span(n)})" for name, n in found.materials.items()))
-    if found.fields:
-        yield _format_label("fields", ", ".join(f"{name} {shape}" for name, shape in found.fields.items()))
-    for index, (name, text) in enumerate(found.channels.items()):
-        yield from _format_long("" if index else "channels", f"{name} {text}")
-    yield _format_label("varies", ", ".join(found.varies) or "nothing but the initial state")
-    yield _format_label("bounds", _box(found.stated_bounds) + " stated")
-    yield _format_label("", _box(found.observed) + " observed")
-    yield _format_label("domain", f"{_box(found.domain)} for a grid; {', '.join(found.boundary)}")
-    yield _format_label("gravity", _gravity(found))
-    yield _format_label(
-        "occupied", f"{100 * found.occupied:.2g}% of the domain, one trajectory {100 * found.occupied_each:.2g}%"
-    )
-    yield _format_label("at rest", _rest(found))
+    yield _label("materials", ", ".join(f"{name} ({_span(count)})" for name, count in inspection.materials.items()))
+    if inspection.fields:
+        yield _label("fields", ", ".join(f"{name} {shape}" for name, shape in inspection.fields.items()))
+    for index, (name, text) in enumerate(inspection.channels.items()):
+        label = _label("" if index else "channels", "")
+        yield from textwrap.wrap(f"{name} {text}", _WIDTH, initial_indent=label, subsequent_indent=" " * 14)
+    yield _label("varies", ", ".join(inspection.varies) or "nothing but the initial state")
+    yield _label("bounds", _box(inspection.stated_bounds) + " stated")
+    yield _label("", _box(inspection.observed) + " observed")
+    yield _label("domain", f"{_box(inspection.domain)} for a grid; {', '.join(inspection.boundary)}")
+    yield _label("gravity", _gravity(inspection))
+    share, each = 100 * inspection.occupied, 100 * inspection.occupied_each
+    yield _label("occupied", f"{share:.2g}% of the domain, one trajectory {each:.2g}%")
+    yield _label("at rest", _rest(inspection))
     yield ""
     yield "  grid          particles per    cells per frame"
     yield "                occupied cell    median    99.9%      max"
-    for grid in found.grids:
-        mark = "  <- recommended" if grid.cells == found.recommended else ""
+    for grid in inspection.grids:
+        mark = "  <- recommended" if grid.cells == inspection.recommended else ""
         shape = " x ".join(map(str, grid.shape))
         yield (
             f"  {shape:<14}{grid.per_cell:>10.2f}    {grid.median_speed:>9.3f}{grid.high_speed:>9.2f}"
             f"{grid.most_speed:>9.2f}{mark}"
         )
-    for title, items in (("notes", found.notes), ("suspicious", found.findings or ("nothing found",))):
-        yield from _format_list(title, items)
+    for title, items in (("notes", inspection.notes), ("suspicious", inspection.findings or ("nothing found",))):
+        if items:
+            yield from ("", f"  {title}")
+        for item in items:
+            yield from textwrap.wrap(item, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def _format_label(label: str, text: str) -> str:
+def _label(label: str, text: str) -> str:
     return f"  {label:<10}{text}"
-
-
-def _format_long(label: str, text: str) -> Iterator[str]:
-    """A label and its text, on further lines where it is long."""
-    yield from textwrap.wrap(text, _WIDTH, initial_indent=_format_label(label, ""), subsequent_indent=" " * 14)
 
 
 def _span(values: Range) -> str:
@@ -200,53 +191,42 @@ def _box(box: Iterable[tuple[float, float]]) -> str:
     return " x ".join(f"{low:.4g}…{high:.4g}" for low, high in box)
 
 
-def _gravity(found: Inspection) -> str:
-    measured = ", ".join(f"{value:.3g}" for value in found.first_acceleration)
-    if "gravity" in found.varies:
-        stated = "differs between trajectories"
-    else:
-        stated = "not stated" if found.gravity is None else ", ".join(f"{value:g}" for value in found.gravity)
+def _gravity(inspection: Inspection) -> str:
+    measured = ", ".join(f"{value:.3g}" for value in inspection.first_acceleration)
+    stated = "not stated" if inspection.gravity is None else ", ".join(f"{value:g}" for value in inspection.gravity)
+    stated = "differs between trajectories" if "gravity" in inspection.varies else stated
     return f"{stated}; median acceleration in the first frames: {measured}"
 
 
-def _rest(found: Inspection) -> str:
-    if found.rest is None:
+def _rest(inspection: Inspection) -> str:
+    if inspection.rest is None:
         return "no trajectory comes to rest"
-    middle, first, last = found.rest
-    moving = f"; {found.restless} still move at their end" if found.restless else ""
-    return f"from frame {middle} on ({first}-{last}), {middle * found.dt:.3g} s{moving}"
+    middle, first, last = inspection.rest
+    moving = f"; {inspection.restless} still move at their end" if inspection.restless else ""
+    return f"from frame {middle} on ({first}-{last}), {middle * inspection.dt:.3g} s{moving}"
 
 
-def _format_list(title: str, items: Iterable[str]) -> Iterator[str]:
-    items = list(items)
-    if items:
-        yield ""
-        yield f"  {title}"
-    for item in items:
-        yield from textwrap.wrap(item, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
-
-
-def _draw(origin: FolderSource, found: Inspection, path: Path) -> None:
+def _draw(source: FolderSource, inspection: Inspection, path: Path) -> None:
     import numpy as np
 
-    from nmpm.data.format import Split, split_paths
-    from nmpm.data.gravity import own_gravity
+    from nmpm.data.gravity import trajectory_gravity
+    from nmpm.data.inspection.reading import open_dataset
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
-    metadata = origin.metadata
-    trajectory = Split(next(iter(split_paths(origin.folder).values()))).read(0)
+    data = open_dataset(source)
+    metadata, scene, trajectory = data.source.metadata, data.source.scene, next(iter(data.splits.values())).read(0)
     moving = np.isin(trajectory.particle_type, metadata.moving_types)
     static = np.isin(trajectory.particle_type, list(metadata.static_types))
     pictured = LabelledTrajectories(
         positions={"recorded": trajectory.position[:, moving]},
         material=material_names(trajectory.particle_type[moving], metadata.particle_types),
-        bounds=origin.scene.bounds,
+        bounds=scene.bounds,
         dt=metadata.dt,
-        domain=origin.scene.domain,
+        domain=scene.domain,
         obstacle=trajectory.position[0, static],
-        periodic=origin.scene.periodic,
-        gravity=own_gravity(trajectory.attributes, origin.scene, found.path),
-        title=f"{Path(found.path).name}, first trajectory",
+        periodic=scene.periodic,
+        gravity=trajectory_gravity(trajectory.attributes, scene, inspection.path),
+        title=f"{Path(inspection.path).name}, first trajectory",
     )
     write_snapshots(pictured, path)
     sys.stdout.write(f"\nwrote {path}\n")

@@ -150,7 +150,7 @@ def _show(name: str) -> None:
 
 def _preview(preset: Preset, seed: int, path: Path) -> None:
     from nmpm._support.progress import progress_bar
-    from nmpm.data.gravity import own_gravity
+    from nmpm.data.gravity import trajectory_gravity
     from nmpm.sim.preset import BOUNDARY
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
@@ -165,7 +165,7 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
         domain=scene.domain,
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
-        gravity=own_gravity(trajectory.attributes, scene, preset.name),
+        gravity=trajectory_gravity(trajectory.attributes, scene, preset.name),
         title=f"{preset.name}, simulated by nmpm ({preset.generator})",
     )
     write_snapshots(pictured, path)

@@ -25,7 +25,7 @@ _SAME = 1e-6
 
 @dataclass
 class FieldFacts:
-    """What the trajectories seen so far say about a field.
+    """Values of a field in the trajectories seen so far.
 
     Args:
         shape: Of the first one.
@@ -48,11 +48,24 @@ class FieldFacts:
         return "parameter" if self.shape == (1, 1) else "property"
 
     def add(self, values: np.ndarray) -> None:
-        """Add a trajectory's values (T or 1, N or 1) of moving particles."""
+        """Adds a trajectory's values (T or 1, N or 1) of moving particles."""
         if values.size:
             self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
             change = float(np.ptp(values, axis=0).max())
             self.evolves |= change > _SAME * float(np.abs(values).max())
+
+
+def add_fields(
+    facts: dict[str, FieldFacts], split: Split, index: int, metadata: Metadata, names: Iterable[str]
+) -> None:
+    """Adds a trajectory's fields to the facts about the dataset's; names that it lacks are left out.
+
+    Raises:
+        DataError: as `read_fields`.
+    """
+    moving = np.isin(split.particle_type(index), metadata.moving_types)
+    for name, values in read_fields(split, index, names).items():
+        facts.setdefault(name, FieldFacts(values.shape)).add(values if values.shape[1] == 1 else values[:, moving])
 
 
 def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
@@ -61,7 +74,7 @@ def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.
     Raises:
         DataError: if one has another shape, or is no real number.
     """
-    found: dict[str, np.ndarray] = {}
+    fields: dict[str, np.ndarray] = {}
     where, sizes = split.where(index), (split.frames(index), split.particles(index))
     with open_hdf5(split.path) as file:
         group = file[split.names[index]]
@@ -69,10 +82,10 @@ def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.
             values = group.get(name)
             if values is not None and hasattr(values, "dtype"):
                 check_stored_size(values, f"{where}: {name}")
-                found[name] = _arrange(values[()], sizes, f"{where}: {name}")
+                fields[name] = _arrange(values[()], sizes, f"{where}: {name}")
             elif name in group.attrs:
-                found[name] = _arrange(group.attrs[name], sizes, f"{where}: {name}")
-    return found
+                fields[name] = _arrange(group.attrs[name], sizes, f"{where}: {name}")
+    return fields
 
 
 def _arrange(values: Any, sizes: tuple[int, int], where: str) -> np.ndarray:
@@ -91,28 +104,8 @@ def _arrange(values: Any, sizes: tuple[int, int], where: str) -> np.ndarray:
     )
 
 
-def survey_fields(
-    split: Split, metadata: Metadata, names: Sequence[str], sample: Iterable[int]
-) -> dict[str, FieldFacts]:
-    """What trajectories say about fields.
-
-    Args:
-        split: Their file.
-        metadata: Says which particles move.
-        names: Of fields; those that a trajectory lacks are left out.
-        sample: Indices of the trajectories to read.
-    """
-    facts: dict[str, FieldFacts] = {}
-    for index in sample if names else ():
-        moving = np.isin(split.particle_type(index), metadata.moving_types)
-        for name, values in read_fields(split, index, names).items():
-            own = values if values.shape[1] == 1 else values[:, moving]
-            facts.setdefault(name, FieldFacts(values.shape)).add(own)
-    return facts
-
-
 def require_fields(split: Split, names: Sequence[str]) -> None:
-    """Make sure that every trajectory has the declared fields.
+    """Makes sure that every trajectory has the declared fields.
 
     Raises:
         DataError: naming the first that lacks one, and what it has.
@@ -122,10 +115,10 @@ def require_fields(split: Split, names: Sequence[str]) -> None:
     with open_hdf5(split.path) as file:
         for index, group_name in enumerate(split.names):
             group = file[group_name]
-            known = sorted({*group, *group.attrs} - {"position", "particle_type"})
-            missing = [name for name in names if name not in known]
+            stored = sorted({*group, *group.attrs} - {"position", "particle_type"})
+            missing = [name for name in names if name not in stored]
             if missing:
                 raise DataError(
                     f"{split.where(index)}: it has no field {', '.join(missing)}, which the metadata's `fields` or"
-                    f" data.fields name (it has: {', '.join(known) or 'none'}). Correct the name, or leave it out."
+                    f" data.fields name (it has: {', '.join(stored) or 'none'}). Correct the name, or leave it out."
                 )

@@ -17,8 +17,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm.data.compression import FILTERS, write_compressed
-from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5, writable_hdf5
+from nmpm.data.hdf5 import (
+    FILTERS,
+    check_self_contained,
+    check_stored_size,
+    open_hdf5,
+    writable_hdf5,
+    write_compressed,
+)
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
 from nmpm.data.metadata import read_metadata as read_metadata
@@ -165,17 +171,15 @@ class Split:
         Raises:
             DataError: if one does not hold numbers.
         """
-        found: dict[str, np.ndarray] = {}
+        fields: dict[str, np.ndarray] = {}
         with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
-            names: list[str] = []
-            group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-            for name in names:
-                if name not in _CORE:
+            for name in group:
+                if name not in _CORE and isinstance(group[name], h5py.Dataset):
                     _check_field(name, group[name], self.where(index))
                     check_stored_size(group[name], f"{self.where(index)}: {name}")
-                    found[name] = np.asarray(group[name][()])
-        return found
+                    fields[name] = np.asarray(group[name][()])
+        return fields
 
     def read_with_fields(self, index: int) -> Trajectory:
         """Reads a trajectory with its fields.
@@ -219,8 +223,8 @@ def _entry(group: Any, name: str, path: Path) -> _Entry:
         raise DataError(f"{path}: {name!r} is not a group; {_LAYOUT}.")
     missing = [key for key in _CORE if not isinstance(group.get(key), h5py.Dataset)]
     if missing:
-        found = ", ".join(group) or "nothing"
-        raise DataError(f"{where}: the key {' and '.join(map(repr, missing))} is missing (found: {found}); {_LAYOUT}.")
+        names = ", ".join(group) or "nothing"
+        raise DataError(f"{where}: the key {' and '.join(map(repr, missing))} is missing (found: {names}); {_LAYOUT}.")
     _check_arrays(group["position"], group["particle_type"], where)
     for key in _CORE:
         check_stored_size(group[key], f"{where}: {key}")
@@ -265,8 +269,8 @@ def _check_finite(position: np.ndarray, where: str, first_frame: int) -> None:
 
 
 def _other_files(folder: Path) -> str:
-    found = sorted(file.name for file in folder.glob("*.h5"))
-    return f" (beside it: {', '.join(found)})" if found else ""
+    names = sorted(file.name for file in folder.glob("*.h5"))
+    return f" (beside it: {', '.join(names)})" if names else ""
 
 
 def split_paths(folder: Path) -> Mapping[str, Path]:

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from nmpm._support.atomic import atomic_write, lock_folder, temporary_files
+from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import usable_cores
 from nmpm._support.version import __version__
-from nmpm.data.archive_errors import NPZ_ERRORS
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,

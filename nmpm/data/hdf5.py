@@ -1,8 +1,9 @@
-"""Reads HDF5 files from untrusted sources, and writes HDF5 files to disks that may be full.
+"""Reads HDF5 files from anywhere, and writes HDF5 files fast and to disks that may be full.
 
 An HDF5 file can refer to other files (external links, external storage, virtual datasets), so that the bytes of any
 file would be read as positions; `check_self_contained` refuses these. HDF5 crashes the process when a write fails, so
-`writable_hdf5` gives it a file whose writes never fail and reports the error afterwards.
+`writable_hdf5` gives it a file whose writes never fail, and reports the error afterwards. HDF5 compresses one chunk
+after the other, so `write_compressed` compresses in threads what HDF5's own filters would store.
 """
 
 from __future__ import annotations
@@ -10,24 +11,32 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from io import FileIO
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import h5py
+import numpy as np
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.limits import HDF5_DEPTH, HDF5_OBJECTS, expansion_limit
-from nmpm._support.regular_files import check_regular
+from nmpm._support.bounded_files import check_regular, expansion_limit
+from nmpm._support.messages import one_line
+from nmpm._support.threads import map_ranges, split, usable_cores
 from nmpm.errors import DataError, NmpmError
 
 _ERRORS = (OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError, MemoryError)
 """What h5py raises on damaged files."""
-
 _LOCK_SIGNS = ("unable to lock file", "file locking")
 """In HDF5's messages on files that another program, or another part of this one, has locked."""
+_LEVEL = 1
+FILTERS: Mapping[str, Any] = MappingProxyType({"shuffle": True, "compression": "gzip", "compression_opts": _LEVEL})
+"""Options of h5py for a compressed dataset."""
+_AHEAD = 4
+"""Compressed chunks per thread that are in memory before they are written."""
 
 
 @contextmanager
@@ -44,59 +53,48 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     except NmpmError:
         raise
     except _ERRORS as error:
-        raise _read_error(path, error) from error
-
-
-def _read_error(path: Path, error: Exception) -> DataError:
-    reason = " ".join(str(error).split())[:200]
-    if any(sign in reason for sign in _LOCK_SIGNS):
-        cause = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else reason
-        return DataError(
-            f"{path}: is locked ({cause}). Close the program that has it open, e.g. a notebook that writes it; if there"
-            " is none, as on some network or read-only disks, set HDF5_USE_FILE_LOCKING=FALSE."
-        )
-    if isinstance(error, PermissionError):
-        return DataError(f"{path}: cannot be read (permission denied). Correct its permissions.")
-    return DataError(f"{path}: cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again.")
+        reason = one_line(error)
+        if any(sign in reason for sign in _LOCK_SIGNS):
+            cause = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else reason
+            mend = (
+                f"is locked ({cause}). Close the program that has it open, e.g. a notebook that writes it; if there is"
+                " none, as on some network or read-only disks, set HDF5_USE_FILE_LOCKING=FALSE."
+            )
+        elif isinstance(error, PermissionError):
+            mend = "cannot be read (permission denied). Correct its permissions."
+        else:
+            mend = f"cannot be read as HDF5 ({reason}). Is it complete? Copy, download or generate it again."
+        raise DataError(f"{path}: {mend}") from error
 
 
 def check_self_contained(file: Any, path: Path) -> None:
-    """Raises an error if an open HDF5 file takes content from other files, or has too many or too deep groups.
+    """Raises an error if an open HDF5 file takes content from other files.
 
     Raises:
-        DataError: names the file and the link, group or dataset.
+        DataError: names the file and the link or dataset.
     """
     # By hand: h5py's `visititems` recurses in C, and crashes the process in deep groups.
-    pending, count = [("", file, 0)], 0
+    pending, visited = [file], {file}
     while pending:
-        place, group, depth = pending.pop()
+        group = pending.pop()
         for name in group:
-            count += 1
-            where = f"{place}{name}"
-            if count > HDF5_OBJECTS:
-                raise DataError(f"{path}: has more than {HDF5_OBJECTS:,} groups and datasets.")
+            where = f"{group.name}/{name}".lstrip("/")[:100]
             link = group.get(name, getlink=True)
             if isinstance(link, h5py.ExternalLink):
                 raise _elsewhere_error(path, f"{where!r} is an external link to {link.filename!r}")
             # A soft link leads to an object that is visited by its other name, or nowhere.
             item = group[name] if isinstance(link, h5py.HardLink) else None
-            if isinstance(item, h5py.Group):
-                if depth >= HDF5_DEPTH:
-                    raise DataError(f"{path}: {where[:100]!r} is nested more than {HDF5_DEPTH} groups deep.")
-                pending.append((f"{where}/", item, depth + 1))
-            elif isinstance(item, h5py.Dataset):
-                _check_stored_here(item, where, path)
+            if isinstance(item, h5py.Group) and item not in visited:
+                visited.add(item)
+                pending.append(item)
+            elif isinstance(item, h5py.Dataset) and item.external:
+                raise _elsewhere_error(path, f"{where!r} is stored in another file, {item.external[0][0]!r}")
+            elif isinstance(item, h5py.Dataset) and item.is_virtual:
+                raise _elsewhere_error(path, f"{where!r} is a virtual dataset")
 
 
-def _check_stored_here(dataset: Any, name: str, path: Path) -> None:
-    if dataset.external:
-        raise _elsewhere_error(path, f"{name!r} is stored in another file, {dataset.external[0][0]!r}")
-    if dataset.is_virtual:
-        raise _elsewhere_error(path, f"{name!r} is a virtual dataset")
-
-
-def _elsewhere_error(path: Path, found: str) -> DataError:
-    return DataError(f"{path}: {found}; content of other files is not read. Copy it into this file.")
+def _elsewhere_error(path: Path, problem: str) -> DataError:
+    return DataError(f"{path}: {problem}; content of other files is not read. Copy it into this file.")
 
 
 def check_stored_size(dataset: Any, where: str) -> None:
@@ -105,14 +103,42 @@ def check_stored_size(dataset: Any, where: str) -> None:
     Raises:
         DataError: naming `where` and both sizes.
     """
-    declared = math.prod(dataset.shape) * dataset.dtype.itemsize
-    chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    declared, chunk = (math.prod(shape) * dataset.dtype.itemsize for shape in (dataset.shape, dataset.chunks or (0,)))
     stored = int(dataset.id.get_storage_size())
     if max(declared, chunk) > expansion_limit(stored):
         raise DataError(
             f"{where}: has the shape {dataset.shape}, {max(declared, chunk):,} bytes, but only {stored:,} bytes are"
             " stored. Is the file complete? Copy, download or generate it again."
         )
+
+
+def write_compressed(group: Any, name: str, values: np.ndarray, rows: int, threads: int | None = None) -> None:
+    """Adds a compressed dataset to an HDF5 group.
+
+    Args:
+        group: Open for writing.
+        name: Of the dataset.
+        values: At least one row.
+        rows: Of a chunk, along the first axis.
+        threads: That compress; one per processor core when left out.
+    """
+    chunk = (rows, *values.shape[1:])
+    dataset = group.create_dataset(name, shape=values.shape, dtype=values.dtype, chunks=chunk, **FILTERS)
+    threads = threads or usable_cores()
+    ranges, rest = split(len(values), rows), (0,) * (values.ndim - 1)
+    for first in range(0, len(ranges), _AHEAD * threads):
+        batch = ranges[first : first + _AHEAD * threads]
+        packed = map_ranges(lambda low, high: _compress(values[low:high], rows), batch, threads)
+        for (low, _), content in zip(batch, packed, strict=True):
+            dataset.id.write_direct_chunk((low, *rest), content)
+
+
+def _compress(values: np.ndarray, rows: int) -> bytes:
+    """A chunk as HDF5 stores it: filled with zeros to all its rows, first bytes of all values first, compressed."""
+    if len(values) < rows:
+        values = np.concatenate([values, np.zeros((rows - len(values), *values.shape[1:]), values.dtype)])
+    octets = np.ascontiguousarray(values).reshape(-1).view(np.uint8).reshape(-1, values.itemsize)
+    return zlib.compress(octets.T.tobytes(), _LEVEL)
 
 
 @contextmanager
@@ -134,7 +160,12 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
 
         def check() -> None:
             if target.error is not None:
-                raise _write_error(path, target.error, target.unwritten_bytes) from target.error
+                folder = next(folder for folder in path.absolute().parents if folder.is_dir())
+                raise DataError(
+                    f"{path}: cannot be written ({target.error.strerror}): at least {target.unwritten_bytes} more bytes"
+                    f" are needed, {shutil.disk_usage(folder).free} are free on its disk. Free space or choose another"
+                    " folder."
+                ) from target.error
 
         with h5py.File(target, "w", **options) as file:
             yield file, check
@@ -153,14 +184,6 @@ def _open_atomically(path: Path) -> Iterator[FileIO]:
                 f"{path}: cannot be written ({error.strerror}). Correct the permissions, or choose another folder."
             ) from error
         yield raw
-
-
-def _write_error(path: Path, error: OSError, missing: int) -> DataError:
-    free = shutil.disk_usage(next(folder for folder in path.absolute().parents if folder.is_dir())).free
-    return DataError(
-        f"{path}: cannot be written ({error.strerror}): at least {missing} more bytes are needed, {free} are free on"
-        " its disk. Free space or choose another folder."
-    )
 
 
 class _NeverFailingFile:
@@ -184,16 +207,15 @@ class _NeverFailingFile:
         return sum(len(content) for _, content in self._unwritten)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size()}[whence]
-        self._position = start + offset
+        ends = (os.fstat(self._descriptor).st_size, *(first + len(part) for first, part in self._unwritten))
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: max(ends)}[whence]
         return self._position
 
     def tell(self) -> int:
         return self._position
 
     def write(self, data: Any) -> int:
-        content = memoryview(data).cast("B")
-        written = 0
+        content, written = memoryview(data).cast("B"), 0
         try:
             while written < len(content) and self.error is None:
                 written += os.pwrite(self._descriptor, content[written:], self._position + written)
@@ -213,8 +235,7 @@ class _NeverFailingFile:
         target = memoryview(buffer).cast("B")
         first, count = self._position, len(target)
         content = os.pread(self._descriptor, count, first)
-        target[: len(content)] = content
-        target[len(content) :] = bytes(count - len(content))
+        target[:] = content + bytes(count - len(content))
         for offset, part in self._unwritten:
             low, high = max(first, offset), min(first + count, offset + len(part))
             if low < high:
@@ -222,8 +243,7 @@ class _NeverFailingFile:
         self._position += count
         return count
 
-    def truncate(self, size: int | None = None) -> int:
-        size = self._position if size is None else size
+    def truncate(self, size: int) -> int:
         try:
             if self.error is None:
                 os.ftruncate(self._descriptor, size)
@@ -233,7 +253,3 @@ class _NeverFailingFile:
 
     def flush(self) -> None:
         """Does nothing: writes are not buffered."""
-
-    def _size(self) -> int:
-        ends = [offset + len(part) for offset, part in self._unwritten]
-        return max(os.fstat(self._descriptor).st_size, *ends, 0)

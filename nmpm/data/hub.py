@@ -7,9 +7,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from nmpm._support.atomic import lock_folder, new_folder
-from nmpm._support.limits import EXPANSION, FILE_NAME, expansion_limit
+from nmpm._support.bounded_files import EXPANSION, FILE_NAME, ZIP_ERRORS, expansion_limit
 from nmpm._support.shipped import user_home
-from nmpm.data.archive_errors import ZIP_ERRORS
 from nmpm.data.format import SPLITS
 from nmpm.errors import ConfigError, DataError
 

@@ -1,4 +1,4 @@
-"""Validation of JSON objects key by key, with errors that name the file, the key and its value.
+"""Takes the keys of a JSON object one by one; errors name the file, the key and its value.
 
 Parsers raise a TypeError or ValueError that states what is wanted.
 """
@@ -6,62 +6,79 @@ Parsers raise a TypeError or ValueError that states what is wanted.
 from __future__ import annotations
 
 import json
-import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from nmpm._support.limits import WHOLE
 from nmpm._support.messages import one_line
+from nmpm._support.numbers import is_finite
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval, check_field_names
 
+REQUIRED: Any = object()
+"""In place of a default: the key must be there."""
+
 
 class JsonKeys:
-    """Validates and removes the keys of a JSON object one by one; errors name the file and the key."""
+    """The keys of a JSON object that are not taken yet.
 
-    _REQUIRED = object()
+    Args:
+        where: The object's file.
+        plain: The object.
+        problems: Collects what is wrong; None raises it.
+        substitutes: Values, where problems are collected, for keys that are missing or wrong; others take the default.
+    """
 
-    def __init__(self, path: Path | str, plain: dict[str, Any]) -> None:
-        self.path = path
-        self.left = plain
+    def __init__(
+        self,
+        where: Path | str,
+        plain: Mapping[str, Any],
+        problems: list[str] | None = None,
+        substitutes: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.where, self.left, self.problems, self.substitutes = where, dict(plain), problems, substitutes or {}
 
-    def error(self, key: str, value: Any, wanted: str) -> DataError:
-        return DataError(f"{self.path}: {key} = {one_line(_repr(value), 80)} should be {wanted}.")
-
-    def peek(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
-        if self.left.get(key) is None:
-            if default is self._REQUIRED:
-                raise DataError(f"{self.path}: the key {key!r} is missing.")
+    def peek(self, key: str, parse: Callable[[Any], Any], default: Any = REQUIRED) -> Any:
+        """The parsed value of a key; `parse` raises a TypeError or ValueError that states what is wanted."""
+        value = self.left.get(key)
+        if value is None and default is not REQUIRED:
             return default
         try:
-            return parse(self.left[key])
-        except (TypeError, ValueError, OverflowError) as error:
-            raise self.error(key, self.left[key], str(error)) from error
+            if value is not None:
+                return parse(value)
+            problem = f"{self.where}: the key {key!r} is missing."
+        except (TypeError, ValueError) as error:
+            problem = f"{self.where}: {key} = {one_line(json.dumps(value, default=repr), 80)} should be {error}."
+        if self.problems is None:
+            raise DataError(problem)
+        self.problems.append(problem)
+        return self.substitutes.get(key, default)
 
-    def take(self, key: str, parse: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
+    def take(self, key: str, parse: Callable[[Any], Any], default: Any = REQUIRED) -> Any:
+        """As `peek`, and removes the key from those that are left."""
         value = self.peek(key, parse, default)
         self.left.pop(key, None)
         return value
 
 
-def _repr(value: Any) -> str:
-    try:
-        return json.dumps(value)
-    except (TypeError, ValueError):
-        return type(value).__name__
+def parse_dim(value: Any) -> int:
+    """1, 2 or 3."""
+    if value not in (1, 2, 3) or isinstance(value, bool | float):
+        raise ValueError("1, 2 or 3")
+    return int(value)
 
 
-def parse_number(value: Any) -> float:
-    """A finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
-        raise ValueError("a finite number")
-    return float(value)
+def parse_count(value: Any) -> int:
+    """A positive integer."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError("a positive integer")
+    return value
 
 
 def parse_positive(value: Any) -> float:
     """A positive, finite number."""
-    if parse_number(value) <= 0:
+    if not is_finite(value) or value <= 0:
         raise ValueError("a positive number")
     return float(value)
 
@@ -84,18 +101,9 @@ def parse_field_names(value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
-def parse_whole(value: Any) -> int:
-    """A positive integer."""
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < WHOLE:
-        raise ValueError(f"a positive integer below {WHOLE}")
-    return value
-
-
 def parse_ids(value: Any) -> frozenset[int]:
     """A set of type ids from a list."""
-    if not isinstance(value, list) or any(
-        isinstance(i, bool) or not isinstance(i, int) or abs(i) > WHOLE for i in value
-    ):
+    if not isinstance(value, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in value):
         raise ValueError("a list of type ids")
     return frozenset(value)
 
@@ -104,48 +112,31 @@ def parse_names(value: Any) -> dict[int, str]:
     """Names by type id."""
     if not isinstance(value, Mapping) or not value or not all(isinstance(name, str) for name in value.values()):
         raise ValueError('an object that maps ids to names, e.g. {"7": "goop"}')
-    try:
-        types = {int(i): name for i, name in value.items()}
-    except ValueError as error:
-        raise ValueError('an object whose keys are integers, e.g. {"7": "goop"}') from error
-    if any(abs(i) > WHOLE for i in types):
-        raise ValueError(f"an object whose keys are at most {WHOLE}")
-    return types
+    if not all(re.fullmatch(r"-?\d{1,18}", i) for i in value):
+        raise ValueError('an object whose keys are integers, e.g. {"7": "goop"}')
+    return {int(i): name for i, name in value.items()}
 
 
-def vector_parser(dim: int) -> Callable[[Any], tuple[float, ...]]:
-    """A parser of `dim` finite numbers."""
-
-    def parse(value: Any) -> tuple[float, ...]:
-        if not isinstance(value, list) or len(value) != dim:
-            raise ValueError(f"a list of {dim} numbers, one per axis")
-        return tuple(parse_number(item) for item in value)
-
-    return parse
+def parse_vector(value: Any, dim: int) -> tuple[float, ...]:
+    """`dim` finite numbers."""
+    if not isinstance(value, list) or len(value) != dim or not all(map(is_finite, value)):
+        raise ValueError(f"a list of {dim} finite numbers, one per axis")
+    return tuple(map(float, value))
 
 
-def intervals_parser(dim: int) -> Callable[[Any], tuple[Interval, ...]]:
-    """A parser of (lower, upper) for each of `dim` axes."""
+def parse_intervals(value: Any, dim: int) -> tuple[Interval, ...]:
+    """(lower, upper) for each of `dim` axes."""
     wanted = f"a list of {dim} pairs [lower, upper] with lower < upper, one per axis"
-
-    def parse(value: Any) -> tuple[Interval, ...]:
-        if not isinstance(value, list) or len(value) != dim:
+    if not isinstance(value, list) or len(value) != dim:
+        raise ValueError(wanted)
+    for pair in value:
+        if not isinstance(pair, list) or len(pair) != 2 or not all(map(is_finite, pair)) or pair[0] >= pair[1]:
             raise ValueError(wanted)
-        pairs = [vector_parser(2)(pair) for pair in value]
-        if any(low >= high for low, high in pairs):
-            raise ValueError(wanted)
-        return tuple((low, high) for low, high in pairs)
-
-    return parse
+    return tuple((float(low), float(high)) for low, high in value)
 
 
-def flags_parser(dim: int) -> Callable[[Any], tuple[bool, ...]]:
-    """A parser of a truth value for each of `dim` axes."""
-
-    def parse(value: Any) -> tuple[bool, ...]:
-        # LagrangeBench gives three flags to two-dimensional scenes as well.
-        if not isinstance(value, list) or len(value) < dim or not all(isinstance(flag, bool) for flag in value):
-            raise ValueError(f"a list of at least {dim} booleans, one per axis")
-        return tuple(value[:dim])
-
-    return parse
+def parse_flags(value: Any, dim: int) -> tuple[bool, ...]:
+    """A truth value for each of `dim` axes; LagrangeBench gives three to two-dimensional scenes as well."""
+    if not isinstance(value, list) or len(value) < dim or not all(isinstance(flag, bool) for flag in value):
+        raise ValueError(f"a list of at least {dim} booleans, one per axis")
+    return tuple(value[:dim])

@@ -18,26 +18,28 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.bounded_files import read_bounded
-from nmpm._support.limits import METADATA_BYTES, TEXT_DEPTH
+from nmpm._support.bounded_files import check_plain, read_bounded
 from nmpm._support.messages import one_line
 from nmpm.data.families import FAMILIES, PADDING, STATIC_NAMES, find_family
 from nmpm.data.json_keys import (
+    REQUIRED,
     JsonKeys,
-    flags_parser,
-    intervals_parser,
+    parse_count,
     parse_densities,
+    parse_dim,
     parse_field_names,
+    parse_flags,
     parse_ids,
+    parse_intervals,
     parse_names,
     parse_positive,
-    parse_whole,
-    vector_parser,
+    parse_vector,
 )
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
 METADATA_FILE = "metadata.json"
+_BYTES = 2**24
 _LENGTH_KEYS = ("sequence_length", "sequence_length_train", "sequence_length_test")
 
 
@@ -85,17 +87,20 @@ class Metadata:
         names = self.particle_types
         return tuple(sorted(i for i in names if i not in self.static_types and names[i] != PADDING))
 
+    def unknown_types(self, particle_type: np.ndarray) -> list[int]:
+        """Ids in an array that have no name, ascending."""
+        return sorted(set(np.unique(particle_type).tolist()) - set(self.particle_types))
+
     def check_types(self, particle_type: np.ndarray, where: str) -> None:
         """Raises an error if an array has an unknown type id.
 
         Raises:
             DataError: names the unknown ids, and `where` they occur.
         """
-        unknown = sorted(set(np.unique(particle_type).tolist()) - set(self.particle_types))
-        if unknown:
-            known = ", ".join(f"{i} {name}" for i, name in sorted(self.particle_types.items()))
+        if unknown := self.unknown_types(particle_type):
+            named = ", ".join(f"{i} {name}" for i, name in sorted(self.particle_types.items()))
             raise DataError(
-                f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {known}). Name it in"
+                f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {named}). Name it in"
                 f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or at conversion'
                 f" (--types {unknown[0]}=sand), or choose another family"
                 f" ({', '.join(sorted(FAMILIES))})."
@@ -117,41 +122,71 @@ def read_metadata(folder: Path, family: str | None = None) -> Metadata:
         UserWarning: if the file names types otherwise than the family, which is then not used.
     """
     path = Path(folder) / METADATA_FILE
-    return metadata_from_dict(load_json(path), path, family)
+    return parse_metadata(load_json(path), path, family)
 
 
-def metadata_from_dict(plain: Mapping[str, Any], where: Path, family: str | None = None) -> Metadata:
+def parse_metadata(
+    plain: Mapping[str, Any],
+    where: Path,
+    family: str | None = None,
+    problems: list[str] | None = None,
+    substitutes: Mapping[str, Any] | None = None,
+) -> Metadata:
     """Validates the metadata in a JSON object.
 
     Args:
-        plain: The object; numbers, strings, lists and objects.
+        plain: The object.
         where: Its file, for error messages.
         family: Meaning of the type ids where it does not state it.
+        problems: Collects what is wrong with it; when left out, the first problem is raised.
+        substitutes: Where problems are collected, values of the keys that are missing or wrong.
 
     Raises:
         DataError: if a key is missing or has a wrong value.
         ConfigError: if there is no such family.
     """
-    keys = JsonKeys(where, dict(plain))
-    dim = keys.take("dim", parse_whole)
-    if dim not in (1, 2, 3):
-        raise keys.error("dim", dim, "1, 2 or 3")
+    check_plain(plain, where)
+    keys = JsonKeys(where, plain, problems, substitutes)
+    dim = keys.take("dim", parse_dim)
     types, static = _types(keys, family)
+    length_key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
+    length = keys.peek(length_key, parse_count)
+    keys.left.pop("sequence_length", None)
     return Metadata(
-        bounds=keys.take("bounds", intervals_parser(dim)),
+        bounds=keys.take("bounds", lambda value: parse_intervals(value, dim)),
         dt=keys.take("dt", parse_positive) * keys.peek("write_every", parse_positive, 1.0),
         dim=dim,
-        sequence_length=_sequence_length(keys),
+        sequence_length=length,
         particle_types=types,
         static_types=static,
-        periodic=keys.take("periodic_boundary_conditions", flags_parser(dim), (False,) * dim),
-        domain=keys.take("domain", intervals_parser(dim), None),
-        gravity=keys.take("gravity", vector_parser(dim), None),
+        periodic=keys.take("periodic_boundary_conditions", lambda value: parse_flags(value, dim), (False,) * dim),
+        domain=keys.take("domain", lambda value: parse_intervals(value, dim), None),
+        gravity=keys.take("gravity", lambda value: parse_vector(value, dim), None),
         particle_volume=keys.take("particle_volume", parse_positive, None),
         densities=keys.take("densities", parse_densities, {}),
         fields=keys.take("fields", parse_field_names, ()),
         extra=keys.left,
     )
+
+
+def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
+    """Names of type ids and static ids, from the file or else the family."""
+    fallback = find_family(family) if family is not None else None
+    if fallback is None and keys.left.get("particle_types") is None and keys.problems is None:
+        raise DataError(
+            f"{keys.where}: the key 'particle_types' is missing, so the type ids have no meaning. Add it, e.g."
+            f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
+        )
+    types: dict[int, str] = keys.take("particle_types", parse_names, dict(fallback.types) if fallback else REQUIRED)
+    names = fallback.types if fallback else types
+    different = [f"{i} = {name}, not {names[i]}" for i, name in types.items() if names.get(i, name) != name]
+    if different:
+        warnings.warn(
+            f"{keys.where} names its particle types itself ({'; '.join(different)}): the family {family} is not used.",
+            stacklevel=4,
+        )
+    walls = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
+    return types, keys.take("static_types", parse_ids, fallback.static if fallback else walls)
 
 
 def write_metadata(folder: Path, metadata: Metadata) -> None:
@@ -196,18 +231,14 @@ def load_json(path: Path) -> dict[str, Any]:
         raise DataError(f"{path.parent}: no such folder. Give the folder that contains {METADATA_FILE}.")
     if not path.exists():
         raise DataError(f"{path}: no such file. A dataset needs this file, with bounds, dt, dim and sequence_length.")
-    try:
-        text = read_bounded(path, METADATA_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not valid JSON ({error}).") from error
-    return parse_json(text, path)
+    return parse_json(read_bounded(path, _BYTES), path)
 
 
-def parse_json(text: str, where: Path | str) -> dict[str, Any]:
+def parse_json(text: str | bytes, where: Path | str) -> dict[str, Any]:
     """The JSON object of a text.
 
     Raises:
-        DataError: if it is not JSON, not an object, or too deep.
+        DataError: if it is not JSON, not an object, or not plain (`check_plain`).
     """
     try:
         plain = json.loads(text)
@@ -215,45 +246,5 @@ def parse_json(text: str, where: Path | str) -> dict[str, Any]:
         raise DataError(f"{where}: not valid JSON ({one_line(error)}).") from error
     if not isinstance(plain, dict):
         raise DataError(f"{where}: expected a JSON object, found {type(plain).__name__}.")
-    _check_depth(plain, where)
+    check_plain(plain, where)
     return plain
-
-
-def _check_depth(plain: Any, path: Path | str) -> None:
-    level = [plain]
-    for _ in range(TEXT_DEPTH):
-        containers = [value for value in level if isinstance(value, list | dict)]
-        level = [item for value in containers for item in (value.values() if isinstance(value, dict) else value)]
-        if not level:
-            return
-    raise DataError(f"{path}: lists and objects are nested more than {TEXT_DEPTH} deep.")
-
-
-def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
-    fallback = find_family(family) if family is not None else None
-    types = keys.take("particle_types", parse_names, dict(fallback.types) if fallback else None)
-    if types is None:
-        raise DataError(
-            f"{keys.path}: the key 'particle_types' is missing, so the type ids have no meaning. Add it, e.g."
-            f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
-        )
-    if fallback is not None:
-        _warn_of_unused(keys.path, str(family), types, fallback.types)
-    walls = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
-    return types, keys.take("static_types", parse_ids, fallback.static if fallback else walls)
-
-
-def _warn_of_unused(path: Path | str, family: str, types: Mapping[int, str], others: Mapping[int, str]) -> None:
-    """Warn where a file's own names of type ids are not those of the family that was given."""
-    different = [f"{i} = {name}, not {others[i]}" for i, name in types.items() if others.get(i, name) != name]
-    if different:
-        warnings.warn(
-            f"{path} names its particle types itself ({'; '.join(different)}): the family {family} is not used.",
-            stacklevel=4,
-        )
-
-
-def _sequence_length(keys: JsonKeys) -> int:
-    key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
-    length: int = keys.take(key, parse_whole) if key == _LENGTH_KEYS[0] else keys.peek(key, parse_whole)
-    return length

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from nmpm.data.fields import Kind, require_fields, survey_fields
+from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
+from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, Scene, check_field_names
 
@@ -56,7 +57,7 @@ def infer_scene(
     folder = Path(folder)
     stated = read_metadata(folder, family)
     metadata = _override(stated, gravity, boundary, bounds)
-    if gravity is not None:
+    if metadata.gravity is not None and gravity is not None:
         check_gravity(metadata.gravity, stated.gravity, folder / METADATA_FILE)
     split = Split(find_split(folder, *SPLITS))
     if split.dim != metadata.dim:
@@ -66,10 +67,12 @@ def infer_scene(
     types = _types(split, metadata)
     observed = _observe(split, metadata)
     widened, domain = _extents(metadata, observed, folder)
-    gravities = _gravities(split, metadata)
-    if gravity is not None:
-        for found in gravities:
-            check_gravity(metadata.gravity, found, split.path)
+    gravities = distinct_gravities(
+        trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in range(len(split))
+    )
+    if metadata.gravity is not None and gravity is not None:
+        for other in gravities:
+            check_gravity(metadata.gravity, other, split.path)
     materials = _materials(types, metadata, split)
     kinds = _kinds_of_fields(split, metadata, metadata.fields if fields is None else tuple(fields))
     return Scene(
@@ -79,7 +82,7 @@ def infer_scene(
         materials=materials,
         particle_volume=metadata.particle_volume or _volume(observed, metadata, folder),
         boundary=tuple("periodic" if flag else "wall" for flag in metadata.periodic),
-        gravity=_common_gravity(gravities, metadata, split),
+        gravity=common_gravity(gravities, metadata, split),
         gravity_varies=len(gravities) > 1,
         obstacles=bool(types & metadata.static_types),
         densities=_densities(materials, metadata),
@@ -93,7 +96,9 @@ def _kinds_of_fields(split: Split, metadata: Metadata, names: Sequence[str]) -> 
     """The kinds of the declared fields, in their order."""
     check_field_names(names)
     require_fields(split, names)
-    facts = survey_fields(split, metadata, names, _sample(split))
+    facts: dict[str, FieldFacts] = {}
+    for index in _sample(split) if names else ():
+        add_fields(facts, split, index, metadata, names)
     return {name: facts[name].kind for name in names}
 
 
@@ -117,28 +122,14 @@ def _override(
     return metadata
 
 
-def check_gravity(given: tuple[float, ...] | None, stated: tuple[float, ...] | None, path: Path) -> None:
-    """Compare a user's gravity with that of a file, if it states one.
-
-    Raises:
-        ConfigError: naming both, if they differ.
-    """
-    if stated is not None and not _same_gravity(given or (), stated):
-        raise ConfigError(
-            f"gravity = {list(given or ())} contradicts {path}, which states gravity {list(stated)}. Leave the option"
-            " out to use the file's; if the file is wrong, write a corrected copy with nmpm convert FOLDER NEW"
-            f" --gravity={','.join(f'{value:g}' for value in given or ())}."
-        )
-
-
 def _types(split: Split, metadata: Metadata) -> frozenset[int]:
     """All type ids that occur."""
-    found: set[int] = set()
+    types: set[int] = set()
     for index in range(len(split)):
         particle_type = split.particle_type(index)
         metadata.check_types(particle_type, split.where(index))
-        found.update(np.unique(particle_type).tolist())
-    return frozenset(found)
+        types.update(np.unique(particle_type).tolist())
+    return frozenset(types)
 
 
 def _materials(types: frozenset[int], metadata: Metadata, split: Split) -> tuple[str, ...]:
@@ -150,51 +141,8 @@ def _materials(types: frozenset[int], metadata: Metadata, split: Split) -> tuple
 
 def _densities(materials: tuple[str, ...], metadata: Metadata) -> tuple[float, ...]:
     """Density of each material; empty where one is unknown, or there is one material only."""
-    known = [metadata.densities[name] for name in materials if name in metadata.densities]
-    return tuple(known) if 1 < len(known) == len(materials) else ()
-
-
-def _gravities(split: Split, metadata: Metadata) -> tuple[tuple[float, ...], ...]:
-    """The distinct gravities of the trajectories."""
-    return distinct_gravities(trajectory_gravity(split, index, metadata) for index in range(len(split)))
-
-
-def trajectory_gravity(split: Split, index: int, metadata: Metadata) -> tuple[float, ...] | None:
-    """A trajectory's own gravity, or else the dataset's; None if neither is stated."""
-    stated = split.attributes(index).get("gravity")
-    return metadata.gravity if stated is None else tuple(np.ravel(stated).tolist())
-
-
-def distinct_gravities(known: Iterable[tuple[float, ...] | None]) -> tuple[tuple[float, ...], ...]:
-    """The different ones among gravities, without None; one if all are the same.
-
-    Numbers are compared as `check_gravity` does: a float32 attribute beside the metadata's float64 is no other gravity.
-    """
-    distinct = tuple(dict.fromkeys(value for value in known if value is not None))
-    return distinct[:1] if all(_same_gravity(distinct[0], other) for other in distinct) else distinct
-
-
-def _same_gravity(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    return len(one) == len(other) and np.allclose(one, other, atol=1e-6)
-
-
-def _common_gravity(
-    gravities: tuple[tuple[float, ...], ...], metadata: Metadata, split: Split
-) -> tuple[float, ...] | None:
-    """The metadata's gravity, or else that of all trajectories; None if neither is known.
-
-    Raises:
-        DataError: if all trajectories state one that is not the metadata's: models would learn theirs, and fall by the
-            metadata's.
-    """
-    only = gravities[0] if len(gravities) == 1 else None
-    if metadata.gravity and only is not None and not _same_gravity(metadata.gravity, only):
-        raise DataError(
-            f"{split.path}: all trajectories have the attribute gravity {list(only)}, but {METADATA_FILE} states"
-            f" {list(metadata.gravity)}. If the trajectories are right, write a corrected copy with nmpm convert FOLDER"
-            f" NEW --gravity={','.join(f'{value:g}' for value in only)}; otherwise remove their attribute."
-        )
-    return metadata.gravity or only
+    densities = [metadata.densities[name] for name in materials if name in metadata.densities]
+    return tuple(densities) if 1 < len(densities) == len(materials) else ()
 
 
 @dataclass(frozen=True)
@@ -216,9 +164,9 @@ def _observe(split: Split, metadata: Metadata) -> _ObservedExtents:
         trajectory = split.read(index)
         kind = np.isin(trajectory.particle_type, metadata.moving_types)
         present = kind | np.isin(trajectory.particle_type, list(metadata.static_types))
-        for extents, chosen in ((moving, kind), (everything, present)):
-            if chosen.any():
-                position = trajectory.position[:, chosen]
+        for extents, particles in ((moving, kind), (everything, present)):
+            if particles.any():
+                position = trajectory.position[:, particles]
                 extents.append([position.min(axis=(0, 1)), position.max(axis=(0, 1))])
         if index in measured:
             spacing.append(_spacing(trajectory.position[0, kind], metadata))
@@ -234,8 +182,8 @@ def _sample(split: Split) -> range:
 def _union(extents: list[list[np.ndarray]], metadata: Metadata) -> np.ndarray:
     if not extents:
         return np.asarray(metadata.bounds).T
-    found = np.asarray(extents, dtype=np.float64)
-    return np.stack([found[:, 0].min(axis=0), found[:, 1].max(axis=0)])
+    pairs = np.asarray(extents, dtype=np.float64)
+    return np.stack([pairs[:, 0].min(axis=0), pairs[:, 1].max(axis=0)])
 
 
 def _spacing(position: np.ndarray, metadata: Metadata) -> np.ndarray:

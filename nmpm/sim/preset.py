@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-from nmpm._support.limits import FILE_NAME
+from nmpm._support.bounded_files import FILE_NAME
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import to_plain
 from nmpm.errors import ConfigError

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.bounded_files import check_characters
 from nmpm.data.fields import read_fields
 from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
-from nmpm.data.gravity import own_gravity
+from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.json_keys import JsonKeys, parse_ids, parse_names
 from nmpm.data.metadata import parse_json
 from nmpm.data.scene_inference import infer_scene
@@ -54,7 +53,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         domain=scene.domain,
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
-        gravity=own_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
+        gravity=trajectory_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
         title=f"{split.path.name}, trajectory {index}",
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
     )
@@ -137,7 +136,6 @@ def _read_facts(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[
     if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
         raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
     scene, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
-    check_characters([scene, names], path)
     static = np.asarray(attributes.get("static_types")).tolist()
     keys = JsonKeys(path, {"particle_types": names, "static_types": static})
     try:

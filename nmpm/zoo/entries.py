@@ -19,8 +19,7 @@ from safetensors.torch import load
 from torch import Tensor, nn
 from torch.nn.modules import module as hooks
 
-from nmpm._support.bounded_files import read_bounded, read_text, read_yaml
-from nmpm._support.limits import CELLS, FRAMES, INTEGER, LAYERS, PARAMETERS, TEXT_BYTES, WEIGHT_BYTES
+from nmpm._support.bounded_files import TEXT_BYTES, read_bounded, read_text, read_yaml
 from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.errors import ConfigError, DataError, NmpmError, ZooError
@@ -32,6 +31,13 @@ if TYPE_CHECKING:
     from nmpm.training.module import EmulatorModule
 
 CONFIG, WEIGHTS = "config.yaml", "model.safetensors"
+WEIGHT_BYTES = 2**33
+INTEGER = 2**24
+"""Largest integer in a model's recipe; some are exponents."""
+CELLS, FRAMES = 2**24, 2**12
+"""Cells of a model's grid, 4096² or 256³, and frames that one call predicts."""
+PARAMETERS, LAYERS = 10**9, 5_000
+"""Parameters of a network; its modules, and tensors of parameters."""
 SCENES = "scenes.csv"
 """The errors of each test scene, a row each in their order."""
 FILES = (
@@ -93,7 +99,7 @@ def load_entry(folder: Path) -> Pretrained:
     """The model of an entry's folder, on the CPU.
 
     Raises:
-        ZooError: if a file is missing or damaged, asks for more than `nmpm._support.limits` allows, or the weights are
+        ZooError: if a file is missing or damaged, asks for more than is loaded, or the weights are
             not those of card and recipe.
     """
     card = read_card(folder)
@@ -204,7 +210,7 @@ def read_recipe(plain: Mapping[str, Any]) -> EmulatorRecipe:
     """The recipe that plain data describe, if its model is of a bounded size.
 
     Raises:
-        ConfigError: if a number is not finite or too large, or grid or network exceed `nmpm._support.limits`. Data
+        ConfigError: if a number is not finite or too large, or grid or network exceed the limits. Data
             that do not describe a recipe may raise any other exception.
     """
     _check_numbers(plain)

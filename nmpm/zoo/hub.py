@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import read_bounded, read_yaml, to_yaml
-from nmpm._support.limits import WEIGHT_BYTES
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.card import CARD, SIMULATED
-from nmpm.zoo.entries import FILES, WEIGHTS, load_entry, read_card
+from nmpm.zoo.entries import FILES, WEIGHT_BYTES, WEIGHTS, load_entry, read_card
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi

@@ -11,7 +11,7 @@ import torch
 from filelock import BaseFileLock, FileLock
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.bounded_files import check_characters, to_yaml
+from nmpm._support.bounded_files import check_plain, to_yaml
 from nmpm._support.messages import one_line
 from nmpm._support.shipped import user_home
 from nmpm.errors import DataError, ZooError
@@ -109,7 +109,7 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
         ZooError: if they cannot be made, as something is missing; nothing is written.
     """
     try:
-        check_characters(card, folder / CARD)
+        check_plain(card, folder / CARD)
     except DataError as error:
         raise ZooError(str(error)) from error
     try:

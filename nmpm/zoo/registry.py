@@ -21,7 +21,6 @@ from typing import Any
 import torch
 
 from nmpm._support.devices import device_name, find_device
-from nmpm._support.limits import NAME_LENGTH
 from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
@@ -32,6 +31,8 @@ from nmpm.zoo.hub import HubId, download
 from nmpm.zoo.measures.speed import measure_speed
 from nmpm.zoo.pretrained import Pretrained
 
+NAME_LENGTH = 100
+"""Longest name of an entry."""
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]*(/[a-z0-9][a-z0-9_-]*)?")
 
 Root = str | Path | None

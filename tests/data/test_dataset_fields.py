@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import box
 
-from nmpm.data.convert.arrays import write_trajectories
+from nmpm.data.arrays import write_trajectories
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.inspection import inspect

@@ -2,16 +2,18 @@ import fcntl
 import os
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from nmpm._support.regular_files import check_regular
 from nmpm.data.convert import FORMATS, Options
-from nmpm.data.format import METADATA_FILE, Split, Trajectory, read_metadata, write_split
-from nmpm.data.hdf5 import check_self_contained, open_hdf5, writable_hdf5
+from nmpm.data.format import Split, Trajectory, write_split
+from nmpm.data.hdf5 import FILTERS, check_self_contained, open_hdf5, writable_hdf5, write_compressed
 from nmpm.errors import DataError
 from tests.made_up import made_up_trajectory
 
@@ -102,50 +104,6 @@ class TestLocks:
             self.refused(split)
 
 
-class TestRegularFiles:
-    def test_regular_files_and_links_to_them_pass(self, split):
-        link = split.with_name("valid.h5")
-        link.symlink_to(split)
-        check_regular(link)
-        assert len(Split(link)) == 2
-
-    @pytest.mark.parametrize("name", ["train.h5", "valid.h5"])
-    def test_split(self, tmp_path, name):
-        os.mkfifo(tmp_path / name)
-        with pytest.raises(DataError, match=f"{name}: is a FIFO, not a regular file"):
-            Split(tmp_path / name)
-
-    def test_metadata(self, tmp_path):
-        os.mkfifo(tmp_path / METADATA_FILE)
-        with pytest.raises(DataError, match=r"metadata.json: is a FIFO"):
-            read_metadata(tmp_path)
-
-    @pytest.mark.parametrize("device", ["/dev/zero", "/dev/null"])
-    def test_device(self, tmp_path, device):
-        (tmp_path / "train.h5").symlink_to(device)
-        with pytest.raises(DataError, match=r"train.h5: is a character device"):
-            Split(tmp_path / "train.h5")
-
-    @pytest.mark.parametrize(
-        ("format_name", "file"),
-        [
-            ("native", "train.h5"),
-            ("deepmind", "train.tfrecord"),
-            ("gns-npz", "train.npz"),
-            ("neuralmpm", "train/sim_0.h5"),
-            ("dmcf", "train/a.msgpack.zst"),
-            ("rollout-pickle", "rollout_0.pkl"),
-        ],
-    )
-    def test_every_format(self, make_dataset, format_name, file):
-        folder = make_dataset(train=(), valid=(), test=())
-        (folder / file).parent.mkdir(exist_ok=True)
-        os.mkfifo(folder / file)
-        kind = next(kind for kind in FORMATS if kind.name == format_name)
-        with pytest.raises(DataError, match=rf"{Path(file).name}: is a FIFO, not a regular file"):
-            kind.open(folder, Options(family="deepmind", dt=0.1))
-
-
 WRITE = """
 import resource, sys
 from pathlib import Path
@@ -160,7 +118,7 @@ except Exception as error:
 
 
 class TestFullDisk:
-    @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.999])
+    @pytest.mark.parametrize("share", [0.0, pytest.param(0.3, marks=pytest.mark.slow), 0.999])
     def test_is_an_error_that_leaves_nothing(self, tmp_path, share):
         """A limit on the size of files stands for the disk; in a process of its own, since HDF5 would crash it."""
         write_split(tmp_path / "whole.h5", trajectories())
@@ -238,3 +196,42 @@ def test_a_complete_file_is_ordinary_hdf5(tmp_path):
     with open_hdf5(tmp_path / "a.h5") as file:
         check_self_contained(file, tmp_path / "a.h5")
         assert file["values"][()].tolist() == [0, 1, 2, 3, 4]
+
+
+def stored_chunks(dataset) -> list[bytes]:
+    """Shuffled, as they are before compression, whose bytes depend on the library."""
+    places = range(0, len(dataset), dataset.chunks[0])
+    return [zlib.decompress(dataset.id.read_direct_chunk((place, 0))[1]) for place in places]
+
+
+@given(
+    length=st.integers(1, 40), width=st.integers(1, 5), rows=st.integers(1, 40), threads=st.integers(1, 3),
+    kind=st.sampled_from(["<f4", "<f8", "<i2"]), seed=st.integers(0, 99),
+)  # fmt: skip
+@settings(max_examples=20)
+def test_chunks_are_those_that_hdf5_writes(tmp_path_factory, length, width, rows, threads, kind, seed):
+    values = np.random.default_rng(seed).integers(0, 1000, (length, width)).astype(kind)
+    rows = min(rows, length)
+    with h5py.File(tmp_path_factory.mktemp("chunks") / "file.h5", "w") as file:
+        write_compressed(file, "ours", values, rows, threads)
+        file.create_dataset("theirs", data=values, chunks=(rows, width), **FILTERS)
+        np.testing.assert_array_equal(file["ours"][:], values)
+        assert file["ours"].dtype == values.dtype
+        assert file["ours"].chunks == file["theirs"].chunks
+        assert stored_chunks(file["ours"]) == stored_chunks(file["theirs"])
+
+
+def test_values_that_are_not_contiguous_are_written(tmp_path):
+    values = np.arange(60.0).reshape(3, 20).T
+    with h5py.File(tmp_path / "file.h5", "w") as file:
+        write_compressed(file, "ours", values, 6)
+        np.testing.assert_array_equal(file["ours"][:], values)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_the_number_of_threads_does_not_matter(tmp_path, threads):
+    values = np.random.default_rng(0).random((200, 3), dtype=np.float32)
+    for name, count in (("one.h5", 1), ("many.h5", threads)):
+        with h5py.File(tmp_path / name, "w", libver=("earliest", "v108")) as file:
+            write_compressed(file, "position", values, 7, count)
+    assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "many.h5").read_bytes()

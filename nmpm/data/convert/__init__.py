@@ -11,14 +11,15 @@ from pathlib import Path
 from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
-from nmpm.data.convert.conversion import detect_format, find_format, write_native
+from nmpm.data.convert.base import Rereadable as Rereadable
+from nmpm.data.convert.conversion import renumber_types, write_native
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
-from nmpm.data.convert.renumbering import renumber_types
 from nmpm.data.convert.rollout_pickle import RolloutPickle
+from nmpm.errors import ConfigError, DataError
 
 FORMATS: tuple[DatasetFormat, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
 
@@ -35,8 +36,27 @@ def open_dataset(path: Path, format_name: str | None = None, options: Options | 
         DataError: if the path is missing, of no known format, or damaged.
         ConfigError: if there is no format of that name, or an option is invalid.
     """
-    dataset_format = find_format(format_name, FORMATS) if format_name else detect_format(Path(path), FORMATS)
-    return dataset_format.open(Path(path), options or Options())
+    return _find_format(Path(path), format_name).open(Path(path), options or Options())
+
+
+def _find_format(path: Path, name: str | None) -> DatasetFormat:
+    """The format of that name, or else the first that recognises the path."""
+    names = ", ".join(kind.name for kind in FORMATS)
+    if name is not None:
+        for kind in FORMATS:
+            if kind.name == name:
+                return kind
+        raise ConfigError(f"No format is called {name!r}; known: {names}.")
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder.")
+    for kind in FORMATS:
+        if kind.recognises(path):
+            return kind
+    content = ", ".join(sorted(item.name for item in path.iterdir())[:8]) if path.is_dir() else "a file"
+    raise DataError(
+        f"{path}: no known format ({names}); found {content or 'nothing'}. State the --format, or write the arrays with"
+        " nmpm.write_trajectories."
+    )
 
 
 def convert(
@@ -45,6 +65,7 @@ def convert(
     format_name: str | None = None,
     options: Options | None = None,
     ids: Mapping[int, int] | None = None,
+    problems: list[str] | None = None,
 ) -> tuple[str, ...]:
     """Converts a dataset of any format into the native layout; after an error nothing is left.
 
@@ -54,6 +75,8 @@ def convert(
         format_name: Name of the source's format; detected when left out.
         options: Facts that the files do not state.
         ids: New particle type ids by old ones; other ids stay.
+        problems: Collects what is wrong with trajectories, and the others are converted; when left out, the first
+            problem is raised.
 
     Returns:
         Notes on assumptions and inconsistencies, as sentences.
@@ -63,4 +86,4 @@ def convert(
         ConfigError: if there is no format of that name, or an option is invalid.
     """
     dataset = open_dataset(source, format_name, options)
-    return write_native(renumber_types(dataset, ids) if ids else dataset, destination)
+    return write_native(renumber_types(dataset, ids) if ids else dataset, destination, problems)

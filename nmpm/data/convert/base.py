@@ -1,4 +1,4 @@
-"""The interface of format readers, and the options that users give them."""
+"""The interface of format readers: a reader is one subclass of `DatasetFormat` in one file, listed in `FORMATS`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNKNOWN_LENGTH = 0
 
 @dataclass(frozen=True)
 class Options:
-    """What a user states where the files are silent or wrong; None takes what the files state.
+    """Facts that a user states where the files are silent or wrong; None takes what the files state.
 
     Args:
         family: Meaning of the type ids: "deepmind", "lagrangebench", "jax-sph".
@@ -53,16 +53,14 @@ class Options:
                 raise ConfigError(f"{name} = {value} needs one entry for each of the data's {metadata.dim} axes.")
         if self.dt is not None and not self.dt > 0:
             raise ConfigError(f"dt = {self.dt} must be positive: seconds between stored frames.")
-        changes: dict[str, Any] = {
-            name: getattr(self, name) for name in ("dt", "gravity", "periodic", "static", "fields")
-        }
-        changes["static_types"] = changes.pop("static")
         if self.bounds is not None:
             metadata = replace(metadata, domain=None, bounds=self.bounds)
         if self.types:
             walls = frozenset(i for i, name in self.types.items() if name in STATIC_NAMES)
             static = (metadata.static_types - frozenset(self.types)) | walls
             metadata = replace(metadata, particle_types=metadata.particle_types | dict(self.types), static_types=static)
+        changes: dict[str, Any] = {"static_types": self.static}
+        changes |= {name: getattr(self, name) for name in ("dt", "gravity", "periodic", "fields")}
         return replace(metadata, **{name: value for name, value in changes.items() if value is not None})
 
 
@@ -78,11 +76,6 @@ class Rereadable(Iterable[Trajectory]):
 
     def __iter__(self) -> Iterator[Trajectory]:
         return self.start()
-
-
-def split_name(stem: str) -> str | None:
-    """The split that a file's name begins with, or None: "test_sub" means test."""
-    return next((split for split in SPLITS if stem.lower().startswith(split)), None)
 
 
 @dataclass(frozen=True)
@@ -124,3 +117,13 @@ class DatasetFormat(abc.ABC):
         Raises:
             DataError: if a file is missing, damaged or not of this format; names the file.
         """
+
+
+def split_name(stem: str) -> str | None:
+    """The split that a file's name begins with, or None: "test_sub" means test."""
+    return next((split for split in SPLITS if stem.lower().startswith(split)), None)
+
+
+def family_note(family: str) -> str:
+    """The note that says how type ids are read."""
+    return f"Particle types have the meaning of the {family} family."

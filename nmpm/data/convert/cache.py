@@ -12,7 +12,7 @@ from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
 from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.format import METADATA_FILE
-from nmpm.data.scene_inference import check_gravity
+from nmpm.data.gravity import check_gravity
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,11 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
         ConfigError: if the options contradict the gravity that the files state.
     """
     path, options = Path(path).resolve(), options or Options()
-    _check_stated_gravity(path, options)
+    if options.gravity is not None:
+        stated = open_dataset(path, options=replace(options, gravity=None))
+        if "gravity" not in stated.assumed:
+            metadata = (path if path.is_dir() else path.parent) / METADATA_FILE
+            check_gravity(options.gravity, stated.metadata.gravity, metadata if metadata.is_file() else path)
     cache = user_home() / "converted"
     folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
     with lock_folder(cache):
@@ -41,30 +45,14 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
     return folder
 
 
-def _check_stated_gravity(path: Path, options: Options) -> None:
-    if options.gravity is None:
-        return
-    dataset = open_dataset(path, options=replace(options, gravity=None))
-    if "gravity" not in dataset.assumed:
-        metadata = (path if path.is_dir() else path.parent) / METADATA_FILE
-        check_gravity(options.gravity, dataset.metadata.gravity, metadata if metadata.is_file() else path)
-
-
 def _fingerprint(path: Path, options: Options) -> str:
-    identity = repr((str(path), _plain(options), list(_file_stamps(path))))
+    ordered = replace(options, types=dict(sorted((options.types or {}).items())))
+    static = sorted(options.static or ())
+    identity = repr((str(path), replace(ordered, static=None), options.static is None, static, list(_stamps(path))))
     return hashlib.sha256(identity.encode()).hexdigest()[:10]
 
 
-def _plain(options: Options) -> list[tuple[str, object]]:
-    entries = dict(vars(options))
-    entries["types"] = sorted((options.types or {}).items())
-    entries["static"] = sorted(options.static) if options.static is not None else None
-    if options.fields is None:  # as in caches of versions without fields
-        del entries["fields"]
-    return sorted(entries.items())
-
-
-def _file_stamps(path: Path) -> Iterator[tuple[str, int, int]]:
+def _stamps(path: Path) -> Iterator[tuple[str, int, int]]:
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
             status = file.stat()

@@ -1,58 +1,34 @@
-"""Detects formats, and streams opened datasets into the native layout."""
+"""Streams opened datasets into the native layout, and renumbers particle types on the way."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset
-from nmpm.data.convert.conversion_log import ConversionLog
-from nmpm.data.format import SPLITS, Trajectory, write_metadata, write_split
-from nmpm.data.statistics import MotionStatistics
+from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Rereadable
+from nmpm.data.format import SPLITS, Metadata, Trajectory, write_metadata, write_split
+from nmpm.data.statistics import STATISTICS_KEYS, MotionStatistics, find_disagreements, first_moving_particle
 from nmpm.errors import ConfigError, DataError
 
 NOTES = "conversion"
+STATED = "stated_statistics"
+MOVING_BOUNDARIES = "moving_boundaries"
 
 
-def detect_format(path: Path, formats: Sequence[DatasetFormat]) -> DatasetFormat:
-    """Detects the format of a file or folder.
-
-    Raises:
-        DataError: if the path is missing, or looks like none of the formats.
-    """
-    if not path.exists():
-        raise DataError(f"{path}: no such file or folder.")
-    found = next((kind for kind in formats if kind.recognises(path)), None)
-    if found is None:
-        content = ", ".join(sorted(item.name for item in path.iterdir())[:8]) if path.is_dir() else "a file"
-        raise DataError(
-            f"{path}: no known format ({', '.join(kind.name for kind in formats)}); found"
-            f" {content or 'nothing'}. State the --format, or write the arrays with nmpm.write_trajectories."
-        )
-    return found
-
-
-def find_format(name: str, formats: Sequence[DatasetFormat]) -> DatasetFormat:
-    """The format with a name.
-
-    Raises:
-        ConfigError: if there is no such format; lists the known ones.
-    """
-    for kind in formats:
-        if kind.name == name:
-            return kind
-    raise ConfigError(f"No format is called {name!r}; known: {', '.join(kind.name for kind in formats)}.")
-
-
-def write_native(source: ForeignDataset, destination: Path) -> tuple[str, ...]:
+def write_native(source: ForeignDataset, destination: Path, problems: list[str] | None = None) -> tuple[str, ...]:
     """Writes an opened dataset in the native layout.
 
     Args:
         source: The dataset.
         destination: A folder that does not exist yet, or is empty.
+        problems: Collects what is wrong with trajectories; of each split those before the first that cannot be read
+            are written. When left out, the first problem is raised.
 
     Returns:
         The source's notes, and those of the conversion.
@@ -64,31 +40,152 @@ def write_native(source: ForeignDataset, destination: Path) -> tuple[str, ...]:
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination}: exists already; choose another folder, or delete this one.")
     try:
-        with new_folder(destination) as part:
-            return _write(source, part)
+        with new_folder(destination) as folder:
+            return _write(source, folder, problems)
     except OSError as error:
         raise DataError(f"{destination}: cannot be written ({error}).") from error
 
 
-def _write(source: ForeignDataset, folder: Path) -> tuple[str, ...]:
+def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> tuple[str, ...]:
     names = [name for name in SPLITS if name in source.splits]
-    known = [source.counts.get(name) for name in names]
-    total = None if None in known else sum(count or 0 for count in known)
-    log = ConversionLog(source.metadata, MotionStatistics(source.metadata))
+    counts = [source.counts.get(name) for name in names]
+    total = None if None in counts else sum(count or 0 for count in counts)
+    log = _Log(source.metadata, problems)
     with progress_bar("Converting", total) as advance:
         for name in names:
-            write_split(folder / f"{name}.h5", _log_and_yield(source.splits[name], log, f"{name} split", advance))
+            done = log.number
+            try:
+                write_split(folder / f"{name}.h5", log.watch(source.splits[name], name, advance))
+            except DataError:
+                if not problems or log.number > done:
+                    raise
             # The statistics are those of the first split, train where there is one.
-            log.statistics_done = True
+            log.statistics = log.statistics or log.motion.result()
+    if problems and not log.number:
+        raise DataError(problems[0])
     metadata, inconsistencies = log.final_metadata()
     write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *inconsistencies]}))
     return (*source.notes, *inconsistencies, *log.out_of_bounds_notes())
 
 
-def _log_and_yield(
-    trajectories: Iterable[Trajectory], log: ConversionLog, where: str, advance: Callable[[], object]
-) -> Iterator[Trajectory]:
-    for index, trajectory in enumerate(trajectories):
-        log.add(trajectory, f"{where}, trajectory {index}")
-        yield trajectory
-        advance()
+class _Log:
+    """Collects facts about the trajectories of a conversion.
+
+    Args:
+        metadata: As the files state it.
+        problems: Collects what is wrong with trajectories; None raises it.
+    """
+
+    def __init__(self, metadata: Metadata, problems: list[str] | None) -> None:
+        self.metadata, self.problems = metadata, problems
+        self.motion, self.statistics = MotionStatistics(metadata), dict[str, list[float]]()
+        self.number, self.moving_boundaries = 0, 0
+        self.frames: set[int] = set()
+        self.particles = 0
+        self.lower, self.upper = np.full(metadata.dim, np.inf), np.full(metadata.dim, -np.inf)
+
+    def watch(
+        self, trajectories: Iterable[Trajectory], split: str, advance: Callable[[], object]
+    ) -> Iterator[Trajectory]:
+        """Yields the trajectories of a split, up to one that is damaged where problems are collected."""
+        try:
+            for index, trajectory in enumerate(trajectories):
+                self._add(trajectory, f"{split} split, trajectory {index}")
+                yield trajectory
+                advance()
+        except DataError as error:
+            if self.problems is None:
+                raise
+            self.problems.append(f"{error} Trajectories after it are not read.")
+
+    def _add(self, trajectory: Trajectory, where: str) -> None:
+        types, position, dim = trajectory.particle_type, trajectory.position, self.metadata.dim
+        if position.shape[2] != dim:
+            raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {dim}.")
+        if self.problems is None:
+            self.metadata.check_types(types, where)
+        if not self.statistics:
+            self.motion.add(trajectory)
+        self.number += 1
+        static = np.isin(types, list(self.metadata.static_types))
+        self.moving_boundaries += first_moving_particle(position, static, self.metadata.bounds) is not None
+        present = static | np.isin(types, self.metadata.moving_types)
+        if present.any():
+            self.lower = np.minimum(self.lower, position[:, present].min(axis=(0, 1)))
+            self.upper = np.maximum(self.upper, position[:, present].max(axis=(0, 1)))
+        self.frames.add(len(position))
+        self.particles = max(self.particles, position.shape[1])
+
+    def final_metadata(self) -> tuple[Metadata, list[str]]:
+        """The metadata with the measured statistics, and notes on inconsistencies."""
+        extra = dict(self.metadata.extra)
+        stated = {key: extra[key] for key in STATISTICS_KEYS if key in extra}
+        notes = find_disagreements(self.statistics, stated)
+        if notes:
+            notes.append(f"The stated values are kept as {STATED!r}.")
+        if stated:
+            extra[STATED] = stated
+        extra |= self.statistics | {"num_particles_max": self.particles}
+        if self.moving_boundaries:
+            extra[MOVING_BOUNDARIES] = True
+            notes.append(
+                f"Particles of a static type move in {self.moving_boundaries} of {self.number} trajectories. Their"
+                " positions are kept; to train on them, state which types are static (--static)."
+            )
+        length, few, many = self.metadata.sequence_length, min(self.frames), max(self.frames)
+        if length != UNKNOWN_LENGTH and not self.frames <= {length, length + 1}:
+            lengths = f"{few}" if few == many else f"{few} to {many}"
+            notes.append(f"The metadata state sequence_length {length}; trajectories have {lengths} frames.")
+        return replace(self.metadata, extra=extra, sequence_length=length or many - 1), notes
+
+    def out_of_bounds_notes(self) -> list[str]:
+        """Notes on positions outside of the stated bounds."""
+        return [
+            f"Along {'xyz'[axis]} positions reach from {self.lower[axis]:.4g} to {self.upper[axis]:.4g}, beyond the"
+            f" stated bounds {[low, high]}; the scene's domain will contain them."
+            for axis, (low, high) in enumerate(self.metadata.bounds)
+            if not self.metadata.periodic[axis] and (self.lower[axis] < low or self.upper[axis] > high)
+        ]
+
+
+def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDataset:
+    """The same dataset with other particle type ids, as other readers expect; names and static types follow.
+
+    Args:
+        source: The dataset.
+        ids: New ids by old ones; other ids stay.
+
+    Raises:
+        ConfigError: if two types would get the same id, or an old id is unknown.
+    """
+    metadata = source.metadata
+    unknown = sorted(set(ids) - set(metadata.particle_types))
+    if unknown:
+        names = ", ".join(f"{i} {name}" for i, name in sorted(metadata.particle_types.items()))
+        raise ConfigError(f"There is no particle type {', '.join(map(str, unknown))}; known: {names}.")
+    # A type whose id is requested for another and that is not renumbered itself is dropped; `_renumber` checks that it
+    # does not occur.
+    kept = {i: name for i, name in metadata.particle_types.items() if i in ids or i not in ids.values()}
+    types = {ids.get(i, i): name for i, name in kept.items()}
+    if len(types) < len(kept):
+        raise ConfigError(f"{dict(ids)} gives two particle types the same id.")
+    static = frozenset(ids.get(i, i) for i in metadata.static_types if i in kept)
+    return replace(
+        source,
+        metadata=replace(metadata, particle_types=types, static_types=static),
+        splits={name: Rereadable(partial(_renumber, split, ids, kept)) for name, split in source.splits.items()},
+    )
+
+
+def _renumber(split: Iterable[Trajectory], ids: Mapping[int, int], kept: Mapping[int, str]) -> Iterator[Trajectory]:
+    for trajectory in split:
+        old = trajectory.particle_type
+        dropped = sorted(set(np.unique(old).tolist()) - set(kept))
+        if dropped:
+            raise ConfigError(
+                f"Particle type {dropped[0]} occurs, but its id is given to another type; give it a new one."
+            )
+        new = old.copy()
+        for before, after in ids.items():
+            new[old == before] = after
+        yield replace(trajectory, particle_type=new)

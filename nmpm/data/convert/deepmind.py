@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, family_note, split_name
 from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
 from nmpm.errors import DataError
@@ -42,42 +42,38 @@ class DeepMind(DatasetFormat):
         for split, file in files.items():
             if not offsets[split]:
                 raise DataError(f"{file}: the file has no record.")
+        renamed = [f"{file.name} becomes the {split} split." for split, file in files.items() if file.stem != split]
         return ForeignDataset(
             metadata=metadata,
             splits={s: Rereadable(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
-            notes=(f"Particle types have the meaning of the {family} family.", *_naming(files)),
-            counts={split: len(found) for split, found in offsets.items()},
+            notes=(family_note(family), *renamed),
+            counts={split: len(starts) for split, starts in offsets.items()},
         )
 
 
 def _files(path: Path) -> dict[str, Path]:
     """The TFRecord of each split."""
-    found = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path] * (path.suffix == _SUFFIX and path.is_file())
-    by_split = {split: [file for file in found if split_name(file.stem) == split] for split in SPLITS}
-    for split, files in by_split.items():
-        if len(files) > 1:
+    files = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path] * (path.suffix == _SUFFIX and path.is_file())
+    by_split = {split: [file for file in files if split_name(file.stem) == split] for split in SPLITS}
+    for split, same in by_split.items():
+        if len(same) > 1:
             raise DataError(
-                f"{path}: {', '.join(f.name for f in files)} all belong to the split {split}; give one of the files."
+                f"{path}: {', '.join(f.name for f in same)} all belong to the split {split}; give one of the files."
             )
-    if len(found) == 1 and not any(by_split.values()):
-        by_split["test"] = found
-    return {split: files[0] for split, files in by_split.items() if files}
-
-
-def _naming(files: dict[str, Path]) -> list[str]:
-    return [f"{file.name} becomes the {split} split." for split, file in files.items() if file.stem != split]
+    if len(files) == 1 and not any(by_split.values()):
+        by_split["test"] = files
+    return {split: same[0] for split, same in by_split.items() if same}
 
 
 def _trajectories(path: Path, offsets: tuple[int, ...], dim: int) -> Iterator[Trajectory]:
     for index, offset in enumerate(offsets):
-        where = f"{path}: record {index}"
-        yield _trajectory(read_record(path, offset, index), dim, where)
+        yield _trajectory(read_record(path, offset, index), dim, f"{path}: record {index}")
 
 
 def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
     if "position" not in example.steps or "particle_type" not in example.context:
-        found = ", ".join(sorted({*example.context, *example.steps})) or "nothing"
-        raise DataError(f"{where}: needs the features `particle_type` and `position`; found {found}.")
+        features = ", ".join(sorted({*example.context, *example.steps})) or "nothing"
+        raise DataError(f"{where}: needs the features `particle_type` and `position`; found {features}.")
     particle_type = _numbers(example.context["particle_type"], np.dtype("<i8"), f"{where}, particle_type")
     particles = len(particle_type)
     frames = [_numbers(step, np.dtype("<f4"), f"{where}, position") for step in example.steps["position"]]
@@ -88,17 +84,15 @@ def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
             f"{where}: {len(frames)} frames, {particles} particles: each frame needs {particles} x {dim} numbers{got}."
             f" Is `dim` of {METADATA_FILE} right?"
         )
+    attributes = {k: _attribute(v) for k, v in example.context.items() if k != "particle_type" and len(v)}
+    fields = {
+        name: _field(steps, particles, dim, f"{where}, {name}")
+        for name, steps in example.steps.items()
+        if name != "position"
+    }
     try:
-        return Trajectory(
-            position=np.stack(frames).reshape(len(frames), particles, dim),
-            particle_type=particle_type,
-            attributes={k: _attribute(v) for k, v in example.context.items() if k != "particle_type" and len(v)},
-            fields={
-                name: _field(steps, particles, dim, f"{where}, {name}")
-                for name, steps in example.steps.items()
-                if name != "position"
-            },
-        )
+        position = np.stack(frames).reshape(len(frames), particles, dim)
+        return Trajectory(position, particle_type, attributes, fields)
     except DataError as error:
         raise DataError(f"{where}: {error}") from error
 
@@ -108,7 +102,7 @@ def _numbers(feature: Feature, kind: np.dtype[Any], where: str) -> np.ndarray:
     if isinstance(feature, np.ndarray):
         return feature
     if len(feature) != 1 or len(feature[0]) % kind.itemsize:
-        sizes = [len(part) for part in feature]
+        sizes = [len(part) for part in feature[:8]]
         raise DataError(
             f"{where}: expected one string of {kind.itemsize}-byte numbers; found strings of {sizes} bytes."
         )

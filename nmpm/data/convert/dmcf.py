@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm._support.limits import EXPANSION, MESSAGE_BYTES, MESSAGE_CONTAINERS, MESSAGE_ITEMS, expansion_limit
-from nmpm._support.regular_files import check_regular
+from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
+from nmpm._support.messages import one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
 from nmpm.data.families import find_family
 from nmpm.data.format import SPLITS, Metadata, Trajectory
@@ -26,6 +26,8 @@ from nmpm.errors import ConfigError, DataError, NmpmError
 _SUFFIX = ".msgpack.zst"
 _FLUID, _WALL = 0, 1
 _DT, _GRAVITY = 0.02, -9.81
+_FRAME_BYTES = 2**27
+_ITEMS = 256  # of a list or map
 _KIND = re.compile(rb"[<>|=]?[biuf]\d{1,2}")
 
 
@@ -47,13 +49,13 @@ class Dmcf(DatasetFormat):
         first = next(_frames(sample), {})
         return ForeignDataset(
             metadata=options.apply_to(_metadata(first, find_family(family).types, options, sample)),
-            splits={split: Rereadable(partial(_trajectories, found)) for split, found in files.items()},
+            splits={split: Rereadable(partial(_trajectories, paths)) for split, paths in files.items()},
             notes=(
                 f"The fluid becomes particle type {_FLUID}, the solid boundary type {_WALL} ({family} family).",
                 *(() if options.dt else (f"The files do not state dt; {_DT:g} s is assumed (--dt).",)),
                 *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
             ),
-            counts={split: len(found) for split, found in files.items()},
+            counts={split: len(paths) for split, paths in files.items()},
             assumed=frozenset({"dt", "gravity"}),
         )
 
@@ -64,7 +66,7 @@ def _files(path: Path) -> dict[str, tuple[Path, ...]]:
     folders = {split: sorted((path / split).glob(f"*{_SUFFIX}")) for split in SPLITS}
     if not any(folders.values()):
         folders = {"test": sorted(path.glob(f"*{_SUFFIX}"))}
-    return {split: tuple(found) for split, found in folders.items() if found}
+    return {split: tuple(paths) for split, paths in folders.items() if paths}
 
 
 def _frames(path: Path) -> Iterator[dict[str, Any]]:
@@ -77,57 +79,18 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
     check_regular(path)
     try:
         with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
-            containers = _ContainerCount()
             reader = msgpack.Unpacker(
-                _BoundedStream(stream, expansion_limit(path.stat().st_size)),
-                raw=True,
-                strict_map_key=True,
-                max_buffer_size=MESSAGE_BYTES,
-                max_array_len=MESSAGE_ITEMS,
-                max_map_len=MESSAGE_ITEMS,
-                list_hook=containers.add,
-                object_hook=containers.add,
+                stream, raw=True, max_buffer_size=_FRAME_BYTES, max_array_len=_ITEMS, max_map_len=_ITEMS
             )
             for index in range(reader.read_array_header()):
-                containers.number = 0
                 yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
+                if reader.tell() > expansion_limit(path.stat().st_size):
+                    raise ValueError(f"it unpacks to more than {EXPANSION} times its size")
     except NmpmError:
         raise
     except (zstandard.ZstdError, msgpack.UnpackException, ValueError, OSError, RecursionError, MemoryError) as error:
-        reason = str(error)[:200] or type(error).__name__
+        reason = one_line(error) or type(error).__name__
         raise DataError(f"{path}: cannot be read ({reason}). Is it complete? Copy or download it again.") from error
-
-
-class _BoundedStream:
-    """A stream that raises an error where it unpacks to more than it should.
-
-    Args:
-        stream: Of unpacked bytes.
-        limit: Bytes.
-    """
-
-    def __init__(self, stream: Any, limit: int) -> None:
-        self._stream, self._left, self._limit = stream, limit, limit
-
-    def read(self, count: int) -> bytes:
-        content: bytes = self._stream.read(count)
-        self._left -= len(content)
-        if self._left < 0:
-            raise ValueError(f"it unpacks to more than {self._limit:,} bytes, {EXPANSION} times its size")
-        return content
-
-
-class _ContainerCount:
-    """Raises an error where a frame has more lists and maps than `MESSAGE_CONTAINERS`."""
-
-    def __init__(self) -> None:
-        self.number = 0
-
-    def add(self, container: Any) -> Any:
-        self.number += 1
-        if self.number > MESSAGE_CONTAINERS:
-            raise ValueError(f"a frame has more than {MESSAGE_CONTAINERS} lists and maps")
-        return container
 
 
 def _decode_frame(frame: Any, where: str) -> dict[str, Any]:
@@ -143,14 +106,12 @@ def _value(value: Any, where: str) -> Any:
     try:
         code, shape = value[b"type"], value[b"shape"] if value[b"nd"] else []
         if not isinstance(code, bytes) or not _KIND.fullmatch(code):
-            raise ValueError(f"expected numbers, found the type {str(code)[:40]}")
+            raise ValueError("expected numbers")
         if not isinstance(shape, list) or not all(isinstance(side, int) and side >= 0 for side in shape):
-            raise ValueError(f"its shape is {str(shape)[:40]}")
-        kind = np.dtype(code.decode("ascii"))
-        flat = np.frombuffer(value[b"data"], kind)
-        return flat.reshape(shape)
-    except (KeyError, TypeError, ValueError, AttributeError, UnicodeDecodeError) as error:
-        raise DataError(f"{where}: not an array as msgpack-numpy writes it ({str(error)[:100]}).") from error
+            raise ValueError("its shape is not a list of sizes")
+        return np.frombuffer(value[b"data"], code.decode("ascii")).reshape(shape)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{where}: not an array as msgpack-numpy writes it ({one_line(error, 100)}).") from error
 
 
 def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -> Metadata:
@@ -170,10 +131,10 @@ def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -
 
 
 def _array(frame: dict[str, Any], name: str, where: str) -> np.ndarray:
-    found = frame.get(name)
-    if not isinstance(found, np.ndarray) or found.ndim != 2 or 0 in found.shape or found.dtype.kind != "f":
+    array = frame.get(name)
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or 0 in array.shape or array.dtype.kind != "f":
         raise DataError(f"{where}: {name!r} must be floats of shape (N, D).")
-    return found
+    return array
 
 
 def _wall(first: dict[str, Any], dim: int, path: Path) -> np.ndarray:
@@ -214,11 +175,11 @@ def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
 
 
 def _attributes(first: dict[str, Any]) -> dict[str, Any]:
-    known: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}
-    grav = first.get("grav")
-    if isinstance(grav, np.ndarray) and grav.shape == (first["pos"].shape[1],):
-        known["gravity"] = grav.astype(np.float64)
-    return known
+    attributes: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}
+    gravity = first.get("grav")
+    if isinstance(gravity, np.ndarray) and gravity.shape == (first["pos"].shape[1],):
+        attributes["gravity"] = gravity.astype(np.float64)
+    return attributes
 
 
 def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -13,14 +13,13 @@ import zipfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm._support.limits import ARRAY_NAME, EXPANSION, expansion_limit
-from nmpm._support.regular_files import check_regular
-from nmpm.data.archive_errors import NPZ_ERRORS
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, split_name
+from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
+from nmpm._support.messages import one_line
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, family_note, split_name
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
 from nmpm.errors import DataError, NmpmError
@@ -36,10 +35,10 @@ class GnsNpz(DatasetFormat):
     summary: ClassVar[str] = "NumPy files of geoelements/gns with metadata.json"
 
     def recognises(self, path: Path) -> bool:
-        return bool(_found(path)) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
+        return bool(_files(path)) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = {split_name(file.stem) or "test": file for file in reversed(_found(path))}
+        files = {split_name(file.stem) or "test": file for file in reversed(_files(path))}
         if not files:
             raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
         family = options.family or "deepmind"
@@ -48,12 +47,12 @@ class GnsNpz(DatasetFormat):
         return ForeignDataset(
             metadata=metadata,
             splits={split: Rereadable(partial(_trajectories, files[split], names)) for split, names in members.items()},
-            notes=(f"Particle types have the meaning of the {family} family.",),
+            notes=(family_note(family),),
             counts={split: None if names == (_ALL,) else len(names) for split, names in members.items()},
         )
 
 
-def _found(path: Path) -> list[Path]:
+def _files(path: Path) -> list[Path]:
     if path.is_dir():
         return [file for split in SPLITS if (file := path / f"{split}{_SUFFIX}").exists()]
     return [path] if path.suffix == _SUFFIX and path.is_file() else []
@@ -65,34 +64,32 @@ def _members(path: Path) -> tuple[str, ...]:
     try:
         with zipfile.ZipFile(path) as file:
             items = [item for item in file.infolist() if item.filename.endswith(".npy")]
-            unpacked = sum(item.file_size for item in items)
     except NPZ_ERRORS as error:
         raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
-    names = [item.filename.removesuffix(".npy") for item in items]
-    if not names:
+    if not items:
         raise DataError(f"{path}: the file has no array.")
-    if max(map(len, names)) > ARRAY_NAME:
-        raise DataError(f"{path}: the name of an array has more than {ARRAY_NAME} characters.")
+    unpacked = sum(item.file_size for item in items)
     if unpacked > expansion_limit(path.stat().st_size):
         raise DataError(f"{path}: unpacks to {unpacked:,} bytes, more than {EXPANSION} times its size.")
-    return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d+", name)]))
+    names = [item.filename.removesuffix(".npy") for item in items]
+    return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d{1,18}", name)]))
 
 
 def _trajectories(path: Path, names: tuple[str, ...]) -> Iterator[Trajectory]:
     for name in names:
-        where = f"{path}: {name}"
-        content = _array(path, name)
-        rows = list(content) if name == _ALL else [content]
-        for row in rows:
+        where = f"{path}: {one_line(name, 60)}"
+        content = _array(path, name, where)
+        for row in content if name == _ALL else [content]:
             yield _trajectory(row, where)
 
 
-def _array(path: Path, name: str) -> Any:
+def _array(path: Path, name: str, where: str) -> Any:
     """The content of a member; objects are read by the restricted unpickler."""
-    where = f"{path}: {name}"
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
-            shape, fortran, kind = _header(file)
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, fortran, kind = read(file)
             data = file.read()
         if kind.hasobject:
             return load_pickled(data, where)
@@ -102,14 +99,7 @@ def _array(path: Path, name: str) -> Any:
     except NmpmError:
         raise
     except NPZ_ERRORS as error:
-        raise DataError(f"{where}: cannot be read ({str(error)[:200]}). Copy or download the file again.") from error
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, kind = read(file)
-    return shape, fortran, kind
+        raise DataError(f"{where}: cannot be read ({one_line(error)}). Copy or download the file again.") from error
 
 
 def _trajectory(row: Any, where: str) -> Trajectory:
@@ -133,9 +123,9 @@ def _trajectory(row: Any, where: str) -> Trajectory:
 
 def _per_particle(value: Any, particles: int, where: str) -> np.ndarray:
     """(N,) numbers, from one per particle or one for all."""
-    found = number_array(value, where)
-    if found.size not in (1, particles) or found.ndim > 1:
+    numbers = number_array(value, where)
+    if numbers.size not in (1, particles) or numbers.ndim > 1:
         raise DataError(
-            f"{where}: expected one number, or one for each of {particles} particles; found shape {found.shape}."
+            f"{where}: expected one number, or one for each of {particles} particles; found shape {numbers.shape}."
         )
-    return np.broadcast_to(found.reshape(-1), particles).copy()
+    return np.broadcast_to(numbers.reshape(-1), particles).copy()

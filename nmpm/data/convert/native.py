@@ -23,13 +23,13 @@ class Native(DatasetFormat):
     def open(self, path: Path, options: Options) -> ForeignDataset:
         metadata = options.apply_to(read_metadata(path, options.family))
         splits = {name: Split(file) for name, file in split_paths(path).items()}
-        family = (
+        note = (
             f"Particle types have the meaning of the {options.family} family where {METADATA_FILE} does not name them."
         )
         return ForeignDataset(
             metadata=metadata,
             splits={name: Rereadable(partial(_trajectories, split)) for name, split in splits.items()},
-            notes=(family,) if options.family else (),
+            notes=(note,) if options.family else (),
             counts={name: len(split) for name, split in splits.items()},
         )
 

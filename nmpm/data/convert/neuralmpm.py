@@ -66,16 +66,16 @@ class NeuralMpm(DatasetFormat):
         files = _files(path)
         if not files:
             raise DataError(f"{path}: no train, valid or test folder with sim_*.h5 files there.")
-        known = _PUBLISHED.get(path.resolve().name.lower())
-        first = next(_trajectories(next(iter(files.values()))[:1], known.material if known else None))
-        metadata = options.apply_to(_metadata(path, known, first, options))
-        material = known.material if known else _only_material(options, path, files)
+        published = _PUBLISHED.get(path.resolve().name.lower())
+        first = next(_trajectories(next(iter(files.values()))[:1], published.material if published else None))
+        metadata = options.apply_to(_metadata(path, published, first, options))
+        material = published.material if published else _only_material(options, path, files)
         family = options.family or "deepmind"
         return ForeignDataset(
             metadata=metadata,
-            splits={split: Rereadable(partial(_trajectories, found, material)) for split, found in files.items()},
-            notes=(*_notes(path, known, first, metadata), f"Particle types have the ids of the {family} family."),
-            counts={split: len(found) for split, found in files.items()},
+            splits={split: Rereadable(partial(_trajectories, paths, material)) for split, paths in files.items()},
+            notes=(*_notes(path, published, first, metadata), f"Particle types have the ids of the {family} family."),
+            counts={split: len(paths) for split, paths in files.items()},
         )
 
 
@@ -84,8 +84,8 @@ def _files(path: Path) -> dict[str, tuple[Path, ...]]:
     folders = {split: path / split for split in SPLITS}
     if path.is_dir() and path.name in SPLITS and any(path.glob("sim_*.h5")):
         folders = {path.name: path}
-    found = {split: sorted(folder.glob("sim_*.h5"), key=_number) for split, folder in folders.items()}
-    return {split: tuple(files) for split, files in found.items() if files}
+    paths = {split: sorted(folder.glob("sim_*.h5"), key=_number) for split, folder in folders.items()}
+    return {split: tuple(files) for split, files in paths.items() if files}
 
 
 def _number(path: Path) -> tuple[int, str]:
@@ -93,10 +93,10 @@ def _number(path: Path) -> tuple[int, str]:
     return (int(digits[-1]) if digits else -1, path.name)
 
 
-def _metadata(path: Path, known: _Published | None, first: Trajectory, options: Options) -> Metadata:
+def _metadata(path: Path, published: _Published | None, first: Trajectory, options: Options) -> Metadata:
     family = find_family(options.family or "deepmind")
     dim = first.position.shape[2]
-    if known is None and options.dt is None:
+    if published is None and options.dt is None:
         raise DataError(
             f"{path}: the files do not state the time between frames, and no published dataset is called"
             f" {path.resolve().name!r} ({', '.join(_PUBLISHED)}). Give --dt, and --gravity and --bounds if"
@@ -105,19 +105,19 @@ def _metadata(path: Path, known: _Published | None, first: Trajectory, options: 
     low, high = first.position.min(axis=(0, 1)), first.position.max(axis=(0, 1))
     observed = tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
     return Metadata(
-        bounds=known.domain if known and len(known.domain) == dim else observed,
-        dt=known.dt if known else options.dt or 1.0,
+        bounds=published.domain if published and len(published.domain) == dim else observed,
+        dt=published.dt if published else options.dt or 1.0,
         dim=dim,
         sequence_length=UNKNOWN_LENGTH,
         particle_types=dict(family.types),
         static_types=frozenset({_BOUNDARY}),
-        gravity=known.gravity if known and known.gravity and len(known.gravity) == dim else None,
+        gravity=published.gravity if published and published.gravity and len(published.gravity) == dim else None,
     )
 
 
-def _notes(path: Path, known: _Published | None, first: Trajectory, metadata: Metadata) -> list[str]:
+def _notes(path: Path, published: _Published | None, first: Trajectory, metadata: Metadata) -> list[str]:
     notes = []
-    if known is not None:
+    if published is not None:
         notes.append(
             f"Recognised as the published {path.resolve().name}: dt {metadata.dt:g}, bounds {metadata.bounds}, gravity"
             f" {metadata.gravity or 'as stated in each file'}."
@@ -183,6 +183,6 @@ def _positions(content: dict[str, np.ndarray], name: str, path: Path) -> np.ndar
     """Removes an array of positions from a file's content and validates it."""
     array = content.pop(name, None)
     if array is None or array.dtype.kind != "f" or array.ndim not in ((3,) if name == "particles" else (2, 3)):
-        found = "is missing" if array is None else f"is {array.dtype} of shape {array.shape}"
-        raise DataError(f"{path}: {name!r} {found}; expected floats of shape (T, N, D).")
+        problem = "is missing" if array is None else f"is {array.dtype} of shape {array.shape}"
+        raise DataError(f"{path}: {name!r} {problem}; expected floats of shape (T, N, D).")
     return array

@@ -10,12 +10,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.bounded_files import read_bounded
-from nmpm._support.limits import PICKLE_BYTES
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, family_note
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
-from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.metadata import metadata_from_dict
+from nmpm.data.format import Trajectory
+from nmpm.data.metadata import parse_metadata
 from nmpm.errors import DataError
+
+_BYTES = 2**31
+_NEEDED = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
 
 
 class RolloutPickle(DatasetFormat):
@@ -32,11 +34,12 @@ class RolloutPickle(DatasetFormat):
         if not files:
             raise DataError(f"{path}: no .pkl file there.")
         family = options.family or "deepmind"
+        metadata = parse_metadata(_to_plain(_content(files[0])["metadata"], files[0]), files[0], family)
         return ForeignDataset(
-            metadata=options.apply_to(_metadata(files[0], family)),
+            metadata=options.apply_to(metadata),
             splits={"test": Rereadable(partial(_trajectories, files))},
             notes=(
-                f"Particle types have the meaning of the {family} family.",
+                family_note(family),
                 "The true trajectories become the positions; the predictions are kept as the field"
                 " predicted_rollout, with the initial positions in front.",
             ),
@@ -51,40 +54,30 @@ def _files(path: Path) -> tuple[Path, ...]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    content = load_pickled(read_bounded(path, PICKLE_BYTES), str(path))
-    needed = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
-    if not isinstance(content, dict) or not all(key in content for key in needed):
-        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
-        raise DataError(f"{path}: a rollout has {', '.join(needed)}; found {found[:200]}.")
+    content = load_pickled(read_bounded(path, _BYTES), str(path))
+    if not isinstance(content, dict) or not all(key in content for key in _NEEDED):
+        raise DataError(f"{path}: a rollout is a dict of {', '.join(_NEEDED)}; this is something else.")
     return content
 
 
-def _metadata(path: Path, family: str) -> Metadata:
-    plain = _content(path)["metadata"]
-    if not isinstance(plain, dict):
-        raise DataError(f"{path}: metadata must map keys to values; it is {type(plain).__name__}.")
-    return metadata_from_dict(_to_plain(plain), path, family)
-
-
-def _to_plain(value: Any) -> Any:
-    """Converts NumPy's arrays and numbers to Python's lists and numbers."""
-    if isinstance(value, dict):
-        return {str(key): _to_plain(item) for key, item in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+def _to_plain(metadata: Any, path: Path) -> dict[str, Any]:
+    """The metadata with NumPy's arrays and numbers as Python's lists and numbers."""
+    if not isinstance(metadata, dict):
+        raise DataError(f"{path}: metadata must map keys to values; it is {type(metadata).__name__}.")
+    return {key: item.tolist() if isinstance(item, np.ndarray | np.generic) else item for key, item in metadata.items()}
 
 
 def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
     for path in files:
         content = _content(path)
-        initial = number_array(content["initial_positions"], f"{path}: initial_positions").astype(np.float32)
-        parts = {
-            key: number_array(content[key], f"{path}: {key}").astype(np.float32)
-            for key in ("ground_truth_rollout", "predicted_rollout")
+        arrays: dict[str, np.ndarray] = {
+            key: number_array(content[key], f"{path}: {key}")
+            for key in ("initial_positions", "ground_truth_rollout", "predicted_rollout", "particle_types")
             if key in content
         }
         try:
-            whole: dict[str, np.ndarray] = {key: np.concatenate([initial, part]) for key, part in parts.items()}
-            types = number_array(content["particle_types"], f"{path}: particle_types")
-            yield Trajectory(whole.pop("ground_truth_rollout"), types, {}, whole)
+            initial, types = arrays.pop("initial_positions"), arrays.pop("particle_types")
+            fields = {key: np.concatenate([initial, part]).astype(np.float32) for key, part in arrays.items()}
+            yield Trajectory(fields.pop("ground_truth_rollout"), types, {}, fields)
         except (ValueError, TypeError, MemoryError) as error:
             raise DataError(f"{path}: {error}") from error

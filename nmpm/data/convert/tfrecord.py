@@ -17,12 +17,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.limits import RECORD_FIELDS
-from nmpm._support.regular_files import check_regular
+from nmpm._support.bounded_files import check_regular
 from nmpm.errors import DataError
 
-_MASK_DELTA = 0xA282EAD8
-_LARGEST = 2**33  # bytes of a record; a larger length means damage
 _BYTES, _FLOATS, _INTEGERS = 1, 2, 3  # fields of `Feature`
 
 Feature = list[bytes] | NDArray[np.float32] | NDArray[np.int64]
@@ -51,8 +48,7 @@ def record_offsets(path: Path) -> list[int]:
     size = path.stat().st_size
     offsets: list[int] = []
     with path.open("rb") as file:
-        while file.tell() < size:
-            offset = file.tell()
+        while (offset := file.tell()) < size:
             length = _length(file, path, len(offsets), offset)
             if offset + 12 + length + 4 > size:
                 raise _damage_error(path, len(offsets), offset, "the file ends within it")
@@ -74,38 +70,33 @@ def read_record(path: Path, offset: int, index: int) -> SequenceExample:
     """
     with path.open("rb") as file:
         file.seek(offset)
-        length = _length(file, path, index, offset)
-        payload = file.read(length)
+        payload = file.read(_length(file, path, index, offset))
         checksum = file.read(4)
-    if len(payload) < length or len(checksum) < 4:
-        raise _damage_error(path, index, offset, "the file ends within it")
-    if masked_crc(payload) != struct.unpack("<I", checksum)[0]:
+    if struct.pack("<I", masked_crc(payload)) != checksum:
         raise _damage_error(path, index, offset, "its checksum does not match its content")
     try:
-        return _sequence_example(payload, _Budget())
-    except (ValueError, IndexError, struct.error, MemoryError) as error:
+        return _sequence_example(payload)
+    except (ValueError, IndexError, MemoryError) as error:
         raise _damage_error(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
 
 
 def masked_crc(data: bytes) -> int:
     """TFRecord's checksum of some bytes."""
     crc = crc32c(data)
-    return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
+    return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
 
 
 def crc32c(data: bytes) -> int:
     """CRC-32C (Castagnoli)."""
-    return int(_compiled_crc()(np.frombuffer(data, np.uint8), _TABLE)) ^ 0xFFFFFFFF
+    return int(_compiled_crc()(np.frombuffer(data, np.uint8), _crc_table())) ^ 0xFFFFFFFF
 
 
-def _make_table() -> NDArray[np.uint32]:
+@cache
+def _crc_table() -> NDArray[np.uint32]:
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, np.uint32(0x82F63B78) ^ (table >> 1), table >> 1)
     return table.astype(np.uint32)
-
-
-_TABLE = _make_table()
 
 
 def _crc_loop(data: NDArray[np.uint8], table: NDArray[np.uint32]) -> np.uint32:
@@ -123,11 +114,12 @@ def _compiled_crc() -> Callable[[NDArray[np.uint8], NDArray[np.uint32]], np.uint
 
 
 def _length(file: BinaryIO, path: Path, index: int, offset: int) -> int:
+    """Reads a record's header; what it says is checked against the file's size by `record_offsets`."""
     header = file.read(12)
     if len(header) < 12:
         raise _damage_error(path, index, offset, "the file ends within its header")
     length, checksum = struct.unpack("<QI", header)
-    if masked_crc(header[:8]) != checksum or length > _LARGEST:
+    if masked_crc(header[:8]) != checksum:
         raise _damage_error(path, index, offset, "the checksum of its length does not match")
     return int(length)
 
@@ -139,93 +131,75 @@ def _damage_error(path: Path, index: int, offset: int, why: str) -> DataError:
     )
 
 
-class _Budget:
-    """Raises an error after too many fields and integers of a record."""
-
-    def __init__(self) -> None:
-        self.left = RECORD_FIELDS
-
-    def spend(self) -> None:
-        self.left -= 1
-        if self.left < 0:
-            raise ValueError(f"more than {RECORD_FIELDS:,} fields")
-
-
-def _sequence_example(payload: bytes, budget: _Budget) -> SequenceExample:
+def _sequence_example(payload: bytes) -> SequenceExample:
     context: dict[str, Feature] = {}
     steps: dict[str, list[Feature]] = {}
-    for number, value in _fields(payload, budget):
-        for inner, entry in _fields(_bytes(value), budget):
+    for number, value in _fields(payload):
+        for inner, entry in _fields(_bytes(value)):
             if inner != 1:
                 continue
-            name, content = _entry(_bytes(entry), budget)
+            parts = dict(_fields(_bytes(entry)))  # key and value of a map's entry
+            name, content = _bytes(parts.get(1, b"")).decode("utf-8"), _bytes(parts.get(2, b""))
             if number == 1:
-                context[name] = _feature(content, budget)
+                context[name] = _feature(content)
             elif number == 2:
-                steps[name] = [_feature(_bytes(step), budget) for field, step in _fields(content, budget) if field == 1]
+                steps[name] = [_feature(_bytes(step)) for field, step in _fields(content) if field == 1]
     return SequenceExample(context, steps)
 
 
-def _entry(message: bytes, budget: _Budget) -> tuple[str, bytes]:
-    """Key and value of a map's entry."""
-    parts = dict(_fields(message, budget))
-    return _bytes(parts.get(1, b"")).decode("utf-8"), _bytes(parts.get(2, b""))
-
-
-def _feature(message: bytes, budget: _Budget) -> Feature:
-    for kind, content in _fields(message, budget):
-        values = [value for number, value in _fields(_bytes(content), budget) if number == 1]
+def _feature(message: bytes) -> Feature:
+    for kind, content in _fields(message):
+        values = [value for number, value in _fields(_bytes(content)) if number == 1]
         if kind == _BYTES:
             return [_bytes(value) for value in values]
         if kind == _FLOATS:
             return np.frombuffer(b"".join(map(_bytes, values)), "<f4")
         if kind == _INTEGERS:
-            return np.array([number for value in values for number in _integers(value, budget)], np.int64)
+            return np.array([number for value in values for number in _integers(value)], np.uint64).astype(np.int64)
     return []
 
 
-def _integers(value: int | bytes, budget: _Budget) -> Iterator[int]:
+def _integers(value: int | bytes) -> Iterator[int]:
     """Yields one integer, or several packed into bytes; 64 bits in two's complement."""
-    place = 0
-    while isinstance(value, bytes) and place < len(value):
-        budget.spend()
-        number, place = _varint(value, place)
-        yield number - (1 << 64) if number >> 63 else number
+    position = 0
+    while isinstance(value, bytes) and position < len(value):
+        number, position = _varint(value, position)
+        yield number
     if isinstance(value, int):
-        yield value - (1 << 64) if value >> 63 else value
+        yield value
 
 
-def _fields(message: bytes, budget: _Budget) -> Iterator[tuple[int, int | bytes]]:
+def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
     """Yields number and value of each field: an integer, or bytes where it has a length or a fixed width."""
-    place = 0
-    while place < len(message):
-        budget.spend()
-        key, place = _varint(message, place)
+    position = 0
+    while position < len(message):
+        key, position = _varint(message, position)
         number, wire = key >> 3, key & 7
         if wire == 0:
-            integer, place = _varint(message, place)
+            integer, position = _varint(message, position)
             yield number, integer
             continue
         if wire == 2:
-            width, place = _varint(message, place)
+            width, position = _varint(message, position)
         elif wire in (1, 5):
             width = 8 if wire == 1 else 4
         else:
             raise ValueError(f"wire type {wire}")
-        if place + width > len(message):
+        if position + width > len(message):
             raise ValueError("a field reaches beyond its message")
-        yield number, message[place : place + width]
-        place += width
+        yield number, message[position : position + width]
+        position += width
 
 
-def _varint(message: bytes, place: int) -> tuple[int, int]:
+def _varint(message: bytes, position: int) -> tuple[int, int]:
+    """An integer of at most 64 bits, and the position after it."""
     value = shift = 0
     while True:
-        byte = message[place]
+        byte = message[position]
         value |= (byte & 0x7F) << shift
-        place, shift = place + 1, shift + 7
+        position, shift = position + 1, shift + 7
         if byte < 0x80:
-            return value & 0xFFFFFFFFFFFFFFFF, place
+            return value & 0xFFFFFFFFFFFFFFFF, position
         if shift > 63:
             raise ValueError("a varint that is too long")
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory
-from nmpm.data.gravity import own_gravity
+from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -152,10 +152,10 @@ class RecordingReader:
             )
 
     def _gravity(self, trajectory: Trajectory, where: str) -> Tensor:
-        known = own_gravity(trajectory.attributes, self.scene, where)
-        if known is None:
+        gravity = trajectory_gravity(trajectory.attributes, self.scene, where)
+        if gravity is None:
             return torch.zeros(self.scene.dim)
-        return (torch.tensor(known, dtype=torch.float64) * self.scene.dt**2).float()
+        return (torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float()
 
 
 class SplitRecordings(Sequence[Recording]):

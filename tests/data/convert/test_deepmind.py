@@ -4,11 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from nmpm.data.convert import DeepMind, Options, convert
-from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.convert import Options, convert
+from nmpm.data.format import Split, read_metadata
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert import records
@@ -80,25 +78,6 @@ def test_a_missing_feature_is_named(folder, tmp_path):
 def test_options_must_fit_the_axes(folder, tmp_path):
     with pytest.raises(ConfigError, match=r"gravity = .* each of the data's 2 axes"):
         convert(folder, tmp_path / "native", options=Options(gravity=(0.0, 0.0, -9.81)))
-
-
-@given(place=st.integers(0, 5000), value=st.integers(0, 255), cut=st.integers(0, 5000))
-@settings(max_examples=80, deadline=None)
-def test_damaged_messages_are_refused(tmp_path_factory, place, value, cut):
-    """With checksums that fit, so that the parser itself meets the damage."""
-    folder = tmp_path_factory.mktemp("damage")
-    (folder / "metadata.json").write_text(json.dumps(METADATA))
-    data = bytearray(records.trajectory_record(*made(frames=3))[12:-4])
-    data[place % len(data)] = value
-    records.write_records(folder / "train.tfrecord", records.record(bytes(data[: len(data) - cut % 3])))
-    message = ""
-    trajectories: list[Trajectory] = []
-    try:
-        trajectories = list(DeepMind().open(folder, Options()).splits["train"])
-    except DataError as error:
-        message = str(error)
-    assert bool(trajectories) != ("train.tfrecord" in message)
-    assert all(np.isfinite(item.position).all() and item.position.shape[2] == 2 for item in trajectories)
 
 
 class TestRecorded:

@@ -3,11 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
-from nmpm.data.convert import Dmcf, Options, convert
-from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.convert import Options, convert
+from nmpm.data.format import Split, read_metadata
 from nmpm.errors import ConfigError, DataError
 
 msgpack = pytest.importorskip("msgpack", reason="the extra `convert` is not installed")
@@ -67,25 +65,6 @@ def test_missing_packages_give_the_install_command(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(ConfigError, match=r"pip install 'nmpm\[convert\]'"):
         convert(path, tmp_path / "out")
-
-
-@given(place=st.integers(0, 3000), value=st.integers(0, 255), cut=st.integers(0, 400), deep=st.booleans())
-@example(place=241, value=0, cut=0, deep=True)  # a box that is a single number
-@settings(deadline=None, max_examples=150)
-def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, place, value, cut, deep):
-    folder = tmp_path_factory.mktemp("dmcf")
-    data = bytearray(msgpack.packb(frames()) if deep else zstandard.ZstdCompressor().compress(msgpack.packb(frames())))
-    data[place % len(data)] = value
-    damaged = bytes(data[: len(data) - (cut if cut < 200 else 0)])
-    (folder / "a.msgpack.zst").write_bytes(zstandard.ZstdCompressor().compress(damaged) if deep else damaged)
-    found: list[Trajectory] = []
-    message = ""
-    try:
-        found = list(Dmcf().open(folder, Options()).splits["test"])
-    except DataError as error:
-        message = str(error)
-    assert bool(found) != bool(message)
-    assert all(np.isfinite(item.position).all() for item in found)
 
 
 def test_recorded_canyon(recorded, tmp_path):

@@ -3,11 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
-from nmpm.data.convert import GnsNpz, Options, convert
-from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.convert import Options, convert
+from nmpm.data.format import Split, read_metadata
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from tests.data.convert.test_rollout_pickle import Runs
@@ -74,25 +72,6 @@ def test_inconsistent_content_is_refused_by_name(tmp_path, content, message):
     with pytest.raises(DataError, match=message) as caught:
         convert(write(tmp_path / "a", simulation_0=content), tmp_path / "out")
     assert "train.npz: simulation_0" in str(caught.value)
-
-
-@given(place=st.integers(0, 3000), value=st.integers(0, 255), cut=st.integers(0, 300))
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-@example(place=645, value=64, cut=0)  # says it is of a later version of the format
-@settings(deadline=None, max_examples=120)
-def test_damaged_files_give_errors_or_finite_positions(tmp_path_factory, save, place, value, cut):
-    folder = write(tmp_path_factory.mktemp("npz"), save, simulation_0=pair(positions(0), 5))
-    data = bytearray((folder / "train.npz").read_bytes())
-    data[place % len(data)] = value
-    (folder / "train.npz").write_bytes(data[: len(data) - (cut if cut < 100 else 0)])
-    found: list[Trajectory] = []
-    message = ""
-    try:
-        found = list(GnsNpz().open(folder, Options()).splits["train"])
-    except DataError as error:
-        message = str(error)
-    assert bool(found) != ("train.npz" in message)
-    assert all(np.isfinite(item.position).all() for item in found)
 
 
 def test_recorded_flume(recorded, tmp_path):

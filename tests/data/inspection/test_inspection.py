@@ -1,5 +1,4 @@
 import dataclasses
-import json
 from pathlib import Path
 
 import h5py
@@ -149,11 +148,6 @@ def test_states_how_many_trajectories_were_inspected(tmp_path):
     write_metadata(tmp_path, made_up_metadata())
     split = inspect(FolderSource(tmp_path), trajectories=3).splits["train"]
     assert (split.trajectories, split.inspected) == (10, 3)
-
-
-def test_results_are_serialisable_as_json(tmp_path):
-    found = look(tmp_path, made_up_trajectory(12, 5, statics=1))
-    assert json.loads(json.dumps(found.to_dict())) == found.to_dict()
 
 
 def test_recorded_waterdrop(recorded):

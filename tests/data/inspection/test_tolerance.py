@@ -10,7 +10,7 @@ from nmpm.cli import main
 from nmpm.data.format import write_split
 from nmpm.data.generate import generate
 from nmpm.data.inspection import inspect
-from nmpm.data.inspection.tolerance import guess_family
+from nmpm.data.inspection.reading import guess_family
 from nmpm.data.loading.sources import FolderSource, StatedFacts
 from nmpm.sim import load_preset
 from tests.data.convert import records

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-from nmpm._support.plain_data import to_plain
 from nmpm.scene import Interval
 
 Range = tuple[int, int]
@@ -70,7 +67,7 @@ class Inspection:
         gravity: In length/s², where it is known and the same for all trajectories.
         first_acceleration: Median in the first frames, in length/s²; equals gravity where particles start in free fall.
         spacing: Median distance to the nearest neighbour in first frames.
-        varies: What differs between trajectories: "gravity", "materials", "particles", "frames", "obstacles".
+        varies: What differs between trajectories: "gravity", "materials", "particles", "frames", "obstacles", fields.
         fields: Shape of each further array, in the first trajectory.
         grids: Candidate grids.
         recommended: Recommended cells along the longest side.
@@ -105,17 +102,4 @@ class Inspection:
     restless: int
     notes: tuple[str, ...]
     findings: tuple[str, ...]
-    channels: dict[str, str] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain lists, strings and numbers."""
-        plain = dataclasses.asdict(self)
-        return {key: _plain(value) for key, value in plain.items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return to_plain(value)
+    channels: dict[str, str]

@@ -1,0 +1,112 @@
+"""Opens datasets that `nmpm fit` may refuse: problems are collected, and values from the trajectories stand in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from nmpm._support.messages import one_line
+from nmpm.data.families import FAMILIES
+from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
+from nmpm.data.loading.sources import FolderSource
+from nmpm.data.metadata import load_json, parse_metadata
+from nmpm.errors import DataError
+
+
+@dataclass(frozen=True)
+class OpenedDataset:
+    """A dataset, as far as it can be read.
+
+    Args:
+        source: The dataset, with a guessed family where neither metadata nor user state the particle types.
+        splits: Those that can be opened; at least one.
+        metadata: With values from the trajectories where the file has none or wrong ones. Types without a name are
+            called "type 9" and taken for moving.
+        problems: Sentences on what is wrong with the files.
+        wrong_metadata: Whether some of them are about the metadata.
+    """
+
+    source: FolderSource
+    splits: dict[str, Split]
+    metadata: Metadata
+    problems: list[str]
+    wrong_metadata: bool
+
+
+def open_dataset(source: FolderSource) -> OpenedDataset:
+    """Opens a dataset as far as it can be read.
+
+    Raises:
+        DataError: if no split can be opened.
+    """
+    folder, problems = source.folder, list[str]()
+    splits: dict[str, Split] = {}
+    for name, path in split_paths(folder).items():
+        try:
+            splits[name] = Split(path)
+        except DataError as error:
+            problems.append(str(error))
+    if not splits and problems:
+        raise DataError(problems[0])
+    find_split(folder, *SPLITS)
+    problems += [f"{folder}: {rename}" for rename in split_renames(folder)]
+    try:
+        plain: dict[str, Any] | None = load_json(folder / METADATA_FILE)
+    except DataError as error:
+        plain = None
+        problems.append(str(error))
+    ids = sorted({i for split in splits.values() for n in range(len(split)) for i in split.particle_type(n).tolist()})
+    if source.stated.family is None and (plain or {}).get("particle_types") is None:
+        source = FolderSource(folder, replace(source.stated, family=guess_family(ids, plain or {})))
+    metadata, wrong = _read_metadata(source, plain, next(iter(splits.values())), ids)
+    if unknown := metadata.unknown_types(np.array(ids)):
+        metadata = replace(metadata, particle_types=metadata.particle_types | {i: f"type {i}" for i in unknown})
+        problems.append(
+            f"Particle type {', '.join(map(str, unknown))} is not in the metadata; it is taken for a moving material"
+            f" here. To train on it, name it: nmpm convert FOLDER NEW --types {unknown[0]}=sand."
+        )
+    if source.stated.fields is not None:
+        metadata = replace(metadata, fields=tuple(source.stated.fields))
+    return OpenedDataset(source, splits, metadata, problems + wrong, bool(wrong or unknown))
+
+
+def guess_family(ids: Iterable[int], plain: Mapping[str, Any]) -> str:
+    """The family of particle types that knows the most of the ids; LagrangeBench's where its metadata keys occur.
+
+    Args:
+        ids: Particle type ids that occur.
+        plain: The metadata's JSON object.
+    """
+    names = ["deepmind", "lagrangebench", "jax-sph"]
+    if "periodic_boundary_conditions" in plain:
+        names = names[1:] + names[:1]
+    return min(names, key=lambda name: len(set(ids) - set(FAMILIES[name].types)))
+
+
+def _read_metadata(
+    source: FolderSource, stated: dict[str, Any] | None, split: Split, ids: list[int]
+) -> tuple[Metadata, list[str]]:
+    path, plain, problems = source.folder / METADATA_FILE, stated or {}, list[str]()
+    if plain.get("dim") not in (None, split.dim):
+        problems.append(f"{path}: dim = {one_line(plain['dim'], 40)}, but positions have {split.dim} axes.")
+        plain = plain | {"dim": split.dim}
+    try:
+        position = split.read(0).position
+        low, high = position.min(axis=(0, 1)), position.max(axis=(0, 1))
+    except DataError:
+        low, high = np.zeros(split.dim), np.ones(split.dim)
+    substitutes = {
+        "dim": split.dim,
+        "bounds": tuple(zip(low.tolist(), np.where(high > low, high, low + 1).tolist(), strict=True)),
+        "dt": 1.0,
+        "sequence_length": split.frames(0),
+        "particle_types": {i: f"type {i}" for i in ids},
+    }
+    # Of a file that cannot be read, no key needs to be named.
+    metadata = parse_metadata(plain, path, source.stated.family, [] if stated is None else problems, substitutes)
+    if missing := [key for key in ("bounds", "dt") if key not in plain]:
+        problems.append(f"{path}: without {' and '.join(missing)}, lengths and times here are the file's own units.")
+    return metadata, problems
