@@ -6,7 +6,6 @@ the bounds' rule "error", once per bundle.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -30,16 +29,16 @@ from nmpm.emulator.support import Support
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
-from nmpm.transfer.execution import chunks, is_eager_cpu
+from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
 
 @dataclass(frozen=True)
-class Flight:
+class MovingParticles:
     """Particles on their way through a bundle.
 
     Args:
-        cells: (B, N, D) positions.
+        cells: (B, N, D) positions at the start.
         velocity: (B, N, D) the particles' own velocities.
         carried: (B, N, D) velocities that the decoder lets particles keep.
         gravity: (B, 1, D), what a frame adds to a velocity.
@@ -55,11 +54,6 @@ class Flight:
     material: Tensor
     fields: Tensor
     share: Tensor
-
-    def part(self, chunk: slice) -> Flight:
-        """The same for some of the particles."""
-        names = ("cells", "velocity", "carried", "material", "share")
-        return dataclasses.replace(self, **{name: getattr(self, name)[:, chunk] for name in names})
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,7 @@ class Advection:
         Raises:
             DataError: as `constrained_path`.
         """
-        return self._check_bounds(start, self._free(self._take_off(start)))
+        return self._check_bounds(start, self._free_path(self._take_off(start)))
 
     def constrained_path(self, start: BundleStart, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
@@ -103,9 +97,11 @@ class Advection:
         Raises:
             DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
         """
-        flight = self._take_off(start)
-        path = self._free(flight) if budget is None else self._within_energy(flight, budget)
-        path = self._clear_of_obstacles(start, path, solid)
+        moving = self._take_off(start)
+        path = self._free_path(moving) if budget is None else self._within_energy(moving, budget)
+        if self.constraints.solids and self.scene.obstacles:
+            contact = Contact(obstacle_share(solid, self.walls), self.grid)
+            path = self._confine(contact.hold(start.cells, path, start.mask))
         if self.constraints.rest_speed:
             path = self._bring_to_rest(start, path, solid)
         return self._check_bounds(start, path)
@@ -134,100 +130,75 @@ class Advection:
             spread = torch.where(blocked, path, spread)
         return spread if budget is None else self._afford_spread(start, path, spread, budget)
 
-    def _take_off(self, start: BundleStart) -> Flight:
-        """The velocities that particles keep, and their shares of their scene's mass."""
-        fields = start.fields
-        smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
-        carried = self.decoder.carried_velocity(start.velocity, smoothed)
-        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
-        return Flight(start.cells, start.velocity, carried, start.gravity, start.material, fields, share)
-
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's values: fields (B, materials * V, *S) at cells (B, N, D) → (B, N, V)."""
         gathered = self.transfer.g2p(fields, cells, self.grid)
         if len(self.scene.materials) == 1:
             return gathered
-        split = gathered.unflatten(-1, (len(self.scene.materials), -1))
-        chosen = material[..., None, None].expand(-1, -1, 1, split.shape[-1])
-        own: Tensor = split.gather(2, chosen).squeeze(2)
-        return own
+        by_material = gathered.unflatten(-1, (len(self.scene.materials), -1))
+        index = material[..., None, None].expand(-1, -1, 1, by_material.shape[-1])
+        values: Tensor = by_material.gather(2, index).squeeze(2)
+        return values
 
-    def _free(self, flight: Flight) -> Tensor:
-        parts = [self._path(flight.part(chunk)) for chunk in chunks(flight.cells.shape[1], flight.cells.device)]
-        return torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
+    def _take_off(self, start: BundleStart) -> MovingParticles:
+        """The velocities that particles keep, and their shares of their scene's mass."""
+        fields = start.fields
+        smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
+        carried = self.decoder.carried_velocity(start.velocity, smoothed)
+        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
+        return MovingParticles(start.cells, start.velocity, carried, start.gravity, start.material, fields, share)
 
-    def _path(self, flight: Flight) -> Tensor:
+    def _free_path(self, moving: MovingParticles) -> Tensor:
         """(B, m, N, D) positions, frame by frame."""
-        cells, velocity, path = flight.cells, flight.carried, []
-        fields = flight.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
+        cells, velocity, path = moving.cells, moving.carried, []
+        fields = moving.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
         for frame, field in enumerate(fields, start=1):
-            arrived = self._advance(flight, field, cells, velocity, frame)
+            arrived = self._advance(moving, field, cells, velocity, frame)
             velocity, cells = arrived - cells, arrived
             path.append(cells)
         return torch.stack(path, dim=1)
 
-    def _advance(self, flight: Flight, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
+    def _advance(self, moving: MovingParticles, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
         """(B, N, D) positions after a frame, from cells (B, N, D) and the velocity (B, N, D) of the frame before."""
-        known = self.decoder.known_velocity(flight.carried, velocity, flight.gravity, frame)
-        return self._confine(cells + (known + self.gather(field, cells, flight.material)))
+        known = self.decoder.known_velocity(moving.carried, velocity, moving.gravity, frame)
+        return self._confine(cells + (known + self.gather(field, cells, moving.material)))
 
-    def _within_energy(self, flight: Flight, budget: Tensor) -> Tensor:
+    def _within_energy(self, moving: MovingParticles, budget: Tensor) -> Tensor:
         """(B, m, N, D) positions of which no frame exceeds an energy (B,).
 
         On a CPU the free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
         """
         if not is_eager_cpu(budget):
-            return self._limit_energy(flight, budget, flight.cells.unsqueeze(1)[:, :0])
-        path = self._free(flight)
-        energies = self._energies(flight.cells, flight.gravity, flight.share, path)
+            return self._limit_energy(moving, budget, moving.cells.unsqueeze(1)[:, :0])
+        path = self._free_path(moving)
+        energies = self._energies(moving.cells, moving.gravity, moving.share, path)
         exceeds = (energies > budget.unsqueeze(1)).any(0)
         if not bool(exceeds.any()):
             return path
-        return self._limit_energy(flight, budget, path[:, : int(exceeds.int().argmax())])
+        return self._limit_energy(moving, budget, path[:, : int(exceeds.int().argmax())])
 
     def _energies(self, cells: Tensor, gravity: Tensor, share: Tensor, path: Tensor) -> Tensor:
         """(B, m) energies of the frames of a path (B, m, N, D) from cells (B, N, D), with shares (B, N, 1) of mass."""
-        parts = []
-        for chunk in chunks(path.shape[2], path.device):
-            own = path[:, :, chunk]
-            steps = own.diff(dim=1, prepend=cells[:, chunk].unsqueeze(1))
-            own, steps, pull = self.grid.isotropic_units(own, steps, gravity)
-            parts.append(energy(own, steps, pull, share[:, chunk]))
-        return torch.stack(parts).sum(0) if len(parts) > 1 else parts[0]
+        steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
+        path, steps, gravity = self.grid.isotropic_units(path, steps, gravity)
+        return energy(path, steps, gravity, share)
 
-    def _limit_energy(self, flight: Flight, budget: Tensor, begun: Tensor) -> Tensor:
-        """(B, m, N, D) positions, each frame within an energy (B,): all particles advance together, as they share it.
-
-        Chunks only bound the memory of interpolation.
-
-        Args:
-            flight: What to start from.
-            budget: (B,) energy.
-            begun: (B, f, N, D) the first frames, which are within it.
-        """
-        path = [flight.cells, *begun.unbind(1)]
-        velocity, before = flight.carried, flight.velocity
+    def _limit_energy(self, moving: MovingParticles, budget: Tensor, begun: Tensor) -> Tensor:
+        """(B, m, N, D) positions, each frame within an energy (B,), after the first frames (B, f, N, D), which are."""
+        path = [moving.cells, *begun.unbind(1)]
+        velocity, before = moving.carried, moving.velocity
         if len(path) > 1:
             velocity = before = path[-1] - path[-2]
-        parts = [(flight.part(chunk), chunk) for chunk in chunks(flight.cells.shape[1], flight.cells.device)]
-        for frame, field in enumerate(flight.fields.unbind(1)[len(path) - 1 :], start=len(path)):
+        for frame, field in enumerate(moving.fields.unbind(1)[len(path) - 1 :], start=len(path)):
             cells = path[-1]
-            moved = [self._advance(part, field, cells[:, own], velocity[:, own], frame) for part, own in parts]
-            proposed = torch.cat(moved, dim=1) if len(moved) > 1 else moved[0]
+            proposed = self._advance(moving, field, cells, velocity, frame)
             step = proposed - cells
-            place, way, last, gravity = self.grid.isotropic_units(cells, step, before, flight.gravity)
-            factor = affordable(place, way, last, gravity, flight.share, budget)
+            units, steps, last, gravity = self.grid.isotropic_units(cells, step, before, moving.gravity)
+            factor = affordable(units, steps, last, gravity, moving.share, budget)
             arrived = torch.where(factor < 1, self._confine(cells + factor * step), proposed)
             velocity = before = arrived - cells
             path.append(arrived)
         return torch.stack(path[1:], dim=1)
-
-    def _clear_of_obstacles(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
-        """The path (B, m, N, D), clear of obstacles."""
-        if not (self.constraints.solids and self.scene.obstacles):
-            return path
-        contact = Contact(obstacle_share(solid, self.walls), self.grid)
-        return self._confine(contact.hold(start.cells, path, start.mask))
 
     def _bring_to_rest(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
@@ -255,8 +226,8 @@ class Advection:
         """(B, m + 1) energies of the frames of a spread path, and of its end with the velocity of the path's end."""
         share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
         before = path[:, -2] if path.shape[1] > 1 else start.cells
-        place, step, gravity = self.grid.isotropic_units(spread[:, -1], path[:, -1] - before, start.gravity)
-        end = energy(place, step, gravity, share)
+        cells, step, gravity = self.grid.isotropic_units(spread[:, -1], path[:, -1] - before, start.gravity)
+        end = energy(cells, step, gravity, share)
         return torch.cat([self._energies(start.cells, start.gravity, share, spread), end.unsqueeze(1)], dim=1)
 
     def _confine(self, cells: Tensor) -> Tensor:

@@ -13,7 +13,8 @@ from torch import Tensor
 from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.fields import calibrate_fields, true_rates
 from nmpm.emulator.model import UNLIMITED, Emulator
-from nmpm.emulator.rasterise import grid_state, volume_fraction
+from nmpm.emulator.prediction import TensorSteps
+from nmpm.emulator.rasterise import volume_fraction
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
@@ -46,13 +47,13 @@ class _Unknowns:
 
 @torch.no_grad()
 def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
-    """Set the normalisation statistics from training windows of at least m + 2 frames.
+    """Set the normalisation statistics from training windows of at least m + 2 frames, on any device.
 
     Inputs get mean and standard deviation per channel over all cells, and the limits to which they are clipped; outputs
-    the root mean square of what is left of the true velocities once the decoder's known part is taken out, per frame of
-    the bundle and component, and of the evolving fields' changes. Fields get mean and standard deviation. A material
-    without particles in the windows gets the other materials' scales. Where several processes train together, all of
-    them call this, each with windows of its own, and get the statistics of all. The windows may be on any device.
+    the root mean square, per frame of the bundle and component, of the true velocities without the decoder's known
+    part, and of the evolving fields' changes. Fields get mean and standard deviation. A material without particles in
+    the windows gets the other materials' scales. Where several processes train together, all of them call this, each
+    with windows of its own, and get the statistics of all.
 
     Raises:
         ValueError: if there is no window or one is too short.
@@ -68,7 +69,12 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     materials = list(zip(*all_gather(_unknowns(emulator, windows)), strict=True))
     absent = _absent_materials(materials[: len(emulator.scene.materials)])
     if absent:
-        _warn_of_absent([emulator.scene.materials[index] for index in absent])
+        warnings.warn(
+            f"The windows that the model is calibrated on have no particles of"
+            f" {', '.join(emulator.scene.materials[index] for index in absent)}, which get the other materials' scales:"
+            " if they move very differently, shuffle the training trajectories, or calibrate on more.",
+            stacklevel=3,
+        )
     emulator.input_mean.copy_(_borrowed(inputs.mean, emulator.scene, absent).reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(_borrowed(inputs.std, emulator.scene, absent)).reshape_as(emulator.input_std))
     # A channel that never varies in the sample may well do so elsewhere.
@@ -94,21 +100,22 @@ def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
     Raises:
         ValueError: if no cell is half full.
     """
-    found = []
+    fractions = []
     for window in (window.to(emulator.device) for window in windows):
         start, grid = window.initial, emulator.grid
         taken = emulator.solid(start)
         room = 1 - (taken if taken.shape[1] else emulator.walls)
         full = volume_fraction(emulator.scene, grid, Linear(), window.mask, grid.to_cells(window.target[:, -1]))
-        found.append((full / room.clamp(min=0.5))[(full > 0.5) & (room > 0.5)])
-    filled = torch.cat(found).sort().values
+        fractions.append((full / room.clamp(min=0.5))[(full > 0.5) & (room > 0.5)])
+    filled = torch.cat(fractions).sort().values
     if not len(filled):
         raise ValueError("No cell of the windows is half full: the density cap cannot be measured.")
     return float(filled[min(len(filled) - 1, int(_FULL * len(filled)))])
 
 
 def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:
-    state = torch.cat([_state(emulator, window) for window in windows])
+    starts = [window.initial for window in windows]
+    state = torch.cat([TensorSteps(emulator).rasterise(start, emulator.solid(start))[-1] for start in starts])
     axes = (0, *range(2, state.dim()))
     cells = state.numel() // state.shape[1]
     figures = (state.mean(axes), state.std(axes), state.amin(axes), state.amax(axes))
@@ -137,13 +144,6 @@ def _combine(parts: Sequence[_Inputs]) -> _Inputs:
     )
 
 
-def _state(emulator: Emulator, window: Window) -> Tensor:
-    start = window.initial
-    cells, velocity, _ = emulator.in_cells(start)
-    solid, scales = emulator.solid(start), emulator.field_scales
-    return grid_state(emulator.scene, emulator.grid, emulator.transfer, start, cells, velocity, solid, scales)
-
-
 def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
     """For each material the part of the velocity that the network has to predict, then of each the fields' rates."""
     unknown = [[_unknown_velocity(emulator, window) for window in windows]]
@@ -163,14 +163,6 @@ def _absent_materials(materials: Sequence[Sequence[_Unknowns]]) -> list[int]:
     """Indices of the materials without particles; none where no material has any."""
     absent = [index for index, parts in enumerate(materials) if not any(part.particles for part in parts)]
     return absent if len(absent) < len(materials) else []
-
-
-def _warn_of_absent(names: Sequence[str]) -> None:
-    warnings.warn(
-        f"The windows that the model is calibrated on have no particles of {', '.join(names)}, which get the other"
-        " materials' scales: if they move very differently, shuffle the training trajectories, or calibrate on more.",
-        stacklevel=4,
-    )
 
 
 def _borrowed(values: Tensor, scene: Scene, absent: Sequence[int]) -> Tensor:

@@ -1,7 +1,7 @@
-"""Constraints: facts about the scenes that rollouts obey whatever the network predicts.
+"""Constraints: physical limits enforced in rollouts whatever the network predicts.
 
-Each is switched on where it holds. Except for the bounds, none acts in training, which has to see the network's own
-errors. Nothing here reads values back from the device, except `check_within_bounds`.
+Only `bounds` acts in training too, which has to see the network's own errors. Nothing here reads values back from the
+device, except `check_within_bounds`.
 
 All quantities are in grid units: cells, cells per frame. Energies may be in any unit of length that is the same along
 each axis, as cells need not be square.
@@ -53,11 +53,11 @@ BOUNDS: Mapping[str, BoundsRule] = MappingProxyType({"stop": stop, "reflect": re
 
 
 def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, periodic: Sequence[bool]) -> None:
-    """Raise an error if a bundle leads more than a cell beyond the bounds. Reads one value back from the device.
+    """Reject paths (B, m, N, D) in cells that lead more than a cell beyond the bounds; reads one value back.
 
     Args:
-        path: (B, m, N, D) in cells.
-        mask: (B, N) bool, False for padding, which may be anywhere.
+        path: Of which padding may be anywhere.
+        mask: (B, N) bool, False for padding.
         bounds: (2, D) lowest and highest positions.
         periodic: Whether each axis wraps, and so has no bounds.
 
@@ -113,16 +113,9 @@ class Constraints:
 
 
 def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> Tensor:
-    """Kinetic and potential energy per mass of each scene, up to a constant.
+    """Kinetic and potential energy per mass (B, ...) of each scene, up to a constant.
 
-    Args:
-        cells: (B, ..., N, D).
-        velocity: (B, ..., N, D).
-        gravity: (B, 1, D).
-        share: (B, N, 1), each particle's share of the scene's mass, from `mass_shares`.
-
-    Returns:
-        (B, ...).
+    Of positions and velocities (B, ..., N, D), gravity (B, 1, D) and shares (B, N, 1) of mass from `mass_shares`.
     """
     extra = (1,) * (cells.dim() - 3)
     batch, count, dim = cells.shape[0], cells.shape[-2], cells.shape[-1]
@@ -132,16 +125,9 @@ def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> T
 
 
 def mass_shares(scene: Scene, material: Tensor, mask: Tensor, dtype: torch.dtype) -> Tensor:
-    """Each particle's share of its scene's mass, zero for padding; all particles have the same volume.
+    """(B, N, 1) each particle's share of its scene's mass, zero for padding; sums to one in scenes with particles.
 
-    Args:
-        scene: Gives the materials' densities; without them all particles have the same mass.
-        material: (B, N) index of each particle's material.
-        mask: (B, N) bool, False for padding.
-        dtype: Of the result.
-
-    Returns:
-        (B, N, 1), summing to one over the particles of a scene that has any.
+    All particles have the same volume; where the scene has no densities, the same mass. `material` and `mask` (B, N).
     """
     mass = mask.to(dtype)
     if len(set(scene.densities)) > 1:
@@ -152,21 +138,16 @@ def mass_shares(scene: Scene, material: Tensor, mask: Tensor, dtype: torch.dtype
 
 
 def lowest_potential(scene: Scene, gravity: Tensor) -> Tensor:
-    """Potential energy per mass where it is lowest within the scene's bounds: in one of their corners.
+    """(B,) the lowest potential energy per mass within the scene's bounds, in length² per frame²: in a corner.
 
-    Args:
-        scene: Gives the bounds.
-        gravity: (B, D) in length per frame².
-
-    Returns:
-        (B,) in length² per frame².
+    Gravity (B, D) is in length per frame².
     """
     sides = zip(gravity.unbind(-1), scene.bounds, strict=True)
     return -torch.stack([torch.maximum(along * low, along * high) for along, (low, high) in sides]).sum(0)
 
 
 def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
-    """Factors for the particles' steps in a frame with which their scene does not exceed its energy.
+    """(B, N, 1) factors for the particles' steps in a frame with which their scene does not exceed its energy.
 
     With a factor s for some of the steps the energy after the frame is a parabola in s; the largest s in [0, 1] within
     the budget is taken. In a scene that exceeds its budget s applies to the particles that gain energy in this frame;
@@ -179,9 +160,6 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
         gravity: (B, 1, D).
         share: (B, N, 1), each particle's share of its scene's mass.
         budget: (B,) energy that is allowed.
-
-    Returns:
-        (B, N, 1).
     """
     mass = share.squeeze(-1)
     work = step * gravity
@@ -190,29 +168,24 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
     excess = (-_over_axes(cells * gravity) * mass).sum(1) - budget  # of the scene if nobody moved
     excess = excess.clamp(min=-_UNLIMITED)
     gains = _gains(cells, step, before, work)
-    own = gains.to(step.dtype)
-    square = torch.stack([(kinetic * own).sum(1), kinetic.sum(1)], dim=1)  # of those that gain; of all
-    slope = torch.stack([(fall * own).sum(1), fall.sum(1)], dim=1)
+    gaining = gains.to(step.dtype)
+    square = torch.stack([(kinetic * gaining).sum(1), kinetic.sum(1)], dim=1)  # of those that gain; of all
+    slope = torch.stack([(fall * gaining).sum(1), fall.sum(1)], dim=1)
     both = square + slope
     constant = excess.unsqueeze(1) + (both[:, 1:] - both)
     factor, exact = _largest_root(square, slope, constant)
     suffices = exact[:, 0] & (factor[:, 0] >= 0) & (factor[:, 0] <= 1)
-    chosen = torch.where(suffices, factor[:, 0], factor[:, 1].clamp(0, 1))
+    taken = torch.where(suffices, factor[:, 0], factor[:, 1].clamp(0, 1))
     exceeds = both[:, 1] + excess > 0
     applies = exceeds.unsqueeze(1) & (gains | ~suffices.unsqueeze(1))
-    return torch.where(applies, chosen.unsqueeze(1), 1.0).unsqueeze(-1)
+    return torch.where(applies, taken.unsqueeze(1), 1.0).unsqueeze(-1)
 
 
 def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
-    """The part of the way between two paths that each scene can afford, as energy is convex in it.
+    """(B,) the part of the way between two paths that each scene can afford, as energy is convex in it.
 
-    Args:
-        before: (B, F) energies at its beginning.
-        after: (B, F) energies at its end.
-        budget: (B,) energy that is allowed.
-
-    Returns:
-        (B,) from 0 to 1; exactly 1 where the end is within the budget.
+    From energies (B, F) of the frames of both paths and the energy (B,) that is allowed; exactly 1 where the end is
+    within it.
     """
     exceeds = after > budget.unsqueeze(1)
     rise = torch.where(exceeds, after - before, 1.0)
@@ -246,19 +219,15 @@ def _largest_root(square: Tensor, slope: Tensor, constant: Tensor) -> tuple[Tens
 
 
 def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tensor:
-    """Whether particles move no more in a bundle than the model's error.
+    """(B, N) bool: whether particles move no more in a bundle than the model's error, a speed in cells per frame.
 
-    A particle in free fall is not at rest, however little it moves: at the top of its flight it would be held in the
-    air.
+    A particle in free fall is not at rest, however little it moves: at the top of its path it would be held in the air.
 
     Args:
         start: (B, N, D) where the bundle starts.
         path: (B, m, N, D) its frames.
         speed: In cells per frame.
         gravity: (B, 1, D), what a frame adds to the velocity in free fall; zero where it is not known.
-
-    Returns:
-        (B, N) bool.
     """
     frames = path.shape[1]
     still: Tensor = (path[:, -1] - start).norm(dim=-1) < speed * frames

@@ -1,13 +1,9 @@
 """Fields beside motion: numbers that particles carry, such as a temperature, or that a scene has, such as a force.
 
-On the grid a field of the particles is its mean over those of each material in a cell, by mass, as velocity is; a
-number of the whole scene is constant. Fields enter in units of their spread in the training data about their mean
-there, so that empty cells, and fields that a scene lacks, hold the mean. Those that evolve are predicted as rates: with
-r_1 … r_m the grid's rates of a bundle's frames,
-
-    s_i = s_{i-1} + g2p(r_i)(x_{i-1})
-
-so that each particle keeps a value of its own, which nothing smooths, and takes it along.
+On the grid a field of the particles is its mean over those of each material in a cell, as velocity is; a number of the
+whole scene is constant. Fields enter in units of their spread in the training data about their mean there, so that
+empty cells, and fields that a scene lacks, hold the mean. Evolving fields are predicted as rates: with r_1 … r_m the
+grid's rates of a bundle's frames, s_i = s_{i-1} + g2p(r_i)(x_{i-1}), so that nothing smooths a particle's value.
 """
 
 from __future__ import annotations
@@ -49,14 +45,12 @@ class FieldScales(nn.Module):
         """The standard deviation () of each field, by name."""
         return {name: self.std[index] for index, name in enumerate(self.scene.fields)}
 
-    def missing(self, particles: Particles) -> tuple[str, ...]:
-        """Names of the fields that a state lacks."""
-        return tuple(name for name in self.scene.fields if name not in particles.fields)
-
     def warn_of_missing(self, particles: Particles) -> None:
         """Warn, once for each name, of fields that a state lacks, which then have their training mean."""
-        for name in self.missing(particles):
-            mean = float(self.mean[self.scene.fields.index(name)])
+        for index, name in enumerate(self.scene.fields):
+            if name in particles.fields:
+                continue
+            mean = float(self.mean[index])
             warnings.warn(
                 f"The scene has no {name}, which the model was trained with; its training mean, {mean:.4g}, is used.",
                 stacklevel=3,
@@ -100,12 +94,11 @@ class FieldScales(nn.Module):
         batch, count = particles.mask.shape
         steps = [gather(rate, cells) for rate, cells in zip(rates.unbind(1), places.unbind(1), strict=True)]
         gained = torch.stack(steps, dim=1).cumsum(1)
-        found = {}
+        fields = {}
         for index, name in enumerate(self.scene.evolving):
-            known = particles.fields.get(name, self.mean[index].expand(batch, 1))
-            begun = known.expand(batch, count).unsqueeze(1)
-            found[name] = begun + (self.std[index] * gained[..., index]).to(begun.dtype)
-        return found
+            begun = particles.fields.get(name, self.mean[index].expand(batch, 1)).expand(batch, count).unsqueeze(1)
+            fields[name] = begun + (self.std[index] * gained[..., index]).to(begun.dtype)
+        return fields
 
 
 def warn_of_ignored(scene: Scene, given: Iterable[str]) -> None:
@@ -125,8 +118,8 @@ def calibrate_fields(scales: FieldScales, windows: Sequence[Window]) -> None:
     """
     for index, name in enumerate(scales.scene.fields):
         values = [_values(window, name) for window in windows if name in window.fields]
-        own = [(part.numel(), part.sum().item(), part.square().sum().item()) for part in values]
-        parts = [part for of_rank in all_gather(own) for part in of_rank]
+        sums = [(part.numel(), part.sum().item(), part.square().sum().item()) for part in values]
+        parts = [part for of_rank in all_gather(sums) for part in of_rank]
         count, total, squares = (sum(column) for column in zip((0, 0.0, 0.0), *parts, strict=True))
         if count:
             mean = total / count
@@ -150,11 +143,11 @@ def true_rates(scales: FieldScales, window: Window, frames: int) -> Tensor:
     Zero where a window lacks a field, or it is constant in time.
     """
     batch, count = window.mask.shape
-    found = []
+    rates = []
     for index, name in enumerate(scales.scene.evolving):
         values = window.fields.get(name)
         if values is None or values.shape[1] == 1:
-            found.append(scales.mean.new_zeros(batch, frames, count))
+            rates.append(scales.mean.new_zeros(batch, frames, count))
         else:
-            found.append(values[:, 1 : frames + 2].diff(dim=1) / scales.std[index])
-    return torch.stack(found, dim=-1)
+            rates.append(values[:, 1 : frames + 2].diff(dim=1) / scales.std[index])
+    return torch.stack(rates, dim=-1)

@@ -21,19 +21,19 @@ class _Numbers(NamedTuple):
     """Numbers of a state that must be finite.
 
     Args:
-        place: What an error calls one of them, with the index into K.
+        name: What an error calls one of them, with the index into K.
         values: (B, K, V).
-        counts: (B, K) bool, False for padding.
+        real: (B, K) bool, False for padding.
     """
 
-    place: str
+    name: str
     values: Tensor
-    counts: Tensor
+    real: Tensor
 
     @property
     def wrong(self) -> Tensor:
         """(B, K) bool."""
-        return ~self.values.isfinite().all(-1) & self.counts
+        return ~self.values.isfinite().all(-1) & self.real
 
 
 def _state_numbers(particles: Particles) -> list[_Numbers]:
@@ -55,10 +55,6 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
 
     All checks are read back from the device at once; details are computed only if one fails.
 
-    Args:
-        emulator: Is to predict.
-        particles: The state to start from.
-
     Raises:
         DataError: naming the weight or statistic; or scene, particle and value.
     """
@@ -79,7 +75,7 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
         if bad.any():
             scene, index = map(int, bad.nonzero()[0])
             raise DataError(
-                f"Scene {scene} of the batch, {given.place.format(index)} is {given.values[scene, index].tolist()}; it"
+                f"Scene {scene} of the batch, {given.name.format(index)} is {given.values[scene, index].tolist()}; it"
                 " must be finite."
             )
     if unknown.any():
@@ -98,8 +94,9 @@ def check_inputs(emulator: Emulator, particles: Particles) -> None:
 
 def warn_of_training_mode(emulator: Emulator) -> None:
     """Warn of an emulator in training mode, such as a module's own, whose rollouts would be other than intended."""
-    held = emulator.constraints
-    constrained = held.energy or held.rest_speed or held.density_cap or (held.solids and emulator.scene.obstacles)
+    limits = emulator.constraints
+    constrained = limits.energy or limits.rest_speed or limits.density_cap
+    constrained = constrained or (limits.solids and emulator.scene.obstacles)
     if emulator.training and (constrained or emulator.recipe.grid_noise):
         warnings.warn(
             "The emulator is in training mode, in which rollouts obey none of its constraints but the bounds, and the"

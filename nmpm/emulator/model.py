@@ -42,6 +42,8 @@ NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": tor
 _LOG = logging.getLogger(__name__)
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
+COMPILED = "processor._orig_mod."
+"""Prefix of weights in a network that `torch.compile` has wrapped, instead of "processor."."""
 
 
 class Emulator(nn.Module):
@@ -90,7 +92,7 @@ class Emulator(nn.Module):
 
     @property
     def scene(self) -> Scene:
-        """The facts of the scenes."""
+        """What the scenes have in common."""
         return self.recipe.scene
 
     @property
@@ -110,12 +112,12 @@ class Emulator(nn.Module):
 
     @property
     def constraints(self) -> Constraints:
-        """Facts that rollouts are held to."""
+        """Physical limits enforced in rollouts."""
         return self.recipe.constraints
 
     @property
     def device(self) -> torch.device:
-        """Where weights and statistics are."""
+        """Device of weights and statistics."""
         return self.input_mean.device
 
     @property
@@ -171,27 +173,23 @@ class Emulator(nn.Module):
         return other
 
     def with_constraints(self, constraints: Constraints) -> Emulator:
-        """This emulator with its rollouts held to other facts; weights and statistics are shared, not copied."""
+        """This emulator with other constraints; weights and statistics are shared, not copied."""
+        return self._with_recipe(dataclasses.replace(self.recipe, constraints=constraints))
+
+    def _with_recipe(self, recipe: EmulatorRecipe) -> Emulator:
         other = copy.copy(self)
-        other.recipe = dataclasses.replace(self.recipe, constraints=constraints)
-        other._plan = make_plan(other.recipe)
+        other.recipe, other.grid, other._plan = recipe, recipe.grid, make_plan(recipe)
         return other
 
     def with_grid_moved(self, shift: Sequence[float]) -> Emulator:
-        """This emulator with its grid moved by `shift` (D,), in domain length, over the same scenes.
-
-        Weights and statistics are shared, not copied.
+        """This emulator with its grid moved by `shift` (D,), in domain length; weights and statistics are shared.
 
         Raises:
             ConfigError: if the grid would no longer cover the scene's bounds.
         """
-        other = copy.copy(self)
-        other.recipe = dataclasses.replace(self.recipe, scene=self.scene.with_domain_moved(shift))
-        other.grid = other.recipe.grid
-        other._plan = make_plan(other.recipe)
+        other = self._with_recipe(dataclasses.replace(self.recipe, scene=self.scene.with_domain_moved(shift)))
         bounds, walls = other.grid.bounds_in_cells(other.scene), wall_fraction(other.scene, other.grid)
-        own = {"bounds": bounds.to(self.bounds), "walls": walls.to(self.walls)}
-        other._buffers = {**self._buffers, **own}
+        other._buffers = {**self._buffers, "bounds": bounds.to(self.bounds), "walls": walls.to(self.walls)}
         return other
 
     def unconstrained(self) -> Emulator:
@@ -216,13 +214,13 @@ class Emulator(nn.Module):
         if other.network_precision != self.network_precision:
             other.processor.to(self.network_precision)
         other.load_state_dict(self.state_dict())
-        for weight, own in zip(other.parameters(), self.parameters(), strict=True):
-            weight.requires_grad_(own.requires_grad)
+        for weight, original in zip(other.parameters(), self.parameters(), strict=True):
+            weight.requires_grad_(original.requires_grad)
         other.runtime = copy.deepcopy(self.runtime)
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
-        """What stays the same through a rollout from this state: solids and, if constrained, its energy.
+        """The context of a rollout from this state: solids and, if constrained, its energy.
 
         Warns:
             UserWarning: naming each field that the state lacks.
@@ -251,6 +249,14 @@ class Emulator(nn.Module):
         clipped = torch.maximum(torch.minimum(state, self.input_high), self.input_low)
         return (clipped - self.input_mean) / self.input_std
 
+    def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
+        return (
+            self.grid.to_cells(particles.position, self.precision),
+            self.grid.to_cell_displacement(particles.velocity, self.precision),
+            self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
+        )
+
     def forward(self, particles: Particles, context: RolloutContext | None = None) -> Bundle:
         """Predict the next m frames.
 
@@ -277,18 +283,6 @@ class Emulator(nn.Module):
                 state_dict[prefix + COMPILED + name.removeprefix(f"{prefix}processor.")] = state_dict.pop(name)
         super()._load_from_state_dict(state_dict, prefix, *options)
 
-    def in_cells(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in grid units."""
-        return (
-            self.grid.to_cells(particles.position, self.precision),
-            self.grid.to_cell_displacement(particles.velocity, self.precision),
-            self.grid.to_cell_displacement(particles.gravity, self.precision).unsqueeze(1),
-        )
-
-
-COMPILED = "processor._orig_mod."
-"""How names of weights begin in a network that `torch.compile` has wrapped, instead of "processor."."""
-
 
 def _with_plain_names(_module: nn.Module, state: dict[str, Any], prefix: str, _local: object) -> None:
     """Save a network that is wrapped by `torch.compile` as the plain one."""
@@ -297,11 +291,7 @@ def _with_plain_names(_module: nn.Module, state: dict[str, Any], prefix: str, _l
 
 
 def compile_network(network: GridProcessor, grid: Tensor) -> bool:
-    """Compile a network in place; names and weights stay, and so do its checkpoints.
-
-    Args:
-        network: What to compile.
-        grid: (B, C_in, *S), an example of the input, to try it with.
+    """Compile a network in place, so that names of weights stay, and try it on a grid state (B, C_in, *S).
 
     Returns:
         Whether it is compiled. Without a compiler, or if the network cannot be traced, it stays as it was.

@@ -120,12 +120,7 @@ class Monitor:
         self._reference = _Reference(begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share)
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
-        """Measure a bundle.
-
-        Args:
-            emulator: Predicted it.
-            particles: The state that it started from.
-            bundle: Its frames.
+        """Measure a bundle that the emulator predicted from a state.
 
         Raises:
             RolloutStoppedError: under the policy "stop", if a limit is passed.
@@ -161,14 +156,14 @@ class Monitor:
         if self._padded:
             moving = moving.masked_fill(~particles.mask.unsqueeze(-1), 0.0)
         # A NaN position makes the last velocity NaN, and with it the largest, so checking that suffices.
-        held = (bundle.position[:, -1] == particles.position).all(-1) & particles.mask
-        found = {_RESTING: (held.sum(1) / particles.mask.sum(1).clamp(min=1)).to(bundle.velocity)}
-        found |= {"speed": moving.abs().amax((1, 2)) / min(emulator.grid.spacing)}
+        resting = (bundle.position[:, -1] == particles.position).all(-1) & particles.mask
+        measures = {_RESTING: (resting.sum(1) / particles.mask.sum(1).clamp(min=1)).to(bundle.velocity)}
+        measures |= {"speed": moving.abs().amax((1, 2)) / min(emulator.grid.spacing)}
         if self._reference is not None:
             last, fall = bundle.position[:, -1], particles.gravity.unsqueeze(1)
             now = energy(last, bundle.velocity, fall, self._reference.share)
-            found["energy"] = (now - self._reference.energy) / self._reference.above_lowest
-        return found
+            measures["energy"] = (now - self._reference.energy) / self._reference.above_lowest
+        return measures
 
     def _crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> dict[str, Tensor]:
         """(B,) measures of positions (B, N, D) by name."""
@@ -179,12 +174,12 @@ class Monitor:
             for column, (low, high), wraps in zip(last.unbind(-1), scene.bounds, scene.periodic, strict=True)
         ]
         at_walls = torch.stack(sides).any(0) & particles.mask
-        found = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}
+        measures = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}
         if self.crowding is None:
             first, count = scene.input_channels.index(f"{scene.materials[0]}.volume"), len(scene.materials)
             limit = emulator.input_high[first : first + count].amax()
-            found[_CROWDING_LIMIT] = limit.to(last).expand(len(last))
-        return found
+            measures[_CROWDING_LIMIT] = limit.to(last).expand(len(last))
+        return measures
 
     def _judge(self, frame: int, measures: Mapping[str, Tensor]) -> None:
         """Take in the (B,) measures of the bundle that ends with a frame, on the CPU."""
@@ -218,5 +213,5 @@ class Monitor:
         """What was seen, in a sentence or two."""
         seen = ", ".join(f"{what} {value:.3g}" for what, value in self.peaks.items() if what != "not finite")
         passed = "; ".join(map(str, self.incidents)) or "none"
-        found = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"
-        return f"{self._frames} frames; most: {seen}; {found}. Limits passed: {passed}."
+        still = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"
+        return f"{self._frames} frames; most: {seen}; {still}. Limits passed: {passed}."

@@ -50,7 +50,7 @@ def unroll(
                 monitor.read()
         yield travelled
         after = periods.wrap(bundle.state_after(particles))
-        calls.let_sleep(particles, after)
+        calls.leave_out_resting(particles, after)
         particles = after
 
 
@@ -63,45 +63,42 @@ class _Calls:
     """
 
     def __init__(self, emulator: Emulator, particles: Particles) -> None:
-        self._context = self._own = emulator.context(particles)
         self._emulator, self._count = emulator, len(particles.position)
-        self._awake, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
+        self._context = self._moving_context = emulator.context(particles)
+        self._moving, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
 
     def predict(self, particles: Particles) -> Bundle:
         """The next bundle of all scenes."""
-        if len(self._awake) == self._count:
-            self._last = self._emulator(particles, self._own)
-        elif self._awake:
-            moving = self._emulator(particles.scenes(self._awake), self._own)
+        if len(self._moving) == self._count:
+            self._last = self._emulator(particles, self._moving_context)
+        elif self._moving:
+            moving = self._emulator(particles.scenes(self._moving), self._moving_context)
             fields = {name: self._put(values, moving.fields[name]) for name, values in self._last.fields.items()}
             position = self._put(self._last.position, moving.position)
             self._last = Bundle(position, self._put(self._last.velocity, moving.velocity), fields)
         return self._last
 
     def _put(self, values: Tensor, moving: Tensor) -> Tensor:
-        """Values (B, …) with those of the scenes that are awake replaced."""
+        """Values (B, …) with those of the scenes that move replaced."""
         values = values.clone()
-        values[self._awake] = moving
+        values[self._moving] = moving
         return values
 
-    def let_sleep(self, before: Particles, after: Particles) -> None:
-        """Leave scenes out of further calls that the last one left as they were, to the bit.
-
-        All or none where another number of scenes would be compiled anew.
-        """
+    def leave_out_resting(self, before: Particles, after: Particles) -> None:
+        """Stop predicting scenes whose state no longer changes; all or none where a smaller batch would be compiled."""
         if self._emulator.training or not is_eager_cpu(after.position) or after.position.requires_grad:
             return
-        awake = [scene for scene in self._awake if not _is_same_state(before, after, scene)]
-        if len(awake) == len(self._awake) or (awake and self._emulator.shapes_are_compiled):
+        moving = [scene for scene in self._moving if not _is_same_state(before, after, scene)]
+        if len(moving) == len(self._moving) or (moving and self._emulator.shapes_are_compiled):
             return
-        self._awake, self._own = awake, self._context.scenes(awake)
+        self._moving, self._moving_context = moving, self._context.scenes(moving)
 
 
 def _is_same_state(before: Particles, after: Particles, scene: int) -> bool:
     """Whether a scene has the same motion and fields in two states, to the bit."""
-    pairs = [(before.velocity, after.velocity), (before.position, after.position)]
     if any(name not in before.fields for name in after.fields):
         return False
+    pairs = [(before.velocity, after.velocity), (before.position, after.position)]
     pairs += [(before.fields[name], values) for name, values in after.fields.items()]
     return all(torch.equal(one[scene], other[scene]) for one, other in pairs)
 
@@ -136,14 +133,7 @@ class Rollout(NamedTuple):
 
 
 def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Iterator[Tensor]:
-    """Predict `frames` frames without gradients, yielding each bundle's positions as it is made.
-
-    Yields:
-        (B, <= m, N, D) positions in domain length; the last bundle is cut to the frames asked for.
-
-    Raises:
-        As `stream_rollout`.
-    """
+    """Yield the positions (B, <= m, N, D) of `stream_rollout`."""
     for part in stream_rollout(emulator, particles, frames, monitor):
         yield part.position
 
@@ -180,28 +170,12 @@ def stream_rollout(
 
 
 def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Tensor:
-    """Predict `frames` frames without gradients.
-
-    Returns:
-        (B, frames, N, D) positions in domain length.
-
-    Raises:
-        As `predict_rollout`.
-    """
+    """(B, frames, N, D) positions in domain length, predicted without gradients; raises as `stream_rollout`."""
     return predict_rollout(emulator, particles, frames, monitor).position
 
 
 def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Rollout:
-    """Predict `frames` frames of positions and evolving fields without gradients.
-
-    Raises:
-        ConfigError: if `frames` is negative, or no whole number.
-        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
-        RolloutStoppedError: if the monitor stops the rollout.
-
-    Warns:
-        UserWarning: if the emulator is in training mode, in which constraints do not act.
-    """
+    """Predict `frames` frames of positions and evolving fields without gradients; raises as `stream_rollout`."""
     batch, *rest = particles.position.shape
     parts = list(stream_rollout(emulator, particles, frames, monitor)) if batch else []
     if parts:

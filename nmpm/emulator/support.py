@@ -31,14 +31,9 @@ MAX_DROP = 0.5
 
 
 def drops(gravity: Tensor, frames: int) -> Tensor:
-    """What a particle falls from rest until each frame of a bundle.
+    """(B, m, 1, D): what a particle falls from rest until each frame of a bundle, at most `MAX_DROP` long.
 
-    Args:
-        gravity: (B, 1, D), what a frame adds to a velocity.
-        frames: m.
-
-    Returns:
-        (B, m, 1, D), at most `MAX_DROP` long.
+    Gravity (B, 1, D) is what a frame adds to a velocity.
     """
     count = torch.arange(1, frames + 1, device=gravity.device, dtype=gravity.dtype).view(-1, 1, 1)
     longest = frames * (frames + 1) / 2 * gravity.norm(dim=-1, keepdim=True)
@@ -48,11 +43,11 @@ def drops(gravity: Tensor, frames: int) -> Tensor:
 
 def floor_rows(scene: Scene, grid: Grid) -> tuple[tuple[int, int], ...]:
     """For each axis, how many rows of cells at its lower and at its upper end are at least half beyond the bounds."""
-    found = []
+    rows = []
     for (low, high), first, width, extent in zip(scene.bounds, grid.lower, grid.spacing, grid.shape, strict=True):
         beyond = (low - first) / width, extent - (high - first) / width
-        found.append((max(0, math.floor(beyond[0] + 0.5)), max(0, math.floor(beyond[1] + 0.5))))
-    return tuple(found)
+        rows.append((max(0, math.floor(beyond[0] + 0.5)), max(0, math.floor(beyond[1] + 0.5))))
+    return tuple(rows)
 
 
 @dataclass(frozen=True)
@@ -72,15 +67,7 @@ class Support:
     grid: Grid
 
     def holds(self, cells: Tensor, gravity: Tensor) -> Tensor:
-        """Whether the cells of particles are supported.
-
-        Args:
-            cells: (B, N, D) positions.
-            gravity: (B, 1, D).
-
-        Returns:
-            (B, N) bool.
-        """
+        """(B, N) bool: whether the cells of particles (B, N, D) are supported against gravity (B, 1, D)."""
         node = torch.zeros_like(cells[..., 0], dtype=torch.long)
         for place, extent, wraps in zip(cells.unbind(-1), self.grid.shape, self.grid.periodic, strict=True):
             row = place.nan_to_num(0.0, 0.0, 0.0).floor().long()

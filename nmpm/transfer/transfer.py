@@ -56,46 +56,35 @@ class Transfer(ABC):
         return summed.transpose(1, 2).reshape(summed.shape[0], -1, *grid.shape)
 
     def momentum(self, velocity: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-        """Momentum and number of particles of each material on the nodes, each particle of mass 1.
+        """Momentum (B, M D, *S) and number (B, M, *S) of each material's particles on the nodes, as `sums`."""
+        return self.sums(velocity, membership, cells, grid)
+
+    def sums(self, values: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Sums of values over the particles of each material, and their numbers, on the nodes.
 
         Args:
-            velocity: (B, N, D).
+            values: (B, N, V).
             membership: (B, N, M), one at a particle's material and zero elsewhere; all zero for padding.
             cells: (B, N, D).
             grid: The grid.
 
         Returns:
-            (B, M D, *S) momentum, all axes of a material together, and (B, M, *S) numbers.
-        """
-        return self.sums(velocity, membership, cells, grid)
-
-    def sums(self, values: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-        """Sums of any values (B, N, V), and the number of particles, of each material on the nodes, as `momentum`.
-
-        Returns:
             (B, M V, *S) sums, all values of a material together, and (B, M, *S) numbers.
         """
-        own = (membership.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
-        sums = self.p2g(torch.cat([own, membership], dim=-1), cells, grid)
-        summed, count = sums.split([own.shape[-1], membership.shape[-1]], dim=1)
+        by_material = (membership.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
+        sums = self.p2g(torch.cat([by_material, membership], dim=-1), cells, grid)
+        summed, count = sums.split([by_material.shape[-1], membership.shape[-1]], dim=1)
         return summed, count
 
     def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Interpolate a grid field (B, C, *S) at `cells` (B, N, D), (B, N, C)."""
-        return gather(self.gather_stencil(cells, grid), field.flatten(2).transpose(1, 2))
+        rows, parts = field.flatten(2).transpose(1, 2), chunks(cells.shape[1], cells.device)
+        gathered = [gather(self.gather_stencil(cells[:, chunk], grid), rows) for chunk in parts]
+        return torch.cat(gathered, dim=1) if len(gathered) > 1 else gathered[0]
 
 
 def scatter(stencil: Stencil, values: Tensor, size: int) -> Tensor:
-    """Sum particle values onto nodes.
-
-    Args:
-        stencil: Of N particles and J nodes each.
-        values: (B, N, C).
-        size: Number of nodes.
-
-    Returns:
-        (B, size, C): sum_p w_pj v_p.
-    """
+    """Sum particle values (B, N, C) onto `size` nodes, (B, size, C): sum_p w_pj v_p."""
     batch, count, channels = values.shape
     touches = stencil.node.shape[-1]
     source = (stencil.weight.unsqueeze(-1) * values.unsqueeze(2)).reshape(batch, count * touches, channels)
@@ -103,15 +92,7 @@ def scatter(stencil: Stencil, values: Tensor, size: int) -> Tensor:
 
 
 def gather(stencil: Stencil, field: Tensor) -> Tensor:
-    """Interpolate a node field at particles.
-
-    Args:
-        stencil: Of N particles and J nodes each.
-        field: (B, size, C).
-
-    Returns:
-        (B, N, C): sum_j w_pj f_j.
-    """
+    """Interpolate a node field (B, size, C) at particles, (B, N, C): sum_j w_pj f_j."""
     batch, count, touches = stencil.node.shape
     channels = field.shape[-1]
     index = stencil.node.reshape(batch, count * touches, 1).expand(-1, -1, channels)

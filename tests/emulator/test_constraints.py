@@ -164,17 +164,6 @@ def test_a_scene_does_not_feel_the_energy_of_others():
         torch.testing.assert_close(together[own], alone, rtol=0, atol=1e-6)
 
 
-def test_chunks_of_particles_share_one_energy(monkeypatch):
-    scene = box()
-    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
-    emulator.output_scale.mul_(3.0)
-    monkeypatch.setattr("nmpm.emulator.prediction.kernels_take", lambda *_: False)
-    whole = rollout(emulator, particles, 12)
-    in_sevens = lambda count, device, values=1: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
-    monkeypatch.setattr("nmpm.emulator.advection.chunks", in_sevens)
-    torch.testing.assert_close(rollout(emulator, particles, 12), whole, rtol=0, atol=1e-6)
-
-
 def test_gradients_through_the_energy_limit_are_finite(monkeypatch):
     scene = box()
     limited_everywhere(monkeypatch)

@@ -256,11 +256,7 @@ class TestBounds:
         particles.position[:, 20:] = -3.0
         assert rollout(emulator.eval(), particles, 4).shape[1] == 4
 
-    def test_error_is_raised_once_per_bundle_for_real_particles_at_their_own_place(self, monkeypatch):
-        """Chunks of particles do not change the index that is named."""
-        monkeypatch.setattr(
-            "nmpm.emulator.advection.chunks", lambda count, *_: [slice(i, i + 7) for i in range(0, count, 7)]
-        )
+    def test_error_is_raised_once_per_bundle_for_real_particles_at_their_own_place(self):
         scene = box()
         parts = {"processor": Pointwise(hidden=(4,)), "decoder": Flip(), "constraints": Constraints(bounds="error")}
         emulator = EmulatorRecipe(scene, 16, 4, **parts).build()
