@@ -20,7 +20,7 @@ from timing import make_parser
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.digests import short_digest
-from nmpm.evaluation.trade.choice import OTHER_SCENES
+from nmpm.evaluation.trade.models import OTHER_SCENES
 from nmpm.zoo import Zoo
 
 PAGE = Path(__file__).parent / "trade_tables.md"
@@ -113,7 +113,7 @@ def section_lines(choices: Sequence[Choice]) -> Iterator[str]:
     yield (
         f"{first['scenes']} test scenes, {first['particles']} particles (median); {first['hardware']}, "
         f"{first['threads']} thread, {first['clock']}.\n"
-        f"[Picture](trade/{first['dataset']}/trade.png), [page](trade/{first['dataset']}/trade.html).\n"
+        f"[Picture](trade/{first['dataset']}/trade.png).\n"
     )
     if weights := weights_line(choices):
         yield f"{weights}\n"

@@ -6,12 +6,13 @@ python benchmarks/trades.py --steps dambreak2d waterdrop-xl
 
 Each step writes its output to OUT/STEP.log. Run the same command again to continue: steps that have succeeded are
 skipped, and `nmpm trade` and the training measure only what is missing. OUT/NAME then has the trade.csv, trade.png and
-trade.html of `benchmarks/trade/NAME`; stored points in OUT/NAME/points of an earlier run are used. Errors do not depend
+trade.md of `benchmarks/trade/NAME`; stored points in OUT/NAME/points of an earlier run are used. Errors do not depend
 on other load, times do: leave the machine alone.
 """
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -50,7 +51,7 @@ class Step:
 def list_steps(out: Path) -> dict[str, Step]:
     """The steps in order, by name."""
     graph = ("benchmarks/gns.py", "goop", "--minutes", *MINUTES, "--out", str(out / "gns"))
-    graphs = tuple(str(out / "gns" / f"minutes-{minutes}") for minutes in ROLLED_OUT)
+    graphs = tuple(f"gns:load:{out / 'gns' / f'minutes-{minutes}.pt'}" for minutes in ROLLED_OUT)
     return {
         "gns": Step((sys.executable, *graph), 22),
         "goop": _trade("goop", out, 25, graphs),
@@ -61,8 +62,9 @@ def list_steps(out: Path) -> dict[str, Step]:
     }
 
 
-def _trade(name: str, out: Path, minutes: int, others: tuple[str, ...] = ()) -> Step:
-    words = ("trade", name, "--config", f"benchmarks/trade/{name}.yaml", "--models", *MODELS[name], *others)
+def _trade(name: str, out: Path, minutes: int, predictors: tuple[str, ...] = ()) -> Step:
+    words = ("trade", name, "--config", f"benchmarks/trade/{name}.yaml", "--models", *MODELS[name])
+    words += ("--predictors", *predictors) if predictors else ()
     return Step((sys.executable, "-m", "nmpm", *words, "--out", str(out / name)), minutes)
 
 
@@ -79,6 +81,8 @@ def main() -> None:
         for name, step in steps.items():
             sys.stdout.write(f"{name}, about {step.minutes} min: {shlex.join(step.words)}\n")
         return
+    folders = (str(Path(__file__).parent), os.environ.get("PYTHONPATH", ""))  # `nmpm trade` imports gns.py
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, folders))
     failed = run_steps({name: list(step.words) for name, step in steps.items()}, chosen.out.resolve())
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}")

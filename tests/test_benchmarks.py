@@ -22,12 +22,14 @@ from scenes import cloud
 from nmpm.data import catalog
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.generate import generate
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import Recording
 from nmpm.emulator import EmulatorRecipe, rollout
-from nmpm.errors import ConfigError
-from nmpm.evaluation.gns import read_graph
+from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.trade import Kind, Scenes, make_choices, read_sweep
 from nmpm.particles import Window
 from nmpm.processors import Identity, UNet
+from nmpm.scene import Scene
 from nmpm.sim import load_preset
 from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo
@@ -529,12 +531,73 @@ def test_a_graph_network_is_trained_and_written_at_the_times_asked_for(tmp_path,
     monkeypatch.setattr(catalog, "ensure", lambda *_: tmp_path / "data")
     words = ("goop", "--minutes", "0.0005", "0.001", "--trajectories", "1", "--width", "4", "--out", str(tmp_path))
     text = run_script("gns", *words)
-    first, last = (read_graph(tmp_path / f"minutes-{minutes}") for minutes in ("0.0005", "0.001"))
-    assert (first.minutes, last.minutes) == (0.0005, 0.001)
-    assert first.steps <= last.steps
-    assert last.curve[: len(first.curve)] == first.curve
+    import gns
+
+    predictor = gns.load(preset.scene, str(tmp_path / "minutes-0.001.pt"))
+    assert "0.001 min of training" in predictor.name
+    assert gns.converged([(2.0, 0.402), (4.0, 0.4)])
+    assert not gns.converged([(2.0, 0.5), (4.0, 0.4)])
+    assert not gns.converged([(4.0, 0.4)])  # nobody knows
+    state = cloud(preset.scene)
+    assert predictor(state, 2).shape == (*state.position.shape[:1], 2, *state.position.shape[1:])
+    with pytest.raises(ConfigError, match="other scenes: dt differ"):
+        gns.load(dataclasses.replace(preset.scene, dt=1.0), str(tmp_path / "minutes-0.0005.pt"))
     assert text.count("loss") == 24
     assert run_script("gns", *words) == ""  # it goes on from the end
+
+
+FREE = Scene(
+    bounds=((-100.0, 100.0),) * 2, domain=((-101.0, 101.0),) * 2, dt=0.1, materials=("water",), particle_volume=1e-2
+)  # fmt: skip
+
+
+def test_graph_networks_have_all_near_pairs_and_do_not_depend_on_place_and_order():
+    from graph_network import GraphSimulator, Neighbours, radius_graph
+
+    generator = torch.Generator().manual_seed(0)
+    position = torch.rand(40, 2, generator=generator)
+    near = (torch.cdist(position.double(), position.double()) <= 0.2) & ~torch.eye(40, dtype=torch.bool)
+    linked = torch.zeros_like(near)
+    linked[tuple(radius_graph(position, 0.2))] = True
+    assert torch.equal(linked, near)
+    with pytest.raises(DataError, match="collapsed"):
+        radius_graph(torch.zeros(300, 2), 0.5)
+    simulator = GraphSimulator(FREE, width=16, steps=3).eval()
+    history = position.unsqueeze(1) + 0.02 * torch.rand(40, 6, 2, generator=generator)
+    around = Neighbours(torch.zeros(40, dtype=torch.int64), torch.zeros(0, 2), torch.zeros(2))
+    order, shift = torch.randperm(40, generator=generator), torch.tensor([0.5, -0.25])  # far from all walls
+    expected = simulator.advance(history, around)
+    torch.testing.assert_close(simulator.advance(history[order], around), expected[order], atol=1e-5, rtol=0)
+    torch.testing.assert_close(simulator.advance(history + shift, around), expected + shift, atol=1e-5, rtol=0)
+
+
+def test_a_graph_network_overfits_free_fall_and_its_training_goes_on_as_if_uninterrupted():
+    import gns
+    from graph_network import GraphSimulator
+
+    start, time = torch.cartesian_prod(*[0.1 * torch.arange(3.0)] * 2), torch.arange(30).view(-1, 1, 1)
+    path = start - torch.tensor([0.0, 5e-4]) * time**2 + torch.tensor([0.01, 0.0]) * time
+    recording = Recording(path, torch.zeros(9, dtype=torch.int64), torch.zeros(0, 2), torch.zeros(2))
+
+    def trainer():
+        torch.manual_seed(0)
+        steps = iter(range(10**6))  # a clock that counts, whatever the machine's speed
+        settings = gns.Training(seconds=150, noise=0.0, rate=3e-3)
+        return gns.GraphTrainer(GraphSimulator(FREE, width=16, steps=2), [recording], settings, lambda: next(steps))
+
+    whole, first, second = trainer(), trainer(), trainer()
+    while not whole.done:
+        whole.step()
+    for _ in range(3):
+        first.step()
+    second.load_state_dict(first.state_dict())
+    while not second.done:
+        second.step()
+    for name, values in whole.simulator.state_dict().items():
+        assert torch.equal(second.simulator.state_dict()[name], values), name
+    predicted = whole.simulator.rollout(collate([recording], FREE, 2).initial, 20)[0]
+    error, distance = predicted - path[2:22], path[2:22] - path[1]
+    assert float(error.abs().max()) < 0.05 * float(distance.abs().max())
 
 
 def test_all_trades_are_commands_that_their_programs_understand(tmp_path):

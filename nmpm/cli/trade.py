@@ -1,9 +1,8 @@
-"""`nmpm trade DATASET`."""
+"""`nmpm trade DATASET`, and the parts that `nmpm compare` shares with it."""
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +13,6 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.emulator import Emulator
-    from nmpm.evaluation.gns import TrainedGraph
-    from nmpm.evaluation.trade import Choice, Point, Scenes, Sweep
 
 DESCRIPTION = """Measure the trade between speed and accuracy: time and errors of emulators, of the simulator with fewer
 substeps and on coarser grids, and of trivial predictors, on the same test scenes and machine. Answers what to run for
@@ -25,14 +22,14 @@ _EXAMPLES = """\
 examples:
   nmpm trade goop                               the zoo's models of goop beside its simulator
   nmpm trade goop --models goop runs/a runs/b   models of your own beside it
-  nmpm trade goop --models goop runs/gns/minutes-10
-                                                a particle-graph network, see benchmarks/gns.py
+  nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) returns it
   nmpm trade FOLDER --models runs/mine          recorded data in native layout: without a simulator
   nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
   nmpm trade goop --config sweep.yaml
 
-It writes to the folder of --out: trade.csv (one row for each choice and error), trade.png, trade.html (an interactive
-page, self-contained), and points/, which holds every measurement: the same command goes on after an interruption, and
+It writes to the folder of --out: trade.csv (one row for each choice and error), trade.md (the table), trade.json (all
+figures of every scene), trade.png (error against time), errors.png (error against frames), frames.png (the first
+scene, side by side), and points/, which holds every measurement: the same command goes on after an interruption, and
 measures only what is new. Times of one CPU thread are CPU time, and all choices take turns; other load on the machine
 still slows networks more than the simulator, so measure on an idle one. Delete points/times-* to time everything anew.
 """
@@ -42,81 +39,87 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["trade", "goop"]."""
     chosen = _parser().parse_args(words[1:])
     if chosen.print_config:
-        from nmpm.evaluation.trade import default_sweep_text
+        from nmpm.evaluation.trade import shipped_sweep_text
 
-        sys.stdout.write(default_sweep_text())
+        sys.stdout.write(shipped_sweep_text("trade"))
         return
-    _check(chosen)
-    out = chosen.out or Path("trade") / Path(chosen.dataset).name
-    check_folder("--out", out)
-    from nmpm._support.devices import find_device
-    from nmpm.evaluation.trade import find_scenes, make_choices
-
-    sweep = _sweep(chosen)
-    scenes = find_scenes(chosen.dataset, sweep.scenes)
-    graphs = _graph_folders(chosen.models or [])
-    models = _models(None if chosen.models is None else [n for n in chosen.models if n not in graphs], scenes)
-    choices = make_choices(sweep, scenes, models, find_device(chosen.device), graphs)
-    if not choices:
-        raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
-    points = _measure(choices, scenes, sweep, out, chosen.keep_predictions)
-    _report(points, scenes, out)
+    if chosen.dataset is None:
+        raise ConfigError("name a dataset, such as goop, or the folder of one; see nmpm trade --help.")
+    if chosen.config is not None:
+        check_input("--config", chosen.config)
+    measure_and_report("trade", chosen, chosen.dataset)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="nmpm trade",
-        description=DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
+        prog="nmpm trade", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
     )
     parser.add_argument("dataset", nargs="?", help="an embedded dataset (goop, …), or a folder in native layout")
+    parser.add_argument("--models", nargs="*", metavar="MODEL", help=f"{MODEL} (default: the zoo's of this dataset)")
     parser.add_argument(
-        "--models",
-        nargs="*",
-        metavar="MODEL",
-        help=f"{MODEL}, or a graph simulator's folder (default: the zoo's of this dataset)",
-    )
-    parser.add_argument("--scenes", type=int, help="number of test scenes (default: the sweep's, 20)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: trade/DATASET)")
+        "--predictors", nargs="*", default=[], metavar="MODULE:FACTORY[:ARGUMENT]",
+        help="predictors of other packages: the module is imported, and its code runs",
+    )  # fmt: skip
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML of what is measured, see --print_config")
     parser.add_argument("--print_config", action="store_true", help="print the shipped sweep, and stop")
-    parser.add_argument("--keep-predictions", action="store_true", help="store all predictions, for other errors later")
-    add_device_option(parser)
+    add_scene_options(parser, "trade", scenes=20)
     return parser
 
 
-def _check(chosen: argparse.Namespace) -> None:
-    """Check the arguments before anything is loaded."""
-    if chosen.dataset is None:
-        raise ConfigError("name a dataset, such as goop, or the folder of one; see nmpm trade --help.")
+def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int) -> None:
+    """Add the options that both commands have."""
+    parser.add_argument("--scenes", type=int, help=f"number of test scenes (default: {scenes})")
+    parser.add_argument(
+        "--wider", type=int, metavar="TIMES", help="simulate scenes of a domain so many times as wide, with more blocks"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help=f"folder to write to (default: {command}/DATASET)")
+    add_device_option(parser)
+
+
+def measure_and_report(command: str, chosen: argparse.Namespace, dataset: str) -> None:
+    """Measure the sweep of a command on a dataset, print the table, and write the report."""
     check_at_least("--scenes", chosen.scenes, 1)
-    if chosen.config is not None:
-        check_input("--config", chosen.config)
+    check_at_least("--wider", chosen.wider, 2)
     check_device(chosen.device)
+    wider = f"-{chosen.wider}-times-as-wide" if chosen.wider else ""
+    out = chosen.out or Path(command) / f"{Path(dataset).name}{wider}"
+    check_folder("--out", out)
+    from rich.console import Console
 
-
-def _sweep(chosen: argparse.Namespace) -> Sweep:
     from nmpm._support.bounded_files import read_text
-    from nmpm.evaluation.trade import default_sweep_text, read_sweep
+    from nmpm._support.devices import find_device
+    from nmpm._support.progress import progress_bar
+    from nmpm.evaluation import trade
+    from nmpm.evaluation.trade.report import likely_points, report_lines, summary_table, write_report
 
     if chosen.config is None:
-        sweep = read_sweep(default_sweep_text(), "the shipped sweep")
+        sweep = trade.read_sweep(trade.shipped_sweep_text(command), f"the sweep of nmpm {command}")
     else:
-        sweep = read_sweep(read_text(chosen.config), str(chosen.config))
-    if chosen.scenes is None:
-        return sweep
-    fitting = tuple(batch for batch in sweep.models.batch if batch <= chosen.scenes)
-    models = dataclasses.replace(sweep.models, batch=fitting or (1,))
-    return dataclasses.replace(sweep, scenes=chosen.scenes, models=models)
+        sweep = trade.read_sweep(read_text(chosen.config), str(chosen.config))
+    sweep = sweep if chosen.scenes is None else sweep.with_scenes(chosen.scenes)
+    models = _models_of(Path(dataset).name) if chosen.models is None else _load_models(chosen.models)
+    if chosen.wider:
+        scenes = trade.find_wider_scenes(dataset, sweep.scenes, chosen.wider)
+    else:
+        scenes = trade.find_scenes(dataset, sweep.scenes)
+    choices = trade.make_choices(sweep, scenes, models, find_device(chosen.device), chosen.predictors)
+    if not choices:
+        raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
+    with progress_bar(command, trade.count_steps(choices, scenes, sweep)) as step:
+        points = trade.measure(choices, scenes, sweep, trade.Store(out), step)
+    console = Console()
+    shown = likely_points(points) if command == "trade" else points
+    console.print(summary_table(shown, points, scenes))
+    for line in report_lines(points):
+        console.print(line, highlight=False, soft_wrap=True)
+    paths = write_report(out, command, points, scenes)
+    sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
 
 
-def _models(names: list[str] | None, scenes: Scenes) -> dict[str, Emulator]:
-    """Models by name; those of the zoo that were trained on the dataset if none are named."""
+def _load_models(names: list[str]) -> dict[str, Emulator]:
+    """Emulators by name; those of runs and entries by the folder's name where that is unique."""
     from nmpm.zoo import load_model
 
-    if names is None:
-        return _models_of(scenes.name)
     short = {name: Path(name).name if Path(name).is_dir() else name for name in names}
     unique = len(set(short.values())) == len(short)
     return {short[name] if unique else name: load_model(name).emulator for name in names}
@@ -128,40 +131,11 @@ def _models_of(dataset: str) -> dict[str, Emulator]:
     from nmpm.zoo import Zoo, load_model
     from nmpm.zoo.card import preset_of
 
-    found = {}
+    models = {}
     for name in Zoo.list():
         try:
             if preset_of(Zoo.card(name)) == dataset:
-                found[name] = load_model(name).emulator
+                models[name] = load_model(name).emulator
         except ZooError as error:
             sys.stderr.write(f"left out: {error}\n")
-    return found
-
-
-def _graph_folders(names: list[str]) -> dict[str, TrainedGraph]:
-    """Those of the models that are folders of graph simulators, by name."""
-    from nmpm.evaluation.gns import is_graph_folder, read_graph
-
-    return {name: read_graph(Path(name)) for name in names if is_graph_folder(Path(name))}
-
-
-def _measure(choices: list[Choice], scenes: Scenes, sweep: Sweep, out: Path, keep: bool) -> list[Point]:
-    from nmpm._support.progress import progress_bar
-    from nmpm.evaluation.trade import Store, count_steps, measure
-
-    with progress_bar("trade", count_steps(choices, scenes, sweep)) as step:
-        return measure(choices, scenes, sweep, Store(out, keep), step)
-
-
-def _report(points: list[Point], scenes: Scenes, out: Path) -> None:
-    from rich.console import Console
-
-    from nmpm.evaluation.trade.report import advice_lines, write_report
-    from nmpm.evaluation.trade.table import failure_lines, pareto_table
-
-    console = Console()
-    console.print(pareto_table(points, scenes))
-    for line in (*advice_lines(points), *failure_lines(points)):
-        console.print(line, highlight=False, soft_wrap=True)
-    paths = write_report(out, points, scenes)
-    sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
+    return models

@@ -1,17 +1,52 @@
-"""An emulator's rollout errors beside those of the trivial predictors."""
+"""An emulator's rollout errors beside those of trivial predictors: it shows skill where its error is below theirs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor, nn
 
 from nmpm.errors import ConfigError
-from nmpm.evaluation.baselines import free_fall, still
 from nmpm.evaluation.figures import PREDICTORS
 from nmpm.metrics import MSE, FieldMSE, RolloutMetric
-from nmpm.particles import Window
+from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
+
+
+def still(particles: Particles, frames: int) -> Tensor:
+    """Positions (B, frames, N, D) if nothing moves."""
+    return particles.position.unsqueeze(1).expand(-1, frames, -1, -1)
+
+
+def free_fall(scene: Scene, particles: Particles, frames: int) -> Tensor:
+    """Every particle flies alone under the scene's gravity and stops at the walls: (B, frames, N, D) positions.
+
+    Frames are equal steps, v_i = v_0 + i g and x_i = x_{i-1} + v_i, as the data's velocities are differences. A
+    component that reaches a bound stays there.
+    """
+    step = torch.arange(1, frames + 1, device=particles.position.device).view(1, -1, 1, 1)
+    start, velocity = particles.position.unsqueeze(1), particles.velocity.unsqueeze(1)
+    gravity = particles.gravity[:, None, None]
+    path = start + velocity * step + gravity * (step * (step + 1) / 2)
+    columns = [
+        path[..., axis] if scene.periodic[axis] else _stop_at_walls(path[..., axis], *scene.bounds[axis])
+        for axis in range(scene.dim)
+    ]
+    return torch.stack(columns, dim=-1)
+
+
+def _stop_at_walls(path: Tensor, low: float, high: float) -> Tensor:
+    """A path (B, T, N) held at the first bound it reaches; at the lower one if it reaches both at once."""
+    frames = torch.arange(path.shape[1], device=path.device).view(1, -1, 1)
+    below, above = _first_frame_where(path <= low, frames), _first_frame_where(path >= high, frames)
+    bound = torch.where(below <= above, torch.full_like(path[:, :1], low), high)
+    return torch.where(frames >= torch.minimum(below, above), bound, path)
+
+
+def _first_frame_where(condition: Tensor, frames: Tensor) -> Tensor:
+    """(B, 1, N): the first of the frames (1, T, 1) at which the condition (B, T, N) holds; T where it never does."""
+    return torch.where(condition, frames, condition.shape[1]).amin(1, keepdim=True)
 
 
 class Comparison(nn.Module):
@@ -41,7 +76,10 @@ class Comparison(nn.Module):
     @property
     def errors(self) -> Mapping[str, MSE]:
         """The squared errors of each of `PREDICTORS`."""
-        return {kind: next(metric for metric in own if isinstance(metric, MSE)) for kind, own in self._by_predictor()}
+        return {
+            kind: next(metric for metric in metrics if isinstance(metric, MSE))
+            for kind, metrics in self._by_predictor()
+        }
 
     @property
     def of_model(self) -> list[RolloutMetric]:
@@ -63,15 +101,15 @@ class Comparison(nn.Module):
             "still": still(window.initial, frames),
             "free_fall": free_fall(self.scene, window.initial, frames),
         }
-        for kind, own in self._by_predictor():
-            for metric in own:
+        for kind, metrics in self._by_predictor():
+            for metric in metrics:
                 metric.update(window, rollouts[kind])
 
     def reset(self) -> None:
         """Forget everything added."""
         self.field_errors.reset()
-        for _, own in self._by_predictor():
-            for metric in own:
+        for _, metrics in self._by_predictor():
+            for metric in metrics:
                 metric.reset()
 
     def compute(self) -> dict[str, Tensor]:
@@ -81,10 +119,10 @@ class Comparison(nn.Module):
         """
         return self.field_errors.compute() | {
             name if kind == "model" else f"{kind}/{name}": value
-            for kind, own in self._by_predictor()
-            for metric in own
+            for kind, metrics in self._by_predictor()
+            for metric in metrics
             for name, value in metric.compute().items()
         }
 
     def _by_predictor(self) -> list[tuple[str, list[RolloutMetric]]]:
-        return [(kind, list(own)) for kind, own in self.metrics.items()]  # type: ignore[call-overload]  # (a ModuleList)
+        return [(kind, list(metrics)) for kind, metrics in self.metrics.items()]  # type: ignore[call-overload]  # (a ModuleList)

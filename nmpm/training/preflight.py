@@ -34,8 +34,7 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.errors import ConfigError, NmpmError
-from nmpm.evaluation.baselines import still
-from nmpm.evaluation.comparison import Comparison
+from nmpm.evaluation.comparison import Comparison, still
 
 if TYPE_CHECKING:
     from nmpm.training.module import EmulatorModule

@@ -1,35 +1,28 @@
-from types import SimpleNamespace
-
 import pytest
 
 from nmpm.cli import main
-from nmpm.cli.trade import _models
-from nmpm.evaluation.trade import default_sweep_text
+from nmpm.cli.trade import _models_of
+from nmpm.evaluation.trade import shipped_sweep_text
 from nmpm.zoo import load_model
-from tests.evaluation.trade.made_up import SWEEP, tiny_scenes
+from tests.evaluation.trade.made_up import SWEEP, tiny_emulator, tiny_scenes
 
 
 def test_the_shipped_sweep_is_printed(capsys):
     assert main(["trade", "--print_config"]) == 0
-    assert capsys.readouterr().out == default_sweep_text()
-
-
-def test_help_teaches(capsys):
-    with pytest.raises(SystemExit):
-        main(["trade", "--help"])
-    out = " ".join(capsys.readouterr().out.split())
-    for word in ("runs/a", "--print_config", "goes on after an interruption", "trade.html"):
-        assert word in out
+    assert capsys.readouterr().out == shipped_sweep_text("trade")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["trade"], "name a dataset"),
-        (["trade", "nothing"], "nothing is neither a folder nor an embedded dataset: dambreak2d"),
+        (["trade", "nothing", "--models"], "nothing is neither a folder nor an embedded dataset: dambreak2d"),
         (["trade", "goop", "--scenes", "0"], "--scenes 0: it must be at least 1"),
         (["trade", "goop", "--config", "nothing.yaml"], "there is no such file"),
-        (["trade", "goop", "--device", "abacus"], "--device abacus"),
+        (["compare", "goop", "--data", "goop", "--wider", "1"], "--wider 1: it must be at least 2"),
+        (["compare", "goop", "--data", "nothing", "--wider", "2"], "nothing cannot be widened"),
+        (["compare", "nothing", "--data", "goop"], "The zoo holds no model 'nothing'"),
+        (["compare", "goop", "--data", "goop", "--device", "abacus"], "--device abacus"),
     ],
 )
 def test_mistakes_are_named(words, message, capsys):
@@ -46,7 +39,7 @@ def test_models_are_those_of_the_dataset_and_damaged_ones_are_left_out(tmp_path,
     (tmp_path / "zoo" / "broken" / "card.yaml").write_text("{")
     loaded = []
     monkeypatch.setattr("nmpm.zoo.load_model", lambda name: loaded.append(name) or load_model(name))
-    assert sorted(_models(None, SimpleNamespace(name="goop"))) == ["goop", "goop/fast"]
+    assert sorted(_models_of("goop")) == ["goop", "goop/fast"]
     assert sorted(loaded) == ["bad", "goop", "goop/fast"]
     left_out = capsys.readouterr().err.splitlines()
     assert [line.partition(": ")[0] for line in left_out] == ["left out", "left out"]
@@ -54,12 +47,29 @@ def test_models_are_those_of_the_dataset_and_damaged_ones_are_left_out(tmp_path,
     assert "broken/card.yaml" in left_out[1]
 
 
-def test_a_folder_is_measured_and_the_report_written(tmp_path, capsys):
+def test_a_folder_is_measured_with_a_predictor_of_another_package_and_the_report_written(tmp_path, capsys):
     tiny_scenes(tmp_path / "tiny")
     (tmp_path / "sweep.yaml").write_text(SWEEP)
     words = ["trade", str(tmp_path / "tiny"), "--models", "--config", str(tmp_path / "sweep.yaml")]
+    words += ["--predictors", "tests.evaluation.trade.made_up:Shifted:0.25"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
-    shown = capsys.readouterr()
-    assert "the Pareto set in time and MSE of the full rollout" in shown.out
-    assert "it made these data" in shown.out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"points", "trade.csv", "trade.png", "trade.html"}
+    shown = capsys.readouterr().out
+    assert "tiny: 2 test scenes" in shown
+    assert "shifted by 0.25: unstable in 2 scenes" in shown
+    assert "it made these data" in shown
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"points", "trade.csv", "trade.json", "trade.md", "trade.png", "errors.png", "frames.png"}
+
+
+def test_models_are_compared(tmp_path, capsys, monkeypatch):
+    scenes = tiny_scenes(tmp_path / "tiny")
+    model = type("Loaded", (), {"emulator": tiny_emulator(scenes.scene)})
+    monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
+    words = ["compare", "carried", "--data", str(tmp_path / "tiny"), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: SWEEP)
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    for name in ("carried", "nothing moves", "free fall", "twin: 3 of 6"):
+        assert name in out
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"points", "compare.csv", "compare.json", "errors.png", "frames.png"} < written

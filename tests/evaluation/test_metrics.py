@@ -3,7 +3,7 @@ import torch
 from scenes import box, cloud
 from scipy.optimize import linear_sum_assignment
 
-from nmpm.evaluation.baselines import free_fall, still
+from nmpm.evaluation.comparison import free_fall, still
 from nmpm.grid import Grid
 from nmpm.metrics import MSE, EarthMover, earth_mover, overall_error
 from nmpm.particles import Window

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.evaluation.shape import measure_shape
+from nmpm.evaluation.prediction_errors import measure_shape
 from nmpm.grid import Grid
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.emulator.rollouts import stream
-from nmpm.evaluation.shape import Shape, measure_shape
+from nmpm.evaluation.prediction_errors import Shape, measure_shape
 from nmpm.evaluation.stress.model import ModelUnderTest, simulate_beside, simulate_window
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, filled_volume, trace_rollout

@@ -3,52 +3,64 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
 
 import torch
 
-from nmpm._support.digests import weights_digest
+from nmpm._support.digests import short_digest, weights_digest
+from nmpm._support.messages import counted
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator, rollout
 from nmpm.errors import ConfigError
-from nmpm.evaluation.trade.choice import CPU, Choice, Kind, Rollout
+from nmpm.evaluation.trade.choices import Choice, Kind, Rollout
 from nmpm.evaluation.trade.scenes import Scenes
 
-CONSTRAINTS: Mapping[str, Callable[[Emulator], Emulator]] = MappingProxyType(
-    {"held": lambda emulator: emulator, "free": Emulator.unconstrained}
-)
-"""With the model's own constraints, or without them, by name."""
+OTHER_SCENES = " (of other scenes)"
+"""Ends the name of a model that was trained on other scenes, in the settings."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class ModelSettings:
+    """Settings of every model; all combinations of them are measured.
+
+    Args:
+        precision: Precisions of the network.
+        constraints: "held", with the model's constraints, and "free", without them.
+        cells: Factors on the number of grid cells along each axis, relative to training.
+        runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
+        batch: Batch sizes, in scenes.
+        threads: Numbers of torch's threads.
+    """
+
+    precision: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
+    constraints: tuple[Literal["held", "free"], ...] = ("held", "free")
+    cells: tuple[float, ...] = (1.0,)
+    runtime: tuple[str, ...] = ("eager",)
+    batch: tuple[int, ...] = (1, 8)
+    threads: tuple[int, ...] = (1,)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ModelChoice(Choice):
     """A trained emulator.
 
     Args:
-        name: Unique among the choices.
-        emulator: In evaluation mode.
-        settings: What was chosen.
-        batch, threads, device: See `Choice`.
+        emulator: In evaluation mode, on the choice's device.
     """
 
-    name: str
     emulator: Emulator
-    settings: Mapping[str, str | int | float]
-    batch: int = 1
-    threads: int = 1
-    device: torch.device = CPU
-    kind: Kind = field(default=Kind.MODEL, init=False)
+    kind: Kind = Kind.MODEL
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        runtime = self.emulator.runtime.name
         return {
             "recipe": self.emulator.recipe.to_dict(),
             "weights": weights_digest(self.emulator.state_dict()),
             "device": self.device.type,
-        } | ({"runtime": runtime} if runtime != "eager" else {})  # (stored measurements of before are eager's)
+            "runtime": self.emulator.runtime.name,
+        }
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         state = scenes.window(indices, 0).to(self.device).initial
@@ -58,52 +70,62 @@ class ModelChoice(Choice):
         return -(-frames // self.emulator.frames) * self.emulator.frames  # whole bundles
 
 
-def over_scenes(name: str, emulator: Emulator, scenes: Scenes) -> Emulator:
-    """The emulator itself, or rebuilt for these scenes if it was trained on others, see `EmulatorRecipe.over`.
+def model_choices(
+    settings: ModelSettings, name: str, emulator: Emulator, scenes: Scenes, device: torch.device
+) -> Iterator[Choice]:
+    """All forms of a model, rebuilt for these scenes if it was trained on others, see `EmulatorRecipe.over`.
+
+    Args:
+        settings: Of the forms; the first of each kind is not part of a form's name.
+        name: Of the model.
+        emulator: On the CPU.
+        scenes: What is predicted.
+        device: Where the forms compute.
 
     Raises:
-        ConfigError: if it cannot take the scenes, naming it and the reason.
+        ConfigError: if the model cannot take the scenes, naming it and the reason; if there is no such runtime.
     """
-    if not emulator.scene.differences(scenes.scene):
-        return emulator
-    try:
-        return emulator.over(scenes.scene)
-    except ConfigError as error:
-        raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
+    differing = emulator.scene.differences(scenes.scene)
+    facts = {"model": name + OTHER_SCENES * bool(differing), "weights": short_digest(emulator.state_dict())}
+    if differing:
+        facts["scenes_differ_in"] = ", ".join(differing)
+        try:
+            emulator = emulator.over(scenes.scene)
+        except ConfigError as error:
+            raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
+    forms = product(settings.precision, settings.constraints, settings.cells, settings.runtime)
+    for precision, constraints, cells, runtime in forms:
+        form = emulator.with_network(NETWORK_PRECISIONS[precision])
+        form = form if constraints == "held" else form.unconstrained()
+        form = _with_cells(form, cells).to(device).with_runtime(runtime)
+        for batch, threads in product(settings.batch, settings.threads):
+            parts = {
+                precision: precision != settings.precision[0],
+                constraints: constraints != settings.constraints[0],
+                f"{cells:g} × cells": cells != 1,
+                runtime: runtime != settings.runtime[0],
+                f"batch {batch}": batch != 1,
+                counted(threads, "thread"): threads != settings.threads[0],
+            }
+            yield ModelChoice(
+                name=", ".join([facts["model"], *(part for part, shown in parts.items() if shown)]),
+                emulator=form,
+                settings={
+                    **facts,
+                    "precision": precision,
+                    "constraints": constraints,
+                    "cells": "×".join(map(str, form.grid.shape)),
+                    "runtime": runtime,
+                },
+                batch=batch,
+                threads=threads,
+                device=device,
+            )
 
 
-def with_precision(emulator: Emulator, name: str) -> Emulator:
-    """The emulator with its network in a precision of `NETWORK_PRECISIONS`.
-
-    Raises:
-        ConfigError: if there is no such precision, or the network cannot have it.
-    """
-    return emulator.with_network(_find("precision", name, NETWORK_PRECISIONS))
-
-
-def with_constraints(emulator: Emulator, name: str) -> Emulator:
-    """The emulator in a form of `CONSTRAINTS`.
-
-    Raises:
-        ConfigError: if there is no such form.
-    """
-    form: Emulator = _find("constraints", name, CONSTRAINTS)(emulator)
-    return form
-
-
-def with_cells(emulator: Emulator, factor: float) -> Emulator:
-    """The same weights on a grid of `factor` times as many cells along each axis.
-
-    Raises:
-        ConfigError: if the processor cannot take the grid.
-    """
+def _with_cells(emulator: Emulator, factor: float) -> Emulator:
+    """The same weights on a grid of `factor` times as many cells along each axis."""
     cells = tuple(max(1, round(factor * n)) for n in emulator.grid.shape)
     if cells == emulator.grid.shape:
         return emulator
     return emulator.rebuilt(dataclasses.replace(emulator.recipe, cells=cells))
-
-
-def _find(what: str, name: str, known: Mapping[str, Any]) -> Any:
-    if name not in known:
-        raise ConfigError(f"models.{what}: {name!r} is not one of {', '.join(known)}.")
-    return known[name]

@@ -1,45 +1,256 @@
-"""The report of a sweep: CSV, picture, page, and sentences."""
+"""The report of a sweep: CSV, JSON, a table for people, sentences, and pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+import json
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
 
 from nmpm._support.atomic import atomic_write
-from nmpm.evaluation.trade.chart import draw_chart
-from nmpm.evaluation.trade.frontier import Comparison, advise, compare_with_simulator
-from nmpm.evaluation.trade.page import page_text
-from nmpm.evaluation.trade.points import Point, measure_names
+from nmpm.evaluation.bootstrap import interval
+from nmpm.evaluation.figures import Unit
+from nmpm.evaluation.trade.charts import draw_chart, draw_curves, draw_frames
+from nmpm.evaluation.trade.choices import Kind
+from nmpm.evaluation.trade.ranking import Point, beside_simulator, measure_names, rank, recommend
 from nmpm.evaluation.trade.scenes import Scenes
-from nmpm.evaluation.trade.table import csv_text
+
+SETTINGS = ("model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
+"""Columns of what was chosen; empty where it does not apply."""
+
+COLUMNS = (
+    "dataset", "scenes", "particles", "kind", "name", *SETTINGS, "batch", "threads", "device", "hardware", "clock",
+    "ms_per_frame", "ms_lower_quartile", "ms_upper_quartile", "ratio_to_reference", "ms_per_second",
+    "frames_per_second", "memory_mb", "stable", "failed_scenes", "failure",
+    "error", "value", "low", "high", "pareto", "pareto_probability",
+)  # fmt: skip
+"""Columns of `csv_text`: one row for each point and error."""
+
+_NAME = 12  # least width of the names in a terminal
+_LIKELY = 0.05  # probability from which on a point may be in the Pareto set
 
 
-def write_report(folder: Path, points: Sequence[Point], scenes: Scenes) -> list[Path]:
-    """Write trade.csv, trade.png and trade.html into a folder, which is made if it is missing."""
+def write_report(folder: Path, name: str, points: Sequence[Point], scenes: Scenes) -> list[Path]:
+    """Write all files of the report into a folder, which is made if it is missing.
+
+    These are NAME.csv, one row for each point and error; NAME.json, all figures of every scene; NAME.md, the table of
+    all points and the sentences; NAME.png, time and error; errors.png and frames.png, see `charts.py`. Pictures are
+    left out where nothing is stable, and frames.png of scenes in one dimension.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"trade.{suffix}" for suffix in ("csv", "png", "html")]
-    with atomic_write(paths[0]) as part:
-        part.write_text(csv_text(points, scenes), encoding="utf-8")
-    if not measure_names(points):
-        return paths[:1]
-    draw_chart(paths[1], points, scenes)
-    with atomic_write(paths[2]) as part:
-        part.write_text(page_text(points, scenes), encoding="utf-8")
+    plain = json.dumps(describe(points, scenes), indent=1, ensure_ascii=False) + "\n"
+    texts = {"csv": csv_text(points, scenes), "json": plain, "md": markdown_text(name, points, scenes)}
+    for suffix, text in texts.items():
+        with atomic_write(folder / f"{name}.{suffix}") as part:
+            part.write_text(text, encoding="utf-8")
+    paths = [folder / f"{name}.{suffix}" for suffix in texts]
+    if measure_names(points):
+        pictures = {f"{name}.png": draw_chart, "errors.png": draw_curves}
+        pictures |= {"frames.png": draw_frames} if scenes.scene.dim > 1 else {}
+        for file, draw in pictures.items():
+            draw(folder / file, points, scenes)
+        paths += [folder / file for file in pictures]
     return paths
 
 
-def advice_lines(points: Sequence[Point], measure: str = "mse") -> list[str]:
-    """What to run from which budget on, and the best emulator beside the simulator."""
-    lines = [f"from {step.milliseconds:.3g} ms per frame: {step.sentence}" for step in advise(points, measure)[1:]]
-    return lines + [_compared(one) for one in compare_with_simulator(points, measure)[:1]]
+def csv_text(points: Sequence[Point], scenes: Scenes) -> str:
+    """One row for each point and error, tidy; lengths in domain length, empty where a value is not known.
+
+    Points that failed in a scene have their errors' columns empty.
+    """
+    out = io.StringIO()
+    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    for measure in measure_names(points):
+        ranks = rank(points, measure)
+        for point in points:
+            row = _row(point, scenes) | {"error": measure}
+            if point.name in ranks:
+                one = ranks[point.name]
+                row |= {"value": one.mean, "low": one.low, "high": one.high}
+                if point.competes:
+                    row |= {"pareto": one.member, "pareto_probability": one.probability}
+            writer.writerow({name: _cell(value) for name, value in row.items()})
+    return out.getvalue()
 
 
-def _compared(one: Comparison) -> str:
-    as_fast, as_good = "no stable simulator setting is as fast", "none is as accurate"
-    if one.at_equal_time is not None:
-        name, ratio = one.at_equal_time
-        as_fast = f"{name} is no slower and has {ratio:.2g} × its error"
-    if one.at_equal_error is not None:
-        name, ratio = one.at_equal_error
-        as_good = f"{name} is no less accurate and takes {ratio:.2g} × its time"
-    return f"The most accurate emulator, {one.model}, beside the simulator: {as_fast}; {as_good}."
+def _row(point: Point, scenes: Scenes) -> dict[str, object]:
+    low, middle, high = point.quartiles
+    particles = sorted(recording.frames.shape[1] for recording in scenes.recordings)
+    memory = point.times.memory
+    return {
+        "dataset": scenes.name,
+        "scenes": len(scenes),
+        "particles": particles[len(particles) // 2],
+        "kind": point.kind.value,
+        "name": point.name,
+        **{name: point.settings.get(name, "") for name in SETTINGS},
+        "batch": point.batch,
+        "threads": point.threads,
+        "device": point.device,
+        "hardware": point.times.hardware,
+        "clock": point.times.clock,
+        "ms_per_frame": middle,
+        "ms_lower_quartile": low,
+        "ms_upper_quartile": high,
+        "ratio_to_reference": point.ratio,
+        "ms_per_second": middle / scenes.scene.dt,
+        "frames_per_second": 1e3 / middle if middle > 0 else math.nan,
+        "memory_mb": "" if memory is None else memory / 1e6,
+        "stable": point.stable,
+        "failed_scenes": len(point.failures),
+        "failure": next(iter(point.failures.values()), ""),
+    }
+
+
+def _cell(value: object) -> object:
+    """Floats with five digits, empty where they are not finite."""
+    if isinstance(value, float | np.floating):
+        return f"{value:.5g}" if math.isfinite(value) else ""
+    return value
+
+
+def describe(points: Sequence[Point], scenes: Scenes) -> dict[str, Any]:
+    """All figures as plain data; lengths in domain length, times in milliseconds; None where there is none."""
+    return {
+        "dataset": scenes.name,
+        "scenes": len(scenes),
+        "particles": [recording.frames.shape[1] for recording in scenes.recordings],
+        "frames": [scenes.frames(index) for index in range(len(scenes))],
+        "shown_frames": [index + 2 for index in scenes.shown_frames()],
+        "hardware": points[0].times.hardware,
+        "clock": points[0].times.clock,
+        "predictors": [_describe_point(point) for point in points],
+    }
+
+
+def _describe_point(point: Point) -> dict[str, Any]:
+    low, middle, high = map(_figure, point.quartiles)
+    return {
+        "name": point.name,
+        "kind": point.kind.value,
+        "settings": dict(point.settings),
+        "batch": point.batch,
+        "errors": {
+            name: {
+                "mean": _figure(point.mean(name)),
+                "interval": [_figure(value) for value in _interval(point, name)],
+                "scenes": [_figure(value) for value in values.tolist()],
+            }
+            for name, values in point.errors.items()
+        },
+        "ms_per_frame": {"median": middle, "quartiles": [low, high]},
+        "ratio_to_first": _figure(point.ratio),
+        "failures": {str(scene): reason for scene, reason in point.failures.items()},
+        "curve": [_figure(value) for value in point.curves.mean(0).tolist()],
+    }
+
+
+def _figure(value: float) -> float | None:
+    return float(f"{value:.5g}") if math.isfinite(value) else None
+
+
+def _interval(point: Point, name: str) -> tuple[float, float]:
+    """Bootstrap interval of 95% of an error's mean over scenes; NaN where one of them has no error."""
+    return interval(point.errors[name].tolist()) if math.isfinite(point.mean(name)) else (math.nan, math.nan)
+
+
+def likely_points(points: Sequence[Point], measure: str = "mse") -> list[Point]:
+    """The points in the Pareto set of time and an error, or likely to be, and the floors."""
+    ranks = rank(points, measure)
+    return [
+        point
+        for point in points
+        if point.name in ranks and (point.kind is Kind.FLOOR or ranks[point.name].probability >= _LIKELY)
+    ]
+
+
+def summary_table(shown: Sequence[Point], points: Sequence[Point], scenes: Scenes) -> Table:
+    """The table of some of the points for a terminal, see `_summary`."""
+    title, caption, headings, rows = _summary(shown, points, scenes)
+    table = Table(
+        title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0,
+        collapse_padding=True,
+    )  # fmt: skip
+    table.add_column(headings[0], min_width=_NAME)
+    for heading in headings[1:]:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def markdown_text(name: str, points: Sequence[Point], scenes: Scenes) -> str:
+    """The table of all points, the sentences and the picture `name`.png, as Markdown."""
+    title, caption, headings, rows = _summary(points, points, scenes)
+    lines = [" | ".join(cells) for cells in (headings, ["---", *["---:"] * (len(headings) - 1)], *rows)]
+    table = "\n".join(f"| {line} |" for line in lines)
+    sentences = "\n".join(f"- {line}" for line in report_lines(points))
+    return f"# {title}\n\n![Time and error]({name}.png)\n\n{table}\n\n{caption}\n\n{sentences}\n"
+
+
+def _summary(
+    shown: Sequence[Point], points: Sequence[Point], scenes: Scenes
+) -> tuple[str, str, list[str], list[list[str]]]:
+    """Title, caption, headings and rows; floors last, the others in order of their time."""
+    counts = sorted(recording.frames.shape[1] for recording in scenes.recordings)
+    particles = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    frames = max(scenes.frames(index) for index in range(len(scenes)))
+    horizons = [name for name in measure_names(points) if name.startswith("mse@") and name != f"mse@{frames}"]
+    ranks = rank(points, "mse")
+    unit = Unit.of([point.mean(name) for point in shown for name in (*horizons, "mse", "emd")])
+    heads = [name.replace("mse", "MSE") for name in horizons]
+    ordered = sorted(shown, key=lambda point: (point.kind is Kind.FLOOR, point.milliseconds))
+    rows = []
+    for point in ordered:
+        one, height = ranks.get(point.name), point.mean("height")
+        spread = f" ({_show(one.low, unit, 2)}–{_show(one.high, unit, 2)})" if one and one.low < one.high else ""
+        rows.append(
+            [
+                point.name + " *" * (one is not None and one.probability >= _LIKELY),
+                f"{point.milliseconds:.3g}" if math.isfinite(point.milliseconds) else "",
+                *(_show(point.mean(name), unit, 2) for name in horizons),
+                _show(point.mean("mse"), unit) + spread,
+                _show(point.mean("emd"), unit),
+                f"{height:.0%}" if math.isfinite(height) else "",
+            ]
+        )
+    return (
+        f"{scenes.name}: {len(scenes)} test scenes of {particles} particles",
+        f"MSE{unit} of frames 1 to h. EMD{unit}: earth mover's distance in the last frame. Height: deviation of the"
+        " particles' mean height in the last frame. ms: per frame, median. *: perhaps in the Pareto set.",
+        ["choice", "ms", *heads, f"MSE@{frames} (95%)", "EMD", "height"],
+        rows,
+    )
+
+
+def _show(value: float, unit: Unit, digits: int = 3) -> str:
+    if not math.isfinite(value):
+        return ""
+    return unit.show(value, digits if value == 0 or value >= 1e-3 * 10.0**unit.exponent else 1)
+
+
+def report_lines(points: Sequence[Point]) -> list[str]:
+    """What to run from which budget on, the best emulator beside the simulator, models of other scenes, failures."""
+    lines = [f"from {step.milliseconds:.3g} ms per frame: {step.sentence}" for step in recommend(points)]
+    return [*lines, *filter(None, [beside_simulator(points)]), *_origins(points), *_failures(points)]
+
+
+def _origins(points: Sequence[Point]) -> Iterator[str]:
+    origins = {str(p.settings["model"]): p.settings["scenes_differ_in"] for p in points if p.of_other_scenes}
+    for model, differing in origins.items():
+        yield f"{model}: what differs from those of its training: {differing}"
+
+
+def _failures(points: Sequence[Point]) -> Iterator[str]:
+    for point in points:
+        if not point.stable:
+            scene, reason = next(iter(point.failures.items()))
+            yield f"{point.name}: unstable in {len(point.failures)} scenes, first in scene {scene}: {reason}"

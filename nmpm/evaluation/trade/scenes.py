@@ -1,4 +1,4 @@
-"""The recorded scenes on which all choices are measured."""
+"""The recorded scenes on which all choices are measured: those of a folder, or of an embedded dataset by its name."""
 
 from __future__ import annotations
 
@@ -11,17 +11,23 @@ from pathlib import Path
 
 import torch
 
+from nmpm._support.messages import suggestion
+from nmpm.data.catalog import catalog, dataset_folder, describe, ensure, find_simulated
 from nmpm.data.format import Split, find_split, read_metadata
+from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.simulation_request import SimulationRequest
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Scene
-from nmpm.sim import Preset, preset_from_dict
+from nmpm.sim import Preset, load_preset, preset_from_dict
 
 MOVING = 0.02
 """A scene moves as long as its root mean square speed is at least this share of the largest one."""
+SHOWN = (0.1, 0.3, 1.0)
+"""Shares of the first scene at which pictures show it: a splash, its return, and how it settles."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +57,9 @@ class Scenes:
 
     def window(self, indices: Sequence[int], frames: int | None = None) -> Window:
         """Some scenes as one batch, with so many frames to predict; with all of the shortest when left out."""
-        chosen = [self.recordings[index] for index in indices]
-        length = min(len(recording.frames) for recording in chosen) if frames is None else frames + 2
-        return collate(chosen, self.scene, length)
+        recordings = [self.recordings[index] for index in indices]
+        length = min(len(recording.frames) for recording in recordings) if frames is None else frames + 2
+        return collate(recordings, self.scene, length)
 
     def moving_frames(self, index: int) -> int:
         """Predicted frames until the scene comes to rest, see `MOVING`; at least 1."""
@@ -62,10 +68,56 @@ class Scenes:
         moving = (speed >= MOVING * speed.max()).nonzero()
         return int(moving[-1]) + 1 if len(moving) else 1
 
+    def shown_frames(self) -> list[int]:
+        """Indices of the predicted frames of the first scene that pictures show."""
+        last = self.frames(0) - 1
+        return sorted({round(share * last) for share in SHOWN})
+
     @cached_property
     def digests(self) -> tuple[str, ...]:
         """SHA-256 of what predictions and errors of each scene depend on, in short: its facts and its recording."""
         return tuple(_digest(self.scene, recording) for recording in self.recordings)
+
+
+def find_scenes(dataset: str, count: int) -> Scenes:
+    """Test scenes of a dataset; of an embedded one that is missing, only these are simulated.
+
+    Args:
+        dataset: Name of an embedded dataset, or a folder in native layout.
+        count: Scenes at most; the dataset may have fewer.
+
+    Raises:
+        ConfigError: if there is no such dataset.
+        DataError: if its files are missing or wrong.
+    """
+    if dataset in catalog():
+        folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
+        return read_scenes(dataset, folder, count)
+    if not Path(dataset).is_dir():
+        raise ConfigError(
+            f"{dataset} is neither a folder nor an embedded dataset: {', '.join(catalog())}."
+            f"{suggestion(dataset, catalog())}"
+        )
+    return read_scenes(Path(dataset).name, Path(dataset), count)
+
+
+def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
+    """Scenes of an embedded dataset's simulator in a domain `times` as wide, with up to `times` as many particles.
+
+    Raises:
+        ConfigError: if the dataset is not an embedded one, as recorded scenes cannot be widened.
+    """
+    if dataset not in catalog():
+        raise ConfigError(
+            f"{dataset} cannot be widened: it is not an embedded dataset. There are {', '.join(catalog())}."
+        )
+    entry = describe(dataset)
+    preset = load_preset(entry.preset).widened(times)
+    request = SimulationRequest(preset, {"train": 0, "valid": 0, "test": count}, entry.seed)
+    name = f"{dataset}-{times}-times-as-wide"
+    folder = dataset_folder(name, request)
+    generate(preset, folder, request.counts, request.seed)
+    return read_scenes(name, folder, count)
 
 
 def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = None) -> Scenes:
@@ -89,9 +141,9 @@ def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = Non
     split = Split(find_split(folder, "test"))
     recordings = SplitRecordings(split, metadata, scene)
     recordings.require_frames(3, "an evaluation")
-    chosen = range(min(count, len(recordings)))
-    seeds = tuple(_seed(split, index) for index in chosen) if preset else ()
-    scenes = Scenes(name, scene, tuple(recordings[index] for index in chosen), preset, seeds)
+    indices = range(min(count, len(recordings)))
+    seeds = tuple(_seed(split, index) for index in indices) if preset else ()
+    scenes = Scenes(name, scene, tuple(recordings[index] for index in indices), preset, seeds)
     _check_start(scenes)
     return scenes
 
@@ -120,9 +172,9 @@ def _check_start(scenes: Scenes) -> None:
 
 def _digest(scene: Scene, recording: Recording) -> str:
     digest = hashlib.sha256(json.dumps(scene.to_dict(), sort_keys=True).encode())
-    own = {name: getattr(recording, name) for name in ("frames", "material", "obstacle", "gravity")}
-    fields = {f"field {name}": values for name, values in sorted(recording.fields.items())}
-    for name, values in (own | fields).items():
+    tensors = {name: getattr(recording, name) for name in ("frames", "material", "obstacle", "gravity")}
+    tensors |= {f"field {name}": values for name, values in sorted(recording.fields.items())}
+    for name, values in tensors.items():
         digest.update(f";{name} {values.dtype} {tuple(values.shape)};".encode())
         digest.update(values.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

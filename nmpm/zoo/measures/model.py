@@ -13,9 +13,9 @@ from torch import Tensor
 from nmpm._support.progress import progress_bar
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
+from nmpm.evaluation.prediction_errors import Measures, measure_errors
 from nmpm.evaluation.stress import GROUPS, QUICK, ModelUnderTest, TestResult, battery
 from nmpm.evaluation.stress.results import as_json
-from nmpm.evaluation.trade.errors import GAIN, Measures, measure_errors
 from nmpm.particles import Window
 from nmpm.sim import Preset, load_preset, preset_names
 from nmpm.viz import write_snapshots
@@ -48,7 +48,7 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     if worst is not None:
         title = f"{model.name}: the test scene with the largest error"
         write_snapshots(labelled_trajectories(model.scene, *worst, title), folder / WORST)
-    names = [name for name in rows[0] if name not in ("mse", GAIN) and all(name in row for row in rows)]
+    names = [name for name in rows[0] if name != "mse" and all(name in row for row in rows)]
     index = int(np.argmax([row["mse"] for row in rows]))
     means = {name: float(np.mean([row[name] for row in rows])) for name in names}
     quality: dict[str, Any] = {name: [mean, *interval([row[name] for row in rows])] for name, mean in means.items()}

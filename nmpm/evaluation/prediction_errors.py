@@ -1,0 +1,233 @@
+"""Errors of a predicted scene by name, its energy, and the shape of settled material.
+
+| name | what |
+|---|---|
+| mse@8, …, mse | squared position error up to a frame, and over all frames; length² |
+| field | share of each material that lies in another cell, of 3 particle spacings; mean over evenly spaced frames |
+| emd | earth mover's distance per material, mean over a few frames that are evenly spaced; length |
+| kinetic | mean absolute error of the kinetic energy, over its mean |
+| height | deviation of the mean height above the floor in the last frame, relative |
+| crowding | deviation of the particles per occupied cell in the last frame, relative |
+
+Position errors barely notice a liquid that slowly loses its volume; height and crowding do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nmpm.grid import Grid
+from nmpm.metrics import earth_mover_of_materials
+from nmpm.particles import Particles, Window
+from nmpm.scene import Scene
+from nmpm.transfer import Linear, Nearest
+
+REVISION = 4
+"""Increased whenever the same prediction gets other errors."""
+MOST_CROWDED = 0.05
+"""Share of the occupied cells that `Shape.peak_crowding` averages: the most crowded ones."""
+
+_MOST_GAIN = 0.05  # of the initial energy: a prediction that gains more is unstable
+_CELL = 3.0  # particle spacings: side of the cells in which particles are counted
+_FIELD_FRAMES = 50  # at which fields are compared
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is measured of a prediction.
+
+    Args:
+        horizons: Frames up to which the MSE is reported, beside the full rollout.
+        emd_frames: Evenly spaced frames at which the earth mover's distance is computed, the last among them; 0 for
+            none, as each takes half a second for 2,000 particles.
+        emd_particles: Particles of a material, drawn at random, that it matches; all when left out. Its cost grows with
+            their cube.
+    """
+
+    horizons: tuple[int, ...] = (8, 32, 100)
+    emd_frames: int = 1
+    emd_particles: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain data."""
+        return dataclasses.asdict(self) | {"horizons": list(self.horizons), "revision": REVISION}
+
+
+def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Measures) -> dict[str, float]:
+    """Errors of a prediction (1, T, N, D) of the only scene of a window; all positions are finite."""
+    moving = window.mask[0]
+    material = window.material[0, moving]
+    ours, theirs = predicted[0, :, moving].double(), window.target[0, :, moving].double()
+    curve = squared_errors(window, predicted)
+    errors = {f"mse@{h}": float(curve[:h].mean()) for h in measures.horizons if h <= len(curve)}
+    errors |= {"mse": float(curve.mean()), "field": field_error(scene, ours, theirs, material)}
+    if measures.emd_frames:
+        frames = _evenly_spaced(len(ours), measures.emd_frames)
+        errors["emd"] = earth_mover_of_materials(ours[frames], theirs[frames], material, measures.emd_particles)
+    errors["kinetic"] = _kinetic_error(scene, window, ours, theirs)
+    if bool((window.gravity != 0).any()):
+        grid, state = _counting_grid(scene), window.initial
+        last = (predicted[:, -1], window.target[:, -1])
+        shape, other = (measure_shape(scene, grid, state, into_domain(scene, position)) for position in last)
+        relative = shape.relative_to(other)
+        errors |= {name: abs(relative[name] - 1) for name in ("height", "crowding")}
+    return errors
+
+
+def squared_errors(window: Window, predicted: Tensor) -> Tensor:
+    """Mean over particles and dimensions of the squared position error of each frame, (T,), in length²."""
+    moving = window.mask[0]
+    return (predicted[0, :, moving].double() - window.target[0, :, moving].double()).square().mean((1, 2))
+
+
+def field_error(scene: Scene, ours: Tensor, theirs: Tensor, material: Tensor) -> float:
+    """Share of the material that another prediction has in other cells, from 0 (the same field) to 1 (none in common).
+
+    Σ |φ̂ − φ| / Σ (φ̂ + φ) over cells, with φ the linear volume fraction of each material. Unlike the position error it
+    does not ask which particle is where, so that particles of other sizes can be compared, and mixing costs nothing.
+
+    Args:
+        scene: Gives domain and particle spacing.
+        ours: (T, N, D) positions; those outside of the domain count as `into_domain` moves them.
+        theirs: (T, N, D) likewise.
+        material: (N,) index into the scene's materials.
+    """
+    frames = _evenly_spaced(len(ours), _FIELD_FRAMES)
+    grid, kinds = _counting_grid(scene), torch.nn.functional.one_hot(material, len(scene.materials)).to(ours.dtype)
+    values = kinds.expand(len(frames), -1, -1)
+    first, second = (
+        Linear().p2g(values, grid.to_cells(into_domain(scene, path[frames]), path.dtype), grid)
+        for path in (ours, theirs)
+    )
+    wrong = (first - second).abs().flatten(1).sum(1)
+    return float((wrong / (first + second).flatten(1).sum(1)).mean())
+
+
+def into_domain(scene: Scene, position: Tensor) -> Tensor:
+    """Positions (..., D) moved into the domain: by whole periods, and to the border at walls."""
+    columns = []
+    for along, (low, high), periodic in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True):
+        columns.append(low + (along - low).remainder(high - low) if periodic else along.clamp(low, high))
+    return torch.stack(columns, dim=-1)
+
+
+def _evenly_spaced(frames: int, count: int) -> NDArray[np.int64]:
+    """Indices of `count` frames, or of all where there are fewer; the last is among them."""
+    return np.unique(np.linspace(0, frames - 1, count + 1).round().astype(np.int64)[1:])
+
+
+def _counting_grid(scene: Scene) -> Grid:
+    longest = max(high - low for low, high in scene.domain)
+    return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
+
+
+def _kinetic_error(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> float:
+    kinetic, truth = (_energy(scene, *_path(window, positions))[0] for positions in (ours, theirs))
+    return float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))
+
+
+def _path(window: Window, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions (T + 2, N, D) from the window's first two frames on, materials and gravity of its moving particles."""
+    moving = window.mask[0]
+    start = window.frames[0, :2, moving].double()
+    return torch.cat([start, positions.double()]), window.material[0, moving], window.gravity[0].double()
+
+
+def recorded_energy_gain(scene: Scene, window: Window, predicted: Tensor) -> float:
+    """`energy_gain` of a prediction (1, T, N, D) of the only scene of a window, from its first two frames on."""
+    return energy_gain(scene, *_path(window, predicted[0, :, window.mask[0]]))
+
+
+def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> float:
+    """Most energy in a path beyond that between its first two frames, as a share of that; 0 where that has none.
+
+    Args:
+        scene: Gives bounds and densities.
+        path: (T, N, D) positions of all moving particles, which have the same volume.
+        material: (N,) index into the scene's materials.
+        gravity: (D,) in length per frame squared.
+    """
+    total = _energy(scene, path.double(), material, gravity.double())[1]
+    initial = float(total[0])
+    return float(total.max() / initial - 1) if initial > 0 else 0.0
+
+
+def instability(gain: float) -> str:
+    """Why a prediction that gains this share of the initial energy is unstable; empty if it is not."""
+    return f"gains {gain:.0%} of energy" if gain > _MOST_GAIN else ""
+
+
+def _energy(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
+    """Kinetic, and kinetic and potential energy per mass between frames, (T - 1,), of a path (T, N, D)."""
+    mass = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)[material]
+    share = mass / mass.sum()
+    steps = path.diff(dim=0)
+    kinetic = (steps.square().sum(-1) * share).sum(-1) / 2
+    middle = (path[1:] + path[:-1]) / 2
+    low, high = torch.tensor(scene.bounds, dtype=torch.float64).T
+    floor = torch.where(gravity < 0, low, high)
+    return kinetic, kinetic - (((middle - floor) @ gravity) * share).sum(-1)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How high settled material stands, how many cells it occupies and how crowded these are, of B scenes at one frame.
+
+    Args:
+        height: (B,) mean height of the particles above the lowest bound, against gravity, in domain length.
+        occupied: (B,) cells that hold a particle.
+        crowding: (B,) particles per occupied cell.
+        peak_crowding: (B,) particles per cell in the most crowded twentieth of the occupied cells.
+    """
+
+    height: Tensor
+    occupied: Tensor
+    crowding: Tensor
+    peak_crowding: Tensor
+
+    @classmethod
+    def concatenate(cls, shapes: Sequence[Shape]) -> Self:
+        """The scenes of several ones."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: torch.cat([getattr(shape, name) for shape in shapes]) for name in names})
+
+    def relative_to(self, other: Shape) -> dict[str, float]:
+        """Each measure, summed over scenes, over that of another shape, by name."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return {name: float(getattr(self, name).sum() / getattr(other, name).sum()) for name in names}
+
+
+def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) -> Shape:
+    """The shape of each scene.
+
+    Args:
+        scene: Gives the bounds.
+        grid: Whose cells are counted.
+        state: Gives gravity, which must not be zero, and which particles are real.
+        position: (B, N, D) in domain length, all finite.
+    """
+    mask = state.mask.unsqueeze(-1)
+    up = -torch.nn.functional.normalize(state.gravity, dim=-1)
+    low, high = position.new_tensor(scene.bounds).T
+    floor = torch.minimum(up * low, up * high).sum(-1)
+    heights = (position * up.unsqueeze(1)).sum(-1) - floor.unsqueeze(1)
+    real = state.mask.sum(1)
+    counts = Nearest().p2g(mask.to(position.dtype), grid.to_cells(position), grid).flatten(1)
+    occupied = (counts > 0).sum(1)
+    ranked = counts.sort(dim=1, descending=True).values
+    kept = (MOST_CROWDED * occupied).ceil().clamp(min=1)
+    first = torch.arange(ranked.shape[1], device=ranked.device) < kept.unsqueeze(1)
+    return Shape(
+        height=(heights * state.mask).sum(1) / real,
+        occupied=occupied.to(position.dtype),
+        crowding=real / occupied,
+        peak_crowding=(ranked * first).sum(1) / kept,
+    )

@@ -1,0 +1,272 @@
+"""Choices: whatever predicts scenes in a comparison of time and error.
+
+Here are the interface, the simulator of the scenes, trivial predictors and those of other packages; `models.py` has the
+emulators.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from nmpm._support.messages import one_line
+from nmpm.errors import ConfigError, DataError
+from nmpm.evaluation.comparison import free_fall, still
+from nmpm.evaluation.prediction_errors import energy_gain
+from nmpm.evaluation.trade.scenes import Scenes
+from nmpm.particles import Particles
+from nmpm.scene import Scene
+from nmpm.sim import InitialState, Preset
+from nmpm.sim.predictability import nudge
+
+Rollout = Callable[[int], Tensor]
+"""From a number of frames to (B, frames, N, D) predicted positions, in domain length."""
+
+Settings = Mapping[str, str | int | float]
+
+CPU = torch.device("cpu")
+
+
+class Kind(StrEnum):
+    """The kind of a choice; floors, the simulator beside itself, are drawn and never recommended."""
+
+    MODEL = "model"
+    OTHER = "other"
+    SIMULATOR = "simulator"
+    TRIVIAL = "trivial"
+    FLOOR = "floor"
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One predicted scene.
+
+    Args:
+        position: (1, T, N, D) of the recorded particles, in domain length.
+        gain: Energy gain of the choice's particles where these are others than the recorded ones, see `energy_gain`.
+    """
+
+    position: Tensor
+    gain: float | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Choice(ABC):
+    """One way of predicting scenes, at one setting.
+
+    Args:
+        kind: Kind of predictor.
+        name: Unique among the choices that are compared.
+        settings: Its settings, by column of the table.
+        batch: Scenes predicted at once when it is timed; predictions do not depend on it.
+        threads: Threads of torch when it is timed.
+        device: Where it computes.
+    """
+
+    kind: Kind
+    name: str
+    settings: Settings = field(default_factory=dict)
+    batch: int = 1
+    threads: int = 1
+    device: torch.device = CPU
+
+    @property
+    @abstractmethod
+    def identity(self) -> Mapping[str, Any]:
+        """Plain data on which its predictions depend, beside the scenes: the key of stored measurements."""
+
+    @abstractmethod
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        """Load what the rollouts of some scenes start from, which is not timed.
+
+        Returns:
+            Predicts the frames after each scene's first two. It raises an NmpmError where it fails.
+        """
+
+    def computed_frames(self, frames: int) -> int:
+        """Frames that a rollout of so many frames computes: the time of a frame is its time over these."""
+        return frames
+
+    def predict(self, scenes: Scenes, index: int) -> Prediction:
+        """Predict all frames of one scene, which is not timed.
+
+        Raises:
+            NmpmError: if it fails; a DataError if positions are not finite.
+        """
+        return Prediction(require_finite(self.prepare(scenes, [index])(scenes.frames(index)).cpu().float()))
+
+
+def digest(plain: Any) -> str:
+    """A key of plain data: SHA-256 of its JSON, in short."""
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def require_finite(position: Tensor) -> Tensor:
+    """The positions (B, T, N, D).
+
+    Raises:
+        DataError: if any is not finite, naming the first such frame.
+    """
+    broken = (~position.isfinite()).flatten(2).any(-1).any(0)
+    if bool(broken.any()):
+        raise DataError(f"Positions are not finite from predicted frame {int(broken.nonzero()[0, 0]) + 1} on.")
+    return position
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulatorChoice(Choice):
+    """A simulator, from the initial state of each trajectory, of which frames 0 and 1 are left out.
+
+    Where its particles are others than the recorded ones (larger particles of SPH), a recorded particle moves like
+    the simulated one that was nearest to it initially. Errors are those of the recorded particles, the energy gain is
+    that of the simulated ones.
+
+    Args:
+        preset: Resolution and substeps; the initial states are drawn from it.
+        nudge: Standard deviation of Gaussian noise on the initial positions, as a share of the domain's longest side.
+    """
+
+    preset: Preset
+    nudge: float = 0.0
+    kind: Kind = Kind.SIMULATOR
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        # The number of frames of the preset's own trajectories does not matter.
+        return {"preset": self.preset.with_frames(1).to_dict(), "revision": self.preset.revision, "nudge": self.nudge}
+
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        (index,) = indices
+        start = self._draw(scenes, index)
+        follow = follow_nearest(scenes.recordings[index].frames[0], start.position)
+        return lambda frames: follow(self._simulate(start, frames))[2:].unsqueeze(0)
+
+    def computed_frames(self, frames: int) -> int:
+        return frames + 1  # from the initial state on, of which a rollout leaves out two frames
+
+    def predict(self, scenes: Scenes, index: int) -> Prediction:
+        if self.preset is scenes.preset and not self.nudge:
+            return Prediction(scenes.window([index]).target)  # it made them
+        start, recording = self._draw(scenes, index), scenes.recordings[index]
+        simulated = self._simulate(start, scenes.frames(index))
+        first = recording.frames[0]
+        position = require_finite(follow_nearest(first, start.position)(simulated)[2:].unsqueeze(0))
+        if first.shape == simulated[0].shape:
+            return Prediction(position)
+        counts = torch.tensor(start.counts or (len(start.position),))
+        material = torch.arange(len(counts)).repeat_interleave(counts)
+        path = require_finite(simulated.unsqueeze(0))[0]
+        return Prediction(position, energy_gain(self.preset.scene, path, material, recording.gravity))
+
+    def _draw(self, scenes: Scenes, index: int) -> InitialState:
+        start = self.preset.draw(scenes.seeds[index])
+        return nudge(self.preset, start, self.nudge, scenes.seeds[index]) if self.nudge else start
+
+    def _simulate(self, start: InitialState, frames: int) -> Tensor:
+        """(frames + 2, M, D): the initial state, the frame that every rollout starts from, and the predicted ones."""
+        return torch.from_numpy(self.preset.simulate_from(start, frames + 1).position[:, : len(start.position)])
+
+
+def follow_nearest(first: Tensor, start: NDArray[Any]) -> Callable[[Tensor], Tensor]:
+    """From simulated paths (T, M, D) to paths (T, N, D) of the recorded particles.
+
+    Args:
+        first: (N, D) initial positions of the recorded particles.
+        start: (M, D) those of the simulated ones: the same, or else a recorded particle moves like the nearest.
+    """
+    if first.shape == start.shape:
+        return lambda simulated: simulated
+    nearest = torch.from_numpy(cKDTree(start).query(first.numpy())[1])
+    return lambda simulated: first + (simulated - simulated[0])[:, nearest]
+
+
+class Predictor(Protocol):
+    """A predictor of another package; it computes on the CPU.
+
+    Attributes:
+        name: Unique among the choices. Measurements are stored by it: it must change when the predictions do.
+    """
+
+    name: str
+
+    def __call__(self, particles: Particles, frames: int) -> Tensor:
+        """Positions (B, frames, N, D) of the next frames, in domain length.
+
+        An NmpmError, or positions that are not finite, make it count as unstable.
+        """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PredictorChoice(Choice):
+    """A trivial predictor, or one of another package.
+
+    Args:
+        predictor: From particles and a number of frames to positions.
+    """
+
+    predictor: Callable[[Particles, int], Tensor]
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        return {self.kind.value: self.name}
+
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        state = scenes.window(indices, 0).initial
+        return lambda frames: _require_shape(self.name, self.predictor(state, frames), state, frames)
+
+
+def _require_shape(name: str, position: Tensor, state: Particles, frames: int) -> Tensor:
+    batch, count, dim = state.position.shape
+    if tuple(position.shape) != (batch, frames, count, dim):
+        raise DataError(f"{name} returns {tuple(position.shape)} positions, not {(batch, frames, count, dim)}.")
+    return position
+
+
+TRIVIAL: Mapping[str, Callable[[Scene], Callable[[Particles, int], Tensor]]] = MappingProxyType(
+    {
+        "nothing moves": lambda _: lambda state, frames: still(state, frames).contiguous(),
+        "free fall": lambda scene: lambda state, frames: free_fall(scene, state, frames),
+    }
+)
+"""Trivial predictors of a scene, by name."""
+
+
+def trivial_choice(name: str, scene: Scene) -> PredictorChoice:
+    """A predictor of `TRIVIAL`."""
+    return PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=TRIVIAL[name](scene))
+
+
+def imported_choice(path: str, scene: Scene) -> PredictorChoice:
+    """The predictor that a factory makes for a scene.
+
+    Args:
+        path: `module:factory`, called with the scene, or `module:factory:argument`, called with that text too. The
+            module is imported, and the code in it runs.
+        scene: Facts of the scenes.
+
+    Raises:
+        ConfigError: if there is no such factory, or it returns no `Predictor`.
+    """
+    module, _, rest = path.partition(":")
+    factory, *argument = rest.split(":", 1)
+    try:
+        make = getattr(import_module(module), factory)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"--predictors {path}: {one_line(error)}. Give module:factory[:argument].") from error
+    predictor = make(scene, *argument)
+    if not callable(predictor) or not isinstance(getattr(predictor, "name", None), str):
+        raise ConfigError(f"--predictors {path}: the factory should return a callable with a name.")
+    settings = {"model": predictor.name}
+    return PredictorChoice(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor)

@@ -1,0 +1,297 @@
+"""Points of the trade, the Pareto set in time and one error, and what to run for a budget.
+
+A point is in the Pareto set if no other is at least as fast and as accurate, and better in one of the two. Its
+probability is the share of resamples of the test scenes (with replacement, the same scenes for all points) in which it
+is; times stay.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import compress
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.evaluation.bootstrap import Floats, intervals, resampled_means
+from nmpm.evaluation.figures import Unit
+from nmpm.evaluation.trade.choices import Kind, Settings
+from nmpm.evaluation.trade.models import OTHER_SCENES
+
+MEASURES: Mapping[str, str] = MappingProxyType(
+    {
+        "mse": "MSE of the full rollout",
+        "field": "share of the material in another cell",
+        "emd": "earth mover's distance",
+        "kinetic": "kinetic energy, relative error",
+        "height": "settled height, relative error",
+        "crowding": "particles per cell, relative error",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Times:
+    """What was timed of a choice.
+
+    Args:
+        milliseconds: Per computed frame and scene, of each round, see `Choice.computed_frames`.
+        ratios: Of each round, over the reference's in the same round.
+        memory: Peak in bytes, None where it is not known.
+        clock: "CPU time" or "wall time".
+        hardware: Processor or GPU.
+    """
+
+    milliseconds: Sequence[float] = ()
+    ratios: Sequence[float] = ()
+    memory: float | None = None
+    clock: str = ""
+    hardware: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A measured choice.
+
+    Args:
+        kind: What it is.
+        name: Unique among the points.
+        settings: What was chosen, by name.
+        batch, threads, device: How it was timed.
+        times: Its times.
+        errors: (S,) of each scene by name; NaN where the prediction failed.
+        failures: Reasons for which scenes have no errors, or are unstable, by the scene's number.
+        curves: (S, T) squared error of each frame, in length²; NaN where the prediction failed.
+        frames: (F, N, D) positions of the first scene at the shown frames; None where that failed.
+    """
+
+    kind: Kind
+    name: str
+    settings: Settings
+    batch: int
+    threads: int
+    device: str
+    times: Times
+    errors: Mapping[str, Floats]
+    failures: Mapping[int, str]
+    curves: Floats
+    frames: Floats | None = None
+
+    @cached_property
+    def quartiles(self) -> tuple[float, float, float]:
+        """Milliseconds per frame and scene: lower quartile, median, upper quartile."""
+        return quartiles(self.times.milliseconds)
+
+    @property
+    def milliseconds(self) -> float:
+        """Median time per frame and scene."""
+        return self.quartiles[1]
+
+    @property
+    def ratio(self) -> float:
+        """Median over rounds of the time over the reference's."""
+        return quartiles(self.times.ratios)[1]
+
+    @property
+    def stable(self) -> bool:
+        """Whether no scene failed."""
+        return not self.failures
+
+    @property
+    def competes(self) -> bool:
+        """Whether a user can choose it: stable, timed, and no floor."""
+        return self.kind is not Kind.FLOOR and self.stable and math.isfinite(self.milliseconds)
+
+    def mean(self, measure: str) -> float:
+        """An error's mean over scenes; NaN where it was not measured or a scene failed."""
+        values = self.errors.get(measure)
+        return float(values.mean()) if values is not None and len(values) else math.nan
+
+    @property
+    def exact(self) -> bool:
+        """Whether it repeats the data: the simulator as it made them."""
+        return self.mean("mse") < 1e-14
+
+    @property
+    def of_other_scenes(self) -> bool:
+        """Whether it is a model that was trained on other scenes."""
+        return str(self.settings.get("model", "")).endswith(OTHER_SCENES)
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Lower quartile, median and upper quartile; NaN where there are no values."""
+    if len(values) < 2:
+        return (values[0],) * 3 if values else (float("nan"),) * 3
+    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
+    return low, middle, high
+
+
+def measure_names(points: Sequence[Point]) -> list[str]:
+    """Errors that all stable points have, in order: full MSE, MSE at horizons, the others."""
+    stable = [point for point in points if point.stable and point.errors]
+    if not stable:
+        return []
+    shared = [name for name in stable[0].errors if all(name in point.errors for point in stable)]
+    return sorted(shared, key=lambda name: (name != "mse", not name.startswith("mse@"), _horizon(name)))
+
+
+def _horizon(name: str) -> int:
+    return int(name.partition("@")[2] or 0)
+
+
+def describe_measure(name: str) -> str:
+    """An error in words."""
+    return MEASURES.get(name, f"MSE of the first {name.partition('@')[2]} frames")
+
+
+@dataclass(frozen=True)
+class Rank:
+    """A point's mean error with its interval, and its membership in the Pareto set.
+
+    Args:
+        mean: Over scenes.
+        low, high: Bootstrap interval of 95%.
+        member: Whether it is in the Pareto set: of one scene at a time if its batch is 1, else of all choices.
+        probability: Share of resamples of the scenes in which it is a member.
+    """
+
+    mean: float
+    low: float
+    high: float
+    member: bool = False
+    probability: float = 0.0
+
+
+def rank(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str, Rank]:
+    """The rank of each point that has the error in all scenes, by name."""
+    measured = [point for point in points if math.isfinite(point.mean(measure))]
+    if not measured:
+        return {}
+    errors = np.stack([point.errors[measure] for point in measured])
+    ranks = {
+        point.name: Rank(float(row.mean()), float(bounds[0]), float(bounds[1]))
+        for point, row, bounds in zip(measured, errors, intervals(errors, seed), strict=True)
+    }
+    for most in (math.inf, 1):  # points of one scene at a time compete among themselves: their times are latencies
+        competing = [point.competes and point.batch <= most for point in measured]
+        competitors = list(compress(measured, competing))
+        times, rows = np.array([point.milliseconds for point in competitors]), errors[competing]
+        members, shares = pareto_members(times, rows.mean(1)), pareto_probabilities(times, rows, seed)
+        for point, member, share in zip(competitors, members, shares, strict=True):
+            ranks[point.name] = replace(ranks[point.name], member=bool(member), probability=float(share))
+    return ranks
+
+
+def pareto_members(times: Floats, errors: Floats) -> NDArray[np.bool_]:
+    """Whether each of P points, with times (P,) and errors (..., P), is in the Pareto set, (..., P)."""
+    faster = times[:, None] < times[None]
+    as_fast = times[:, None] <= times[None]
+    better = errors[..., :, None] < errors[..., None, :]
+    as_good = errors[..., :, None] <= errors[..., None, :]
+    dominates = as_fast & as_good & (faster | better)
+    return np.asarray(~dominates.any(axis=-2))
+
+
+def pareto_probabilities(times: Floats, errors: Floats, seed: int = 0) -> Floats:
+    """Share of resamples of the scenes in which each point is in the Pareto set, (P,), from errors (P, S)."""
+    if not len(times):
+        return np.zeros(0)
+    members = [pareto_members(times, part) for part in np.array_split(resampled_means(errors, seed), 20)]
+    return np.asarray(np.concatenate(members).mean(axis=0))
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """What to run for budgets from `milliseconds` up to that of the next one.
+
+    Args:
+        milliseconds: Smallest budget per frame for which it holds.
+        name: Name of the choice.
+        sentence: The advice in words.
+    """
+
+    milliseconds: float
+    name: str
+    sentence: str
+
+
+def recommend(points: Sequence[Point], measure: str = "mse", seed: int = 0) -> list[Recommendation]:
+    """What to run for any budget of milliseconds per frame of one scene: steps from the least budget on.
+
+    Args:
+        points: All of them; those that predict several scenes at once are left out, as a budget is for one scene.
+        measure: The error that counts.
+        seed: Of the bootstrap.
+    """
+    ranks = rank(points, measure, seed)
+    usable = [point for point in points if point.competes and point.batch == 1 and point.name in ranks]
+    steps: list[Recommendation] = []
+    least = math.inf
+    for point in sorted(usable, key=lambda point: (point.milliseconds, ranks[point.name].mean)):
+        if ranks[point.name].mean < least:
+            least = ranks[point.name].mean
+            steps.append(Recommendation(point.milliseconds, point.name, _sentence(point, usable, ranks, measure)))
+    return steps
+
+
+_DO = {
+    Kind.MODEL: "Use the emulator",
+    Kind.OTHER: "Use",
+    Kind.SIMULATOR: "Run the",
+    Kind.TRIVIAL: "Compute nothing: take",
+}
+_BEST = {Kind.MODEL: "the best emulator", Kind.SIMULATOR: "the best simulator setting"}
+
+
+def _sentence(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank], measure: str) -> str:
+    if point.exact:
+        return f"Run the simulator as it is ({point.milliseconds:.3g} ms per frame): it made these data."
+    unit = Unit.of(one.mean for one in ranks.values())
+    competitor = _competitor(point, usable, ranks)
+    beside = f"; {_BEST[competitor.kind]} there, {competitor.name}, has " if competitor else ""
+    beside += _error(ranks[competitor.name], unit) if competitor else ""
+    return (
+        f"{_DO[point.kind]} {point.name}: {describe_measure(measure)} {_error(ranks[point.name], unit)}, "
+        f"{point.milliseconds:.3g} ms per frame{beside}."
+    )
+
+
+def _competitor(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank]) -> Point | None:
+    """The most accurate emulator or simulator, of another kind than the point, within the same time."""
+    others = [
+        other
+        for other in usable
+        if other.kind in _BEST and other.kind is not point.kind and other.milliseconds <= point.milliseconds
+    ]
+    return min(others, key=lambda other: ranks[other.name].mean, default=None)
+
+
+def _error(rank: Rank, unit: Unit) -> str:
+    return f"{unit.show(rank.mean, 3)} ({unit.show(rank.low, 3)} to {unit.show(rank.high, 3)}){unit}"
+
+
+def beside_simulator(points: Sequence[Point], measure: str = "mse") -> str:
+    """The most accurate emulator beside the simulator's stable settings, in a sentence; empty without emulators."""
+    timed = [point for point in points if point.competes and math.isfinite(point.mean(measure))]
+    simulators = [point for point in timed if point.kind is Kind.SIMULATOR]
+    models = [point for point in timed if point.kind is Kind.MODEL and point.batch == 1]
+    if not models:
+        return ""
+    model = min(models, key=lambda model: model.mean(measure))
+    as_fast = [point for point in simulators if point.milliseconds <= model.milliseconds]
+    as_good = [point for point in simulators if point.mean(measure) <= model.mean(measure)]
+    fast, good = "no stable simulator setting is as fast", "none is as accurate"
+    if as_fast:
+        best = min(as_fast, key=lambda point: point.mean(measure))
+        fast = f"{best.name} is no slower and has {best.mean(measure) / model.mean(measure):.2g} × its error"
+    if as_good:
+        cheapest = min(as_good, key=lambda point: point.milliseconds)
+        good = (
+            f"{cheapest.name} is no less accurate and takes {cheapest.milliseconds / model.milliseconds:.2g} × its time"
+        )
+    return f"The most accurate emulator, {model.name}, beside the simulator: {fast}; {good}."

@@ -1,0 +1,158 @@
+"""Sweeps and the choices that they make: what these predict, and which are left out or refused."""
+
+import dataclasses
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import torch
+
+from nmpm._support.digests import short_digest
+from nmpm.data.catalog import describe
+from nmpm.errors import ConfigError, NmpmError
+from nmpm.evaluation.trade import Kind, Sweep, find_wider_scenes, make_choices, read_sweep, shipped_sweep_text
+from nmpm.evaluation.trade.choices import follow_nearest
+from nmpm.sim import load_preset
+from tests.evaluation.trade.made_up import tiny_emulator, tiny_sweep
+
+PATH = "tests.evaluation.trade.made_up:Shifted"
+
+
+def named(choices, name):
+    return next(choice for choice in choices if choice.name == name)
+
+
+def test_shipped_sweeps_are_read_and_that_of_trade_states_the_defaults():
+    assert read_sweep(shipped_sweep_text("trade"), "trade.yaml") == Sweep() == read_sweep("", "empty.yaml")
+    compared = read_sweep(shipped_sweep_text("compare"), "compare.yaml")
+    assert (compared.scenes, compared.models.batch, compared.measures.horizons) == (6, (1,), (8, 32, 100))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scene: 3", r"mine.yaml: unknown scene; keys: floors, measures"),
+        ("models: {batch: [0]}", r"models.batch: 0 must be a positive number"),
+        ("models: {batch: 8}", r"mine.yaml, models: batch = 8 should be a list, each a whole number"),
+        ("models: {precision: [float16]}", r"precision = .* should be a list, each one of float32, bfloat16"),
+        ("models: {batch: [64]}", r"models.batch: 64 scenes at once of 20"),
+        ("timing: {rounds: 0}", r"timing.rounds: 0 must be a positive number"),
+        ("{", r"mine.yaml cannot be read"),
+    ],
+)
+def test_mistakes_are_named(text, message):
+    with pytest.raises(NmpmError, match=message):
+        read_sweep(text, "mine.yaml")
+
+
+def test_every_choice_predicts_all_frames_of_every_scene_and_the_shipped_simulator_repeats_them(scenes, choices):
+    for choice in choices:
+        predicted = choice.prepare(scenes, [1])(scenes.frames(1))
+        assert predicted.shape == scenes.window([1]).target.shape, choice.name
+    for index in range(2):
+        assert torch.equal(choices[0].prepare(scenes, [index])(scenes.frames(index)), scenes.window([index]).target)
+
+
+def test_several_scenes_at_once_predict_what_each_does_alone(scenes, choices):
+    both = named(choices, "carried, batch 2").prepare(scenes, [0, 1])(4)
+    for index in range(2):
+        alone = named(choices, "carried").prepare(scenes, [index])(4)
+        torch.testing.assert_close(both[index : index + 1, :, : alone.shape[2]], alone)
+
+
+def test_a_nudge_moves_the_simulation_a_little(scenes, choices):
+    nudged = next(choice for choice in choices if "nudged" in choice.name)
+    distance = nudged.prepare(scenes, [0])(4) - scenes.window([0], 4).target
+    assert 0 < float(distance.abs().max()) < 1e-3
+    assert nudged.kind is Kind.FLOOR
+
+
+def test_recorded_particles_move_like_the_nearest_of_fewer_larger_ones():
+    first = torch.tensor([[0.1, 0.1], [0.2, 0.1], [0.8, 0.1]])
+    larger = np.array([[0.15, 0.1], [0.8, 0.12]])
+    moves = torch.tensor([[0.0, 0.3], [0.05, 0.0]])  # of the two larger particles, per frame
+    simulated = torch.from_numpy(larger).float() + torch.arange(3).view(3, 1, 1) * moves
+    paths = follow_nearest(first, larger)(simulated)
+    torch.testing.assert_close(paths, first + torch.arange(3).view(3, 1, 1) * moves[[0, 0, 1]])
+
+
+def test_repeated_and_refused_settings_are_left_out_and_recorded_scenes_have_no_simulator(scenes, choices):
+    names = [choice.name for choice in choices]
+    assert len(names) == len(set(names))
+    assert "carried, free" not in names  # it has no constraints
+    least = dataclasses.replace(scenes.preset, substeps=scenes.preset.coarsened(1)._wave_substeps)
+    strict = make_choices(tiny_sweep(), dataclasses.replace(scenes, preset=least), {})
+    assert strict[0].name == f"simulator, {least.substeps} substeps"
+    assert f"twin: {2 * least.substeps} of {least.substeps} substeps" in [choice.name for choice in strict]
+    recorded = dataclasses.replace(scenes, preset=None, seeds=())
+    kinds = {choice.kind for choice in make_choices(tiny_sweep(), recorded, {"one": tiny_emulator(scenes.scene)})}
+    assert kinds == {Kind.MODEL, Kind.TRIVIAL}
+
+
+def test_a_model_of_other_scenes_gets_cells_of_the_same_size_and_is_named_so(scenes):
+    (left, right), floor = scenes.scene.domain
+    half = (left, (left + right) / 2)
+    narrow = tiny_emulator(
+        dataclasses.replace(scenes.scene, domain=(half, floor), bounds=(half, scenes.scene.bounds[1]))
+    )
+    models = [c for c in make_choices(tiny_sweep(), scenes, {"one": narrow}) if c.kind is Kind.MODEL]
+    assert {choice.settings["model"] for choice in models} == {"one (of other scenes)"}
+    assert {choice.settings["weights"] for choice in models} == {short_digest(narrow.state_dict())}
+    assert "domain" in models[0].settings["scenes_differ_in"]
+    assert (narrow.grid.shape, models[0].emulator.grid.shape) == ((4, 8), (8, 8))
+    other = tiny_emulator(dataclasses.replace(scenes.scene, dt=2 * scenes.scene.dt))
+    with pytest.raises(ConfigError, match=r"model other cannot predict the scenes of .* made for dt"):
+        make_choices(tiny_sweep(), scenes, {"other": other})
+
+
+def test_runtimes_are_choices_of_their_own(scenes):
+    if find_spec("openvino") is None:  # importing it would report to its makers
+        pytest.skip("openvino is not installed")
+    settings = dataclasses.replace(tiny_sweep().models, runtime=("eager", "openvino"), batch=(1,))
+    sweep, models = dataclasses.replace(tiny_sweep(), models=settings), {"carried": tiny_emulator(scenes.scene)}
+    plain, quick = (choice for choice in make_choices(sweep, scenes, models) if choice.kind is Kind.MODEL)
+    assert (plain.name, quick.name) == ("carried", "carried, openvino")
+    assert quick.identity == dict(plain.identity) | {"runtime": "openvino"}
+    wrong = dataclasses.replace(sweep, models=dataclasses.replace(settings, runtime=("fast",)))
+    with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
+        make_choices(wrong, scenes, models)
+
+
+def test_a_predictor_of_another_package_is_a_choice(scenes):
+    still, moving = (c for c in make_choices(tiny_sweep(), scenes, {}, predictors=[PATH, f"{PATH}:0.5"])[-4:-2])
+    assert (still.kind, still.name, moving.name) == (Kind.OTHER, "shifted by 0", "shifted by 0.5")
+    start = scenes.window([0]).initial.position
+    assert torch.equal(moving.prepare(scenes, [0])(3)[:, 2], start + 1.5)
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("nowhere:make", "No module named 'nowhere'"),
+        (PATH + "s", "has no attribute 'Shifteds'"),
+        ("nowhere", "module:factory"),
+        ("builtins:repr", "should return a callable with a name"),
+        (PATH, "Two choices are called 'shifted by 0'"),
+    ],
+)
+def test_predictors_that_cannot_be_used_are_named(path, message, scenes):
+    with pytest.raises(ConfigError, match=message):
+        make_choices(tiny_sweep(), scenes, {}, predictors=[PATH, path])
+    assert "nowhere" not in sys.modules
+
+
+def test_wider_scenes_are_simulated_once_over_a_wider_domain(tmp_path, monkeypatch):
+    tiny = dataclasses.replace(load_preset("goop").coarsened(4).with_frames(4), substeps=6)
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path))
+    monkeypatch.setattr("nmpm.evaluation.trade.scenes.load_preset", lambda name: {describe("goop").preset: tiny}[name])
+    wide = find_wider_scenes("goop", 1, 2)
+    assert (wide.name, len(wide)) == ("goop-2-times-as-wide", 1)
+    (left, right), _ = tiny.scene.domain
+    (wide_left, wide_right), _ = wide.scene.domain
+    assert wide_right - wide_left == pytest.approx(2 * (right - left))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.h5")}
+    assert find_wider_scenes("goop", 1, 2).digests == wide.digests
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.h5")} == before
+    with pytest.raises(ConfigError, match="cannot be widened: it is not an embedded dataset"):
+        find_wider_scenes(str(tmp_path), 1, 2)
