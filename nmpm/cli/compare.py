@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import MODEL
+from nmpm.cli.options import MODEL, HelpFormatter
 from nmpm.cli.trade import add_scene_options, measure_and_report
 
 DESCRIPTION = """Compare models on test scenes that they need not have been trained on: other particle counts, other

@@ -1,12 +1,29 @@
-"""What a training command shows: Lightning's advertisements and remarks about its own internals are left out."""
+"""What a training command shows: mistakes in one line with the nearest name, Lightning's remarks left out."""
 
 from __future__ import annotations
 
 import logging
 import re
+import sys
+import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import NoReturn
+
+from lightning.pytorch.cli import LightningArgumentParser
+
+from nmpm._support.shipped import PACKAGE
+from nmpm.cli.early_checks import UsageError
+from nmpm.decoders import Decoder
+from nmpm.processors import Processor
+from nmpm.transfer import Transfer
+
+PARTS = {"processor": Processor, "transfer": Transfer, "decoder": Decoder}
+LONGEST = 300
+"""Characters of a message of jsonargparse's that are shown."""
 
 REMARKS = re.compile(
     "|".join(
@@ -68,3 +85,72 @@ def quiet_lightning() -> Iterator[None]:
         finally:
             for handler in handlers:
                 handler.removeFilter(remarks)
+
+
+class BriefParser(LightningArgumentParser):
+    """Raises `UsageError` where jsonargparse would print its usage and exit."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        parser = getattr(ex, "subcommand_parser", None) or self
+        names = [action.dest for action in parser._actions]
+        raise UsageError(explain(message, names)) from ex
+
+
+def explain(message: str, names: Iterable[str]) -> str:
+    """A message of jsonargparse in one line, with the nearest known name where one is unknown.
+
+    Args:
+        message: May have many lines.
+        names: Options of the parser, such as "model.cells".
+    """
+    if found := re.match(r"unrecognized arguments: --([\w.]+)", message):
+        return f"there is no option --{found[1]}{_hint(found[1], names, '--')}"
+    if found := re.match(r"Subcommand '\w+' does not accept option '([\w.]+)'", message):
+        return f"the configuration has an unknown key {found[1]}{_hint(found[1], names, '')}"
+    if found := re.match(r"Option '([\w.]+)' is not accepted", message):
+        return f"the argument {found[1]} is unknown{_hint(found[1], names, '')}"
+    key = re.match(r'Parser key "([\w.]+)":', message)
+    option = f"--{key[1]}: " if key else ""
+    if found := re.search(r"module '([\w.]+)' has no attribute '(\w+)'", message):
+        public = [name for name in vars(sys.modules.get(found[1], object())) if not name.startswith("_")]
+        return f"{option}there is no {found[1]}.{found[2]}{_question(found[2], public, f'{found[1]}.')}"
+    if found := re.search(r"Expected a <class '(\w+)'>\.? Got value: (.*)", message):
+        return f"{option}{found[2]} is not of type {found[1]}."
+    if found := re.search(r"Expected a typing\.Literal\[(.*?)\]\.? Got value: (\S+)", message):
+        return f"{option}{found[2]} is not one of {found[1]}."
+    if found := re.search(r"Problem with given class_path '([\w.]+)':\s+(.+)", message):
+        return f"{found[1]}: {found[2]}"
+    rest = re.sub(r"- Expected a path but \S+ either not accessible or invalid", "", message[key.end() if key else 0 :])
+    line = " ".join(rest.split()).removeprefix("- ")
+    return option + (line if len(line) <= LONGEST else f"{line[:LONGEST]} …")
+
+
+def is_of_other_packages(error: BaseException) -> bool:
+    """Whether an error, and what it follows from, was raised by other packages, called by nothing but the CLI."""
+    parts: set[Path] = set()
+    following: BaseException | None = error
+    while following is not None:
+        parts |= {Path(frame.filename) for frame in traceback.extract_tb(following.__traceback__)}
+        following = following.__cause__ or following.__context__
+    return not any(path.is_relative_to(PACKAGE) and not path.is_relative_to(PACKAGE / "cli") for path in parts)
+
+
+def _hint(wrong: str, names: Iterable[str], mark: str) -> str:
+    """A question for the nearest of the options, else for an argument of a part that is spelt like the last word."""
+    if near := get_close_matches(wrong, list(names), n=1, cutoff=0.8):
+        return f"; did you mean {mark}{near[0]}?"
+    arguments = dict(_part_arguments())
+    near = get_close_matches(wrong.rpartition(".")[2], list(arguments), n=1, cutoff=0.75)
+    return f"; did you mean {mark}{arguments[near[0]]}?" if near else ". See --help_all for all there are."
+
+
+def _question(wrong: str, names: Iterable[str], before: str) -> str:
+    near = get_close_matches(wrong, list(names), n=1)
+    return f"; did you mean {before}{near[0]}?" if near else "."
+
+
+def _part_arguments() -> Iterator[tuple[str, str]]:
+    """Arguments of processors, transfers and decoders, and the options that set them."""
+    for part, base in PARTS.items():
+        for kind in base.__subclasses__():
+            yield from ((name, f"model.{part}.{name}") for name in vars(kind).get("__dataclass_fields__", ()))

@@ -6,8 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import add_data_options, check_folder, data_options, new_ids
+from nmpm.cli.options import HelpFormatter, add_data_options, check_folder, data_options, new_ids
 
 _DESCRIPTION = """\
 Bring a dataset of another format into the native layout (LagrangeBench's HDF5 files with a metadata.json).

@@ -3,76 +3,66 @@
 from __future__ import annotations
 
 import operator
-import os
-import shlex
-import sys
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from jsonargparse.typing import PositiveInt
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateMonitor, ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
-from lightning.pytorch.utilities import rank_zero_only
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.collectives import describe_ended_rank, is_lost_connection
-from nmpm._support.devices import device_name, find_device
+from nmpm._support.devices import find_device
 from nmpm._support.threads import stated_threads
+from nmpm.cli.console import BriefParser, explain, is_of_other_packages
 from nmpm.cli.early_checks import UsageError
 from nmpm.cli.options import check_folder
-from nmpm.cli.runs import CONFIG
-from nmpm.cli.typos import BriefParser, explain, is_of_other_packages
+from nmpm.cli.training import CONFIG
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
-from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.forecast import Forecast
 from nmpm.training.callbacks.outputs import PredictionWriter, ReportWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.savers import BestCheckpoint, LastCheckpoint
 from nmpm.training.callbacks.threads import Threads
-from nmpm.training.checkpoints import AtomicCheckpointIO, check_same_recipe, read_checkpoint
+from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.preflight import OVERALL, check_disk, fitting_precision
+from nmpm.training.preflight import OVERALL, fitting_precision
 from nmpm.training.run_folder import RunFolder
-from nmpm.zoo.registry import load_model
 
-BEST = {"filename": "best", "monitor": f"valid/{OVERALL}", "enable_version_counter": False}
-# A checkpoint of its own to resume from: ModelCheckpoint's `save_last` leaves the last one as it was whenever the best
-# does not change.
-LAST = {"filename": "last", "every_n_train_steps": 100, "enable_version_counter": False}
-
+# Two savers, as ModelCheckpoint's `save_last` leaves the last checkpoint as it was whenever the best does not change.
+SAVERS: dict[str, tuple[type[ModelCheckpoint], dict[str, Any]]] = {
+    "checkpoint": (BestCheckpoint, {"filename": "best", "monitor": f"valid/{OVERALL}"}),
+    "resume": (LastCheckpoint, {"filename": "last", "every_n_train_steps": 100}),
+}
+CHECKPOINTS = "checkpoints"
 THREADS = (
     "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
     " used, as measured). Another number changes results by rounding."
 )
-CHECKPOINTS = "checkpoints"
-T = TypeVar("T")
-
 START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
-class EmulatorCLI(LightningCLI):
-    """Links what the model needs from the data and the other way round, and ends a fit with a test.
+class ConfiguredCLI(LightningCLI):
+    """Makes data, model and trainer of a configuration; links what the model needs from the data and vice versa.
 
     Args:
         command: fit, validate, test or predict.
-        note: A line to print when it starts; may be empty.
-        locks: A list that the descriptor of the run folder's lock is appended to. (Callbacks that copy the module copy
-            this object too, so it must not hold what cannot be copied.)
         options: Of LightningCLI.
     """
 
-    def __init__(self, command: str, note: str, locks: list[int], **options: Any) -> None:
-        self.command, self.note, self.locks, self.parent = command, note, locks, os.getppid()
-        self.replaced_precision = ""
+    def __init__(self, command: str, **options: Any) -> None:
+        self.command = command
+        self.bfloat16_replaced = False
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
+
+    # Parser
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # (static there)
         """The one that is run: parsers of the others would cost seconds."""
@@ -85,10 +75,10 @@ class EmulatorCLI(LightningCLI):
         return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        parser.add_lightning_class_args(BestCheckpoint, "checkpoint")
-        parser.set_defaults({f"checkpoint.{key}": value for key, value in BEST.items()})
-        parser.add_lightning_class_args(LastCheckpoint, "resume")
-        parser.set_defaults({f"resume.{key}": value for key, value in LAST.items()})
+        for name, (kind, defaults) in SAVERS.items():
+            parser.add_lightning_class_args(kind, name)
+            given = defaults | {"enable_version_counter": False}
+            parser.set_defaults({f"{name}.{key}": value for key, value in given.items()})
         parser.add_argument("--threads", type=PositiveInt | None, default=None, help=THREADS)
         if self.command == "fit":
             parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
@@ -107,47 +97,45 @@ class EmulatorCLI(LightningCLI):
             return scene
         return scene.with_fields_of(Scene.from_dict(stored)) if isinstance(stored, dict) else scene
 
+    def _parse_ckpt_path(self) -> None:
+        """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""
+
+    # Data, model and trainer
+
     def before_instantiate_classes(self) -> None:
-        """Read checkpoints as tensors and plain data, executing nothing, and keep a run's files in one folder.
+        """Check and complete the configuration; checkpoints are read as tensors and plain data.
 
         Raises:
-            ConfigError: if an untrained model would be evaluated, or the learning rate is not positive.
+            ConfigError: if an untrained model would be evaluated, or an option cannot be.
         """
         config = self.config[self.subcommand]
+        trainer, optimizer = config["trainer"], config["model"].get("optimizer")
         config["weights_only"] = True
-        trainer = config["trainer"]
         trainer["default_root_dir"] = trainer["default_root_dir"] or "runs/default"
         check_folder("--trainer.default_root_dir", Path(trainer["default_root_dir"]))
-        if self.subcommand != "fit":
-            if not config["ckpt_path"]:
-                raise ConfigError(
-                    "--ckpt_path is missing, so the model would be an untrained one: give best or last, of"
-                    f" {trainer['default_root_dir']}, or a checkpoint's file; or call nmpm {self.subcommand} RUN, with"
-                    " the folder of a run."
-                )
-            if config.get("verbose"):
-                config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
+        if self.subcommand != "fit" and not config["ckpt_path"]:
+            raise ConfigError(
+                "--ckpt_path is missing, so the model would be an untrained one: give best or last, of"
+                f" {trainer['default_root_dir']}, or a checkpoint's file; or call nmpm {self.subcommand} RUN, with"
+                " the folder of a run."
+            )
+        if "verbose" in config:
+            config["verbose"] = False  # Lightning's own table, as ReportWriter prints ours
         if trainer["barebones"] or trainer["enable_checkpointing"] is False:
             raise ConfigError(
                 "nmpm fit saves, logs and tests: for a bare Trainer, train from Python (docs/lightning.md)."
             )
-        self._choose_precision(trainer)
+        if isinstance(configured := trainer["precision"], str) and trainer["accelerator"] in ("auto", "cpu"):
+            trainer["precision"] = fitting_precision(configured, find_device(trainer["accelerator"]))
+            self.bfloat16_replaced = trainer["precision"] != configured
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
-        for saver in ("checkpoint", "resume"):
+        for saver in SAVERS:
             folder = Path(trainer["default_root_dir"]) / CHECKPOINTS
             config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
             if self.subcommand == "fit":
                 check_folder(f"--{saver}.dirpath", Path(config[saver]["dirpath"]))
-        optimizer = config["model"].get("optimizer")
         if isinstance(optimizer, dict) or hasattr(optimizer, "get"):
             check_learning_rate((optimizer.get("init_args") or {}).get("lr"))
-
-    def _choose_precision(self, trainer: Any) -> None:
-        """Compute in float32 on a CPU that has no instructions for a configured bfloat16."""
-        configured = trainer["precision"]
-        if isinstance(configured, str) and trainer["accelerator"] in ("auto", "cpu"):
-            trainer["precision"] = fitting_precision(configured, find_device(trainer["accelerator"]))
-            self.replaced_precision = configured if trainer["precision"] != configured else ""
 
     def instantiate_classes(self) -> None:
         """Make data, model and trainer.
@@ -188,9 +176,6 @@ class EmulatorCLI(LightningCLI):
                 getattr(logger, "experiment", None)
         return trainer
 
-    def _parse_ckpt_path(self) -> None:
-        """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""
-
     @property
     def run_folder(self) -> RunFolder:
         """Where this run's files are."""
@@ -204,141 +189,6 @@ class EmulatorCLI(LightningCLI):
         config = self.config[self.subcommand][saver]
         return Path(config["dirpath"]) / f"{config['filename']}{ModelCheckpoint.FILE_EXTENSION}"
 
-    def before_fit(self) -> None:
-        """Check, before data are simulated, that the training can run, and lock the run's folder.
-
-        Raises:
-            ConfigError: if the training has no end, another process trains in the folder, it holds a run that is not
-                to go on, or the checkpoint has other parts.
-            DataError: if the checkpoint cannot be read.
-        """
-        check_endless_batches(self.trainer)
-        for logger in self.trainer.loggers:
-            check_folder("The logger's save_dir", Path(logger.save_dir or "."))
-        check_disk(self.trainer, self.model)
-        resumed = self._load_checkpoint()
-        if resumed is not None:
-            self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated
-        elif self.config_init[self.subcommand].get("start_from"):
-            self._load_initial_weights(str(self.config_init[self.subcommand]["start_from"]))
-        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
-            return
-        self.locks.append(self.run_folder.lock())
-        self.run_folder.remove_unfinished()
-        if resumed is None or not self.run_folder.holds(Path(self.config_init[self.subcommand]["ckpt_path"])):
-            self.run_folder.check_new()
-        self._print_start()
-        sys.stdout.write(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
-        sys.stdout.flush()
-
-    def _print_start(self) -> None:
-        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
-            return
-        device = self.trainer.strategy.root_device
-        hardware = self.threads.describe(self.trainer) if device.type == "cpu" else device_name(device)
-        emulator = self.model.emulator
-        weights = sum(parameter.numel() for parameter in emulator.parameters())
-        sys.stdout.write(
-            f"{self.note}Data: {self.datamodule.description}. Model: {type(emulator.recipe.processor).__name__},"
-            f" {weights:,} parameters, on {hardware}.\n"
-        )
-        if self.replaced_precision:
-            sys.stdout.write("bfloat16 is emulated on this processor; training in float32.\n")
-        sys.stdout.flush()
-
-    def before_validate(self) -> None:
-        self._load_checkpoint()
-        self._print_start()
-
-    before_test = before_predict = before_validate
-
-    def _load_initial_weights(self, name: str) -> None:
-        """Give the model the weights and statistics of another one, over the data's scene.
-
-        Raises:
-            ConfigError: naming the parts in which the two differ.
-        """
-        own = self.model.emulator
-        found = load_model(name).emulator.over(own.scene)
-        check_same_recipe(found.recipe.to_dict(), own.recipe)
-        own.load_state_dict(found.state_dict())
-
-    def _load_checkpoint(self) -> dict[str, Any] | None:
-        """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""
-        config = self.config_init[self.subcommand]
-        if not config.get("ckpt_path"):
-            return None
-        path = self.run_folder.checkpoint(str(config["ckpt_path"]))
-        content = read_checkpoint(path)
-        self.model.on_load_checkpoint(content)
-        config["ckpt_path"] = str(path)
-        return content
-
-    def fit(self, **options: Any) -> None:
-        """Train, then test the best weights; an interruption, or the end of another rank, says how to go on.
-
-        Raises:
-            KeyboardInterrupt: at SIGINT and SIGTERM.
-            NmpmError: if another rank has ended.
-        """
-        try:
-            self.trainer.fit(**options)
-            self._test_best_weights()
-        except SystemExit as ended:
-            if not isinstance(ended.__context__, KeyboardInterrupt):
-                raise
-            if self.trainer.is_global_zero:
-                raise KeyboardInterrupt(self._how_to_go_on()) from None
-            raise SystemExit(130) from None
-        except RuntimeError as error:
-            if not is_lost_connection(error):
-                raise
-            raise self._lost_rank_error() from None
-
-    def _lost_rank_error(self) -> BaseException:
-        """Names the rank that has ended, on one of those that are left: rank 0, or rank 1 where rank 0 has."""
-        if self.trainer.is_global_zero:
-            ended = describe_ended_rank(getattr(self.trainer.strategy.launcher, "procs", []))
-        elif self.trainer.global_rank == 1 and os.getppid() != self.parent:
-            ended = f"rank 0 (process {self.parent}) has ended"
-        else:
-            return SystemExit(1)
-        return NmpmError(f"{ended}: {self._how_to_go_on()}")
-
-    def _how_to_go_on(self) -> str:
-        last = self.run_folder.checkpoints["last"]
-        if not last.is_file():
-            return "interrupted before the first step. The same command starts again; simulated trajectories are kept."
-        step = self._saver(LastCheckpoint).saved_step
-        where = f"stopped at step {step}" if step else "interrupted"
-        return f"{where}. Go on with: {shlex.join(['nmpm', 'fit', '--resume', str(self.run_folder.root)])}"
-
-    def _test_best_weights(self) -> None:
-        """Validate the last weights too, if no validation has, and test the best ones, once.
-
-        Where validations are turned off, the last weights are tested; without a test, the report says why.
-        """
-        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
-        callbacks[:] = [one for one in callbacks if not isinstance(one, BatchSizeFinder)]  # (it would act here, too)
-        best = self._saver(BestCheckpoint)
-        if best.monitor and self.trainer.limit_val_batches and best.scored_step < self.trainer.global_step:
-            self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
-            best.score(self.trainer)
-        # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
-        path = Path(best.best_model_path or self.run_folder.checkpoints["last"])
-        if path.is_file():
-            self.model.load_state_dict(read_checkpoint(path)["state_dict"])
-        untested = "" if self.trainer.limit_test_batches else "--trainer.limit_test_batches is 0."
-        if not self.datamodule.has_test:
-            untested = f"{self.datamodule.data_source.folder} has no test.h5."
-        if untested:
-            self.report.report_untested(self.trainer, self.model, untested)
-        else:
-            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
-
-    def _saver(self, kind: type[T]) -> T:
-        return next(callback for callback in self.trainer.checkpoint_callbacks if isinstance(callback, kind))
-
 
 class RunConfig(SaveConfigCallback):
     """Writes a training's configuration into the run's folder, such that `nmpm test RUN` works from anywhere."""
@@ -349,7 +199,7 @@ class RunConfig(SaveConfigCallback):
         config, root = self.config.clone(), Path(self.config["trainer"]["default_root_dir"])
         config["ckpt_path"] = None
         config.pop("start_from", None)  # unknown to other commands, and of the start alone
-        for saver in ("checkpoint", "resume"):
+        for saver in SAVERS:
             folder = Path(config[saver]["dirpath"])
             config[saver]["dirpath"] = None if folder == root / CHECKPOINTS else str(folder.absolute())
         if config["data"]["path"]:

@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import add_device_option, add_model_options, check_device, check_output
+from nmpm.cli.options import HelpFormatter, add_device_option, add_model_options, check_device, check_output
 from nmpm.errors import ConfigError, DataError
 
 if TYPE_CHECKING:

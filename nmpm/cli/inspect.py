@@ -12,8 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import add_data_options, check_at_least, check_picture, data_options
+from nmpm.cli.options import HelpFormatter, add_data_options, check_at_least, check_picture, data_options
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,18 @@ MODEL = (
     " Face hub, owner/repository@revision"
 )
 """Help for arguments that `nmpm.zoo.load_model` takes."""
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Fills prose to the terminal's width; paragraphs with indented lines, as examples are, stay as written."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = text.strip("\n").split("\n\n")
+        filled = [
+            paragraph if "\n " in paragraph or paragraph.startswith(" ") else textwrap.fill(paragraph, width)
+            for paragraph in paragraphs
+        ]
+        return textwrap.indent("\n\n".join(filled), indent) + "\n"
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.help import HelpFormatter
 from nmpm.cli.options import (
+    HelpFormatter,
     add_device_option,
     add_model_options,
     add_runtime_option,

@@ -7,8 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import check_at_least, check_folder, check_picture
+from nmpm.cli.options import HelpFormatter, check_at_least, check_folder, check_picture
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

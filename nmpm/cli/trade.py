@@ -7,8 +7,15 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import MODEL, add_device_option, check_at_least, check_device, check_folder, check_input
+from nmpm.cli.options import (
+    MODEL,
+    HelpFormatter,
+    add_device_option,
+    check_at_least,
+    check_device,
+    check_folder,
+    check_input,
+)
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:

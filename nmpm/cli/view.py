@@ -6,8 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import check_at_least, check_input
+from nmpm.cli.options import HelpFormatter, check_at_least, check_input
 
 _EXAMPLES = """\
 examples:

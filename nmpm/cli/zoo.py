@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nmpm._support.messages import one_line
-from nmpm.cli.help import HelpFormatter
-from nmpm.cli.options import add_device_option, check_device
+from nmpm.cli.options import HelpFormatter, add_device_option, check_device
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
 _MODEL = "name, an entry's folder, or owner/repository@revision of the hub"

@@ -17,7 +17,7 @@ from nmpm._support.devices import computes_bfloat16
 from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
 from nmpm.cli.early_checks import argument_names
-from nmpm.cli.emulator_cli import EmulatorCLI
+from nmpm.cli.run_training import EmulatorCLI
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
