@@ -1,7 +1,24 @@
-"""The steps around the network as Numba kernels on a CPU, with the parts of this package: rollouts without gradients,
-and trainings with them (`training`, linear transfers only).
+"""The steps around the network as Numba kernels on a CPU: rollouts without gradients (`call`), trainings (`autograd`).
 
-They give what the tensor operations of `nmpm.emulator.rasterise`, `advection`, `constraints`, `contact` and `crowding`
-give, to rounding, in a tenth of the time. Those stay for everything else: other gradients, other devices, float64, the
-parts of other packages, exported programs. `with nmpm.transfer.without_kernels():` chooses them everywhere.
+They give what the tensor operations of `nmpm.emulator.rasterise`, `advection`, `constraints`, `contact`, `support` and
+`crowding` give, to rounding, in a tenth of the time. Those stay for everything else: other gradients, other devices,
+float64, the parts of other packages, exported programs. `with nmpm.transfer.without_kernels():` chooses them
+everywhere.
+
+Kernels take the arrays of one scene, C-contiguous and of float32 unless said otherwise, in cells and cells per frame:
+
+    cells, velocity   (N, D) positions and velocities at the bundle's start
+    material          (N,) int64; empty where there is only one
+    mask              (N,) bool, False for padding
+    mass              (N,) each particle's share of the scene's mass, 0 for padding
+    gravity           (D,) what a frame adds to a velocity
+    state             (size, C_in) the grid state: velocities, volume fractions, solid, constants
+    fields            (m, size, C) velocities that the network predicts, C = materials * D
+    path              (m, N, D) positions at each frame
+    obstacle          (size,) share of each cell's room that is obstacle; empty where there are no obstacles
+    grid              tuple (shape, wraps) of the cells along each axis and whether it is periodic; for transfers also
+                      `steps`, as long as the transfer has nodes along an axis
+    bounds            (3, D) lowest and highest positions, infinite on periodic axes; 1 in the last row to reflect
+    ratio             (D,) widths of the cells over that of the first axis
+    low, high         the range of particles that the call treats, so that threads share a scene
 """

@@ -1,57 +1,95 @@
-"""Kernels that spread overfull cells, as `nmpm.emulator.crowding` and `Advection.uncrowded_path` do.
+"""Overfull cells spread into the room around them: as `nmpm.emulator.crowding` and `Advection.uncrowded_path` compute.
 
-Arrays are those of one scene: positions (N, D), paths (m, N, D), in cells. Nodes are numbered as in the grid state;
-along an axis they lie `stride` apart.
+Nodes are numbered as in the grid state; along an axis they lie `stride` apart.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from nmpm._support.jit import jit, jit_sum
+from nmpm._support.jit import jit
+from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.contact import SURFACE
-from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
-from nmpm.emulator.fused.contact import depths
-from nmpm.emulator.fused.flight import confine, energy
+from nmpm.emulator.crowding import MAX_SHIFT, SWEEPS
+from nmpm.emulator.fused.parameters import Array, KernelParameters
+from nmpm.emulator.fused.path import BLOCK, CHUNK, ROUNDING, confine, energy, fill_mass
+from nmpm.emulator.fused.solids import FreeVolume, SolidCache, depths
+from nmpm.emulator.fused.state import StartArrays
 from nmpm.transfer.fused.gather import gather
 from nmpm.transfer.fused.scatter import scatter
 
-_BLOCK = 512  # particles: their places stay in the fastest cache
+_COUNTED = 2**16  # particles of a chunk that is counted: each has a grid of its own
 _LINEAR = (0, 0)
+_NONE = np.empty(0, np.float32)
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
-_CLOSED, _FURTHEST, _SURFACE = np.float32(CLOSED), np.float32(MAX_SHIFT), np.float32(SURFACE)
+_FURTHEST, _SURFACE = np.float32(MAX_SHIFT), np.float32(SURFACE)
 
 
-@jit
-def conductances(room: Any, shape: Any, wraps: Any, ratio: Any, faces: Any, inverse: Any) -> Any:
-    """Fill in what the sweeps need of a scene.
+def spread_crowds(
+    start: StartArrays, path: Array, parameters: KernelParameters, solids: SolidCache, budget: float | None,
+    threads: int,
+) -> None:  # fmt: skip
+    """Change the path of a scene so that its overfull cells spread, as far as its energy allows.
 
     Args:
-        room: (size,) share of each cell that is not solid.
-        shape: Nodes along each axis, a tuple.
-        wraps: Whether each is periodic, a tuple.
-        ratio: (D,) widths of the cells over that of the first axis.
-        faces: (D, size), of the faces from each node to the next along an axis, around its end; is filled.
-        inverse: (size,) of the sums of the faces' conductances, 0 in solids; is filled.
+        start: Where the path starts.
+        path: Is changed.
+        parameters: Of an emulator with a density cap.
+        solids: Of the scene.
+        budget: Energy that no frame may exceed; None for no such limit.
+        threads: How many work.
     """
-    size, stride = len(room), len(room)
-    inverse[:] = ZERO
-    for axis in range(len(shape)):
-        span, stride = stride, stride // shape[axis]
-        factor = ONE / (ratio[axis] * ratio[axis])
-        for node in range(size):
-            is_last = node % span >= span - stride
-            other = node - (span - stride) if is_last else node + stride
-            closed = is_last and not wraps[axis]
-            faces[axis, node] = ZERO if closed else min(room[node], room[other]) * factor
-        for node in range(size):
-            is_last = node % span >= span - stride
-            inverse[node] += faces[axis, node]
-            inverse[node - (span - stride) if is_last else node + stride] += faces[axis, node]
-    for node in range(size):
-        inverse[node] = ONE / inverse[node] if inverse[node] > _CLOSED else ZERO
+    flow = _find_flow(start, path, parameters, solids.free, threads)
+    if flow is None:
+        return
+    obstacle, spread = solids.obstacle if parameters.solids else _NONE, np.empty_like(path)
+    move = partial(drift, flow, path, start.mask, obstacle, *parameters.grid, parameters.bounds, spread)
+    map_ranges(move, split(len(start.cells), CHUNK), threads)
+    share = 1.0 if budget is None else _affordable_share(start, path, spread, parameters, budget, threads)
+    path[:] = spread if share == 1 else path + np.float32(share) * (spread - path)
+
+
+def _find_flow(
+    start: StartArrays, path: Array, parameters: KernelParameters, free: FreeVolume | None, threads: int
+) -> Array | None:
+    """(size, D) displacements at the nodes; None where no cell is overfull."""
+    if free is None or not len(start.cells):
+        return None
+    count = partial(count_particles, path[-1], start.mask, *parameters.grid)
+    parts = map_ranges(count, split(len(start.cells), max(_COUNTED, 4 * parameters.size)), threads)
+    counts = parts[0]
+    for part in parts[1:]:
+        counts += part
+    flow = np.empty((parameters.size, len(parameters.shape)), np.float32)
+    particle = np.float32(parameters.particle_volume / parameters.density_cap)
+    full = push(counts.reshape(-1), particle, free.room, free.faces, free.inverse, parameters.shape, flow)
+    return flow if full else None
+
+
+def _affordable_share(
+    start: StartArrays, path: Array, spread: Array, parameters: KernelParameters, budget: float, threads: int
+) -> float:
+    """The part of the way from the path to the spread one that no frame's energy forbids.
+
+    As `nmpm.emulator.constraints.affordable_share`.
+    """
+    mass = np.empty(len(start.cells), np.float32)
+    fill_mass(start.material, start.mask, parameters.mass, mass)
+
+    def energies(of: Array) -> Array:
+        find = partial(spread_energies, start.cells, path, of, start.gravity, mass, parameters.ratio)
+        return np.asarray(np.sum(map_ranges(find, split(len(start.cells), CHUNK), threads), axis=0))
+
+    after = energies(spread)
+    exceeds = after > budget + ROUNDING * abs(budget)
+    if not exceeds.any():
+        return 1.0
+    before = energies(path)
+    rise, room = after[exceeds] - before[exceeds], np.maximum(budget - before[exceeds], 0)
+    return float(np.where(rise > 0, room / np.where(rise > 0, rise, 1), 0).min())
 
 
 @jit
@@ -73,9 +111,7 @@ def push(counts: Any, particle: Any, room: Any, faces: Any, inverse: Any, shape:
     Args:
         counts: (size,) particles; is changed.
         particle: What one fills of a cell, over the cap.
-        room: As for `conductances`.
-        faces: From `conductances`.
-        inverse: From `conductances`.
+        room, faces, inverse: Of a `FreeVolume`.
         shape: Nodes along each axis, a tuple.
         flow: (size, D), is filled, if there are overfull cells.
     """
@@ -147,27 +183,22 @@ def _add_difference(entering: Any, leaving: Any, left: Any) -> Any:
 
 @jit
 def drift(
-    flow: Any, path: Any, mask: Any, share: Any, shape: Any, wraps: Any, bounds: Any, spread: Any, low: Any, high: Any
+    flow: Any, path: Any, mask: Any, obstacle: Any, shape: Any, wraps: Any, bounds: Any, spread: Any, low: Any, high: Any
 ) -> Any:
     """Fill in the path with the displacement at its end spread evenly over its frames.
 
     Args:
         flow: (size, D), from `push`.
-        path: (m, N, D).
-        mask: (N,) bool, False for padding, which stays.
-        share: (size,) of each cell's room that is obstacle, which nobody is spread into; empty for none.
-        shape: Nodes along each axis, a tuple.
-        wraps: Whether each is periodic, a tuple.
-        bounds: As for `flight.fly`.
+        path, mask, bounds, low, high: As in `nmpm.emulator.fused`; padding stays.
+        obstacle: Likewise; nobody is spread into it.
+        shape, wraps: Of the grid.
         spread: (m, N, D), is filled.
-        low: The first particle.
-        high: The one after the last.
     """
     frames, dim = path.shape[0], path.shape[2]
-    shift, only = np.empty((_BLOCK, dim), np.float32), np.empty(0, np.int64)
+    shift, only = np.empty((BLOCK, dim), np.float32), np.empty(0, np.int64)
     places, values = np.empty((frames, dim), np.float32), np.empty(frames, np.float32)
-    for begin in range(low, high, _BLOCK):
-        end = min(begin + _BLOCK, high)
+    for begin in range(low, high, BLOCK):
+        end = min(begin + BLOCK, high)
         gather(flow, only, path[frames - 1, begin:end], shape, wraps, _LINEAR, shift)
         for p in range(end - begin):
             for d in range(dim):
@@ -181,13 +212,13 @@ def drift(
                 lowest, highest, reflects = bounds[0, d], bounds[1, d], bounds[2, d] > ZERO
                 for p in range(len(here)):
                     moved[p, d] = confine(here[p, d] + part * shift[p, d], lowest, highest, reflects)
-        if len(share):
-            _take_back(path, share, (shape, wraps), shift, begin, end, places, values, spread)
+        if len(obstacle):
+            _take_back(path, obstacle, (shape, wraps), shift, begin, end, places, values, spread)
 
 
 @jit
 def _take_back(
-    path: Any, share: Any, grid: Any, shift: Any, begin: Any, end: Any, places: Any, values: Any, spread: Any
+    path: Any, obstacle: Any, grid: Any, shift: Any, begin: Any, end: Any, places: Any, values: Any, spread: Any
 ) -> Any:
     """Leave particles on their path that would be spread into an obstacle."""
     for p in range(begin, end):
@@ -197,48 +228,25 @@ def _take_back(
         if not moves:
             continue
         places[:] = spread[:, p]
-        depths(share, places, grid, values)
+        depths(obstacle, places, grid, values)
         if (values > _SURFACE).any():
             spread[:, p] = path[:, p]
 
 
 @jit
 def spread_energies(
-    cells: Any, path: Any, spread: Any, gravity: Any, share: Any, ratio: Any, low: Any, high: Any
+    cells: Any, path: Any, spread: Any, gravity: Any, mass: Any, ratio: Any, low: Any, high: Any
 ) -> Any:
-    """Energies (m + 1,) of the frames of a spread path, and of its end with the velocity of the path's end.
-
-    Args:
-        cells: (N, D) positions at the bundle's start.
-        path: (m, N, D).
-        spread: (m, N, D).
-        gravity: (D,), what a frame adds to a velocity.
-        share: (N,) of the scene's mass.
-        ratio: (D,) widths of the cells over that of the first axis.
-        low: The first particle.
-        high: The one after the last.
-    """
+    """Energies (m + 1,) of the frames of a spread path, and of its end with the velocity of the path's end."""
     frames = len(path)
     energies = np.zeros(frames + 1)
-    for begin in range(low, high, _BLOCK):
-        end = min(begin + _BLOCK, high)
+    for begin in range(low, high, BLOCK):
+        end = min(begin + BLOCK, high)
         for frame in range(frames):
-            before = spread[frame - 1, begin:end] if frame > 0 else cells[begin:end]
-            energies[frame] += energy(spread[frame, begin:end], before, gravity, share[begin:end], ratio)
+            here, before = spread[frame, begin:end], spread[frame - 1, begin:end] if frame > 0 else cells[begin:end]
+            energies[frame] += energy(here, here, before, gravity, mass[begin:end], ratio)
         last = path[frames - 2, begin:end] if frames > 1 else cells[begin:end]
-        energies[frames] += _end_energy(
-            spread[frames - 1, begin:end], path[frames - 1, begin:end], last, gravity, share[begin:end], ratio
+        energies[frames] += energy(
+            spread[frames - 1, begin:end], path[frames - 1, begin:end], last, gravity, mass[begin:end], ratio
         )
     return energies
-
-
-@jit_sum
-def _end_energy(spread: Any, arrived: Any, before: Any, gravity: Any, share: Any, ratio: Any) -> Any:
-    """Energy of particles at `spread` with the step from `before` to `arrived`, weighted by their shares."""
-    total = ZERO
-    for d in range(spread.shape[1]):
-        fall, wide = gravity[d] * ratio[d] * ratio[d], HALF * ratio[d] * ratio[d]
-        for p in range(len(spread)):
-            step = arrived[p, d] - before[p, d]
-            total += share[p] * (wide * step * step - spread[p, d] * fall)
-    return np.float64(total)

@@ -1,91 +1,81 @@
-"""The paths of a batch's particles through a bundle, by the kernels of this package."""
+"""Paths of particles through a bundle, frame by frame, free or within an energy: as `nmpm.emulator.advection` computes.
+
+The free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from nmpm._support.jit import jit, jit_sum
 from nmpm._support.threads import map_ranges, split
-from nmpm.emulator.constraints import FREE_FALL_SHARE
-from nmpm.emulator.fused import contact
-from nmpm.emulator.fused.flight import first_excess, fly, weigh
-from nmpm.emulator.fused.limit import propose, shorten
-from nmpm.emulator.fused.plan import Array, Plan
-from nmpm.emulator.fused.support import rest, support
-from nmpm.emulator.fused.surroundings import Surroundings
+from nmpm.emulator.fused.parameters import Array, KernelParameters
+from nmpm.emulator.fused.state import StartArrays
+from nmpm.transfer.fused.gather import gather
 
-_CHUNK = 2**14  # particles that a thread treats at once; sums do not depend on the number of threads
-_MAX_PIECES = 64
-_TINY = float(np.finfo(np.float32).tiny)
+CHUNK = 2**14
+"""Particles that a thread treats at once; sums do not depend on the number of threads."""
+
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
 """Share of an energy by which sums of float32 may exceed it."""
 
+BLOCK = 512
+"""Particles whose positions and velocities stay in the fastest cache."""
 
-@dataclass(frozen=True)
-class SceneArrays:
-    """One scene of an `emulator.bundle.BundleStart`; shapes as in `flight.fly`."""
-
-    cells: Array
-    velocity: Array
-    material: Array
-    mask: Array
-    gravity: Array
-    state: Array
-    fields: Array
+_TINY = float(np.finfo(np.float32).tiny)
+_ROUNDING = np.float32(ROUNDING)
+ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
-def fly_scene(start: SceneArrays, plan: Plan, budget: float | None, path: Array, threads: int) -> None:
-    """Fill in the path (m, N, D) of a scene: free, or within an energy."""
-    count = len(start.cells)
-    share = np.empty(count if budget is not None else 0, np.float32)
-    if budget is not None:
-        weigh(start.material, start.mask, plan.masses, share)
-    carried = np.empty_like(start.cells)
-    ranges = split(count, _CHUNK)
-    free = partial(
-        fly, start.cells, start.velocity, start.material, start.gravity, share, plan.gather_grid, start.state,
-        start.fields, plan.shares, plan.limits, plan.ratio, carried, path,
-    )  # fmt: skip
-    energies = map_ranges(free, ranges, threads)
-    if budget is not None and energies:
-        first = first_excess(sum(energies[1:], energies[0]), budget + ROUNDING * abs(budget))
-        if first < len(path):
-            _limit(start, plan, budget, share, carried, first, path, threads)
-
-
-def _limit(
-    start: SceneArrays,
-    plan: Plan,
-    budget: float,
-    share: Array,
-    carried: Array,
-    first: int,
-    path: Array,
-    threads: int,
+def find_path(
+    start: StartArrays, fields: Array, parameters: KernelParameters, budget: float | None, path: Array, threads: int
 ) -> None:
-    """Redo a path's frames from the first one that exceeds the energy, each within it."""
-    ranges = split(len(start.cells), _CHUNK)
-    for frame in range(first, len(path)):
-        move = partial(
-            propose, start.cells, start.velocity, start.material, start.gravity, share, plan.gather_grid, start.fields,
-            plan.shares, plan.limits, plan.ratio, carried, path, frame,
+    """Fill in the path of a scene within the bounds.
+
+    Args:
+        start: The scene's particles and grid state.
+        fields: What the network predicts.
+        parameters: Of the emulator.
+        budget: Energy that no frame may exceed; None for no such limit.
+        path: Is filled.
+        threads: How many work.
+    """
+    own, ranges = parameters, split(len(start.cells), CHUNK)
+    mass = np.empty(0 if budget is None else len(start.cells), np.float32)
+    if budget is not None:
+        fill_mass(start.material, start.mask, own.mass, mass)
+    carried = np.empty_like(start.cells)
+    move = partial(
+        free_path, start.cells, start.velocity, start.material, start.gravity, mass, own.g2p_grid, start.state, fields,
+        own.decoder, own.bounds, own.ratio, carried, path,
+    )  # fmt: skip
+    energies = map_ranges(move, ranges, threads)
+    if budget is None or not energies:
+        return
+    limit = budget + ROUNDING * abs(budget)
+    exceeds = (frame for frame, energy in enumerate(sum(energies[1:], energies[0]).tolist()) if energy > limit)
+    for frame in range(next(exceeds, len(path)), len(path)):
+        propose = partial(
+            propose_frame, start.cells, start.velocity, start.material, start.gravity, mass, own.g2p_grid, fields,
+            own.decoder, own.bounds, own.ratio, carried, path, frame,
         )  # fmt: skip
-        factor, only_gainers = _affordable(sum(map_ranges(move, ranges, threads)).tolist(), budget)
+        factor, only_gainers = _affordable(sum(map_ranges(propose, ranges, threads)).tolist(), budget)
         if factor < 1:
-            take_back = partial(
-                shorten, start.cells, start.velocity, start.gravity, plan.limits, plan.ratio, path, frame,
+            shorten = partial(
+                shorten_frame, start.cells, start.velocity, start.gravity, own.bounds, own.ratio, path, frame,
                 np.float32(factor), only_gainers,
             )  # fmt: skip
-            map_ranges(take_back, ranges, threads)
+            map_ranges(shorten, ranges, threads)
 
 
 def _affordable(sums: list[float], budget: float) -> tuple[float, bool]:
     """The factor for steps that keeps the energy, and whether it is for those alone that gain energy.
 
-    As `nmpm.emulator.constraints.affordable`, from the sums of `limit.propose`.
+    As `nmpm.emulator.constraints.affordable`, from the sums of `propose_frame`.
     """
     height, kinetic_gained, kinetic, fall_gained, fall = sums
     excess = max(height - budget, -1e18)
@@ -105,52 +95,176 @@ def _largest_root(square: float, slope: float, constant: float) -> tuple[float, 
     return (math.sqrt(max(inner, _TINY)) - slope) / (2 * square if moves else 1.0), moves and inner >= 0
 
 
-def rest_scene(start: SceneArrays, plan: Plan, share: Array, path: Array, threads: int) -> None:
-    """Leave resting particles of a scene where they started if something holds them up; let the others fall.
+@jit
+def fill_mass(material: Any, mask: Any, particle_mass: Any, mass: Any) -> Any:
+    """Fill in each particle's share of the scene's mass, from the mass (M,) of a particle of each material."""
+    total = 0.0
+    for p in range(len(mask)):
+        own = particle_mass[material[p]] if len(particle_mass) > 1 else np.float32(1)
+        mass[p] = own if mask[p] else ZERO
+        total += mass[p]
+    scale = np.float32(1 / total) if total > 0 else ZERO
+    for p in range(len(mask)):
+        mass[p] *= scale
 
-    Args:
-        start: Where the bundle starts.
-        plan: Of the emulator.
-        share: (size,) of each cell's room that is obstacle; empty where there are no obstacles.
-        path: (m, N, D), is changed.
-        threads: How many work.
+
+@jit
+def free_path(
+    cells: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, state: Any, fields: Any, decoder: Any,
+    bounds: Any, ratio: Any, carried: Any, path: Any, low: Any, high: Any,
+) -> Any:  # fmt: skip
+    """Fill in the path, and the velocities `carried` (N, D) that the decoder lets particles keep.
+
+    Returns:
+        (m,) energies of the frames; zeros where `mass` is empty.
     """
-    held, grid = np.empty(len(start.state), np.bool_), (plan.shape, plan.wraps)
-    support(start.state, plan.volume_channels, share, start.gravity, grid, plan.floor_rows, held)
-    speed = np.float32(plan.rest_speed)
-    still = partial(
-        rest, start.cells, path, start.gravity, speed, np.float32(FREE_FALL_SHARE), share, grid, held, plan.limits
-    )  # fmt: skip
-    map_ranges(still, split(len(start.cells), _CHUNK), threads)
+    frames, dim = len(fields), cells.shape[1]
+    energies = np.zeros(frames)
+    gathered, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
+    for begin in range(low, high, BLOCK):
+        end = min(begin + BLOCK, high)
+        start, kinds = cells[begin:end], material[begin:end]
+        _fill_carried(start, velocity[begin:end], kinds, grid, state, decoder, gathered, carried[begin:end])
+        for frame in range(frames):
+            here = path[frame - 1, begin:end] if frame > 0 else start
+            _move_block(
+                cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, gathered, kept
+            )
+            if len(mass):
+                arrived = path[frame, begin:end]
+                energies[frame] += energy(arrived, arrived, here, gravity, mass[begin:end], ratio)
+    return energies
 
 
-def clear_of_obstacles(start: SceneArrays, plan: Plan, around: Surroundings, path: Array, threads: int) -> None:
-    """Keep a scene's path clear of obstacles, and within the bounds.
+@jit
+def _fill_carried(
+    cells: Any, velocity: Any, material: Any, grid: Any, state: Any, decoder: Any, gathered: Any, carried: Any
+) -> Any:
+    if decoder[1] != ZERO:
+        gather(state, material, cells, grid[0], grid[1], grid[2], gathered)
+    for p in range(len(cells)):
+        for d in range(cells.shape[1]):
+            kept = ZERO  # not a sum over zero shares, which would make NaN of infinite velocities
+            if decoder[0] != ZERO:
+                kept += decoder[0] * velocity[p, d]
+            if decoder[1] != ZERO:
+                kept += decoder[1] * gathered[p, d]
+            carried[p, d] = kept
 
-    Args:
-        start: Where the bundle starts.
-        plan: Of the emulator.
-        around: Its obstacles.
-        path: (m, N, D), is changed.
-        threads: How many work.
+
+@jit
+def _move_block(
+    cells: Any, material: Any, gravity: Any, grid: Any, fields: Any, decoder: Any, bounds: Any, carried: Any, path: Any,
+    frame: Any, begin: Any, end: Any, gathered: Any, kept: Any,
+) -> Any:  # fmt: skip
+    """Fill in a frame of the path of a block, from the one before; `gathered` and `kept` (BLOCK, D) are scratch."""
+    here = path[frame - 1, begin:end] if frame > 0 else cells[begin:end]
+    base = carried[begin:end]
+    if frame > 0 and decoder[3] > ZERO:
+        _subtract(here, path[frame - 2, begin:end] if frame > 1 else cells[begin:end], kept)
+        base = kept[: end - begin]
+    falls = np.float32(1) if decoder[3] > ZERO else np.float32(frame + 1)
+    gather(fields[frame], material[begin:end], here, grid[0], grid[1], grid[2], gathered)
+    _move(here, base, gathered, gravity, decoder[2] * falls, bounds, path[frame, begin:end])
+
+
+@jit
+def _subtract(these: Any, those: Any, out: Any) -> Any:
+    for p in range(len(these)):
+        for d in range(these.shape[1]):
+            out[p, d] = these[p, d] - those[p, d]
+
+
+@jit
+def _move(cells: Any, base: Any, gathered: Any, gravity: Any, falls: Any, bounds: Any, out: Any) -> Any:
+    """Fill in positions after a frame with the velocities base + falls · gravity + gathered, within the bounds."""
+    for d in range(cells.shape[1]):
+        fall = gravity[d] * falls if falls > ZERO else ZERO
+        lowest, highest, reflects = bounds[0, d], bounds[1, d], bounds[2, d] > ZERO
+        for p in range(len(cells)):
+            out[p, d] = confine(cells[p, d] + (base[p, d] + fall + gathered[p, d]), lowest, highest, reflects)
+
+
+@jit
+def confine(x: Any, lowest: Any, highest: Any, reflects: Any) -> Any:
+    """A coordinate within the bounds; NaN stays."""
+    if reflects:
+        x = lowest + (lowest - x) if x < lowest else (highest + (highest - x) if x > highest else x)
+    x = highest if x > highest else x
+    return lowest if x < lowest else x
+
+
+@jit_sum
+def energy(cells: Any, arrived: Any, before: Any, gravity: Any, mass: Any, ratio: Any) -> Any:
+    """Energy of particles at `cells` (n, D) with the steps from `before` to `arrived`, weighted by their mass."""
+    total = ZERO
+    for d in range(cells.shape[1]):
+        fall, wide = gravity[d] * ratio[d] * ratio[d], HALF * ratio[d] * ratio[d]
+        for p in range(len(cells)):
+            step = arrived[p, d] - before[p, d]
+            total += mass[p] * (wide * step * step - cells[p, d] * fall)
+    return np.float64(total)
+
+
+@jit
+def propose_frame(
+    cells: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, fields: Any, decoder: Any, bounds: Any,
+    ratio: Any, carried: Any, path: Any, frame: Any, low: Any, high: Any,
+) -> Any:  # fmt: skip
+    """Fill in a frame of the path as if it were free.
+
+    Returns:
+        (5,): the energy that the scene would have if nobody moved; kinetic energy of the particles that gain energy in
+        this frame, and of all; what falling takes from the potential energy of those, and of all.
     """
-    ranges, grid, share = split(len(start.cells), _CHUNK), (plan.shape, plan.wraps), around.share
-    longest = map_ranges(partial(contact.longest_step, start.cells, path, start.mask), ranges, threads)
-    pieces = _count_pieces(longest)
-    marks = np.empty(len(start.cells), np.int8)
-    find = partial(contact.mark, start.cells, path, start.mask, share, around.clearance, grid, pieces, marks)
-    if not sum(map_ranges(find, ranges, threads)):
-        return
-    rows = np.flatnonzero(marks)
-    free = np.empty(len(rows), np.int64)
-    place, along = np.empty((2, len(rows), plan.dim), np.float32)
-    rest = contact.follow(start.cells, path, share, grid, pieces, rows, free, place, along)
-    contact.slide(path, share, grid, plan.limits, pieces, _count_pieces([rest]), rows, free, place, along)
-    stuck = np.flatnonzero(marks == contact.STUCK)
-    if len(stuck):
-        contact.push_out(start.cells, path, share, grid, plan.limits, stuck)
+    sums = np.zeros(5)
+    dim = cells.shape[1]
+    gathered, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
+    for begin in range(low, high, BLOCK):
+        end = min(begin + BLOCK, high)
+        _move_block(
+            cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, gathered, kept
+        )
+        for p in range(begin, end):
+            kinetic, fall, height, gains = _balance(cells, velocity, gravity, ratio, path, frame, p)
+            sums[0] -= mass[p] * height
+            sums[2] += mass[p] * kinetic
+            sums[4] -= mass[p] * fall
+            if gains:
+                sums[1] += mass[p] * kinetic
+                sums[3] -= mass[p] * fall
+    return sums
 
 
-def _count_pieces(lengths: list[float]) -> int:
-    """Pieces of at most half a cell in the longest of these lengths."""
-    return min(max(math.ceil(max(lengths, default=0.0) / contact.PIECE), 1), _MAX_PIECES)
+@jit
+def _balance(cells: Any, velocity: Any, gravity: Any, ratio: Any, path: Any, frame: Any, p: Any) -> Any:
+    """Of a step: its kinetic energy, the work of gravity, minus the potential before, and whether energy is gained."""
+    kinetic, fall, height, gain = ZERO, ZERO, ZERO, ZERO
+    for d in range(cells.shape[1]):
+        here = path[frame - 1, p, d] if frame > 0 else cells[p, d]
+        step = (path[frame, p, d] - here) * ratio[d]
+        if frame == 0:
+            before = velocity[p, d] * ratio[d]
+        else:
+            before = (here - (path[frame - 2, p, d] if frame > 1 else cells[p, d])) * ratio[d]
+        place, pull = here * ratio[d], gravity[d] * ratio[d]
+        kinetic += HALF * step * step
+        fall += step * pull
+        height += place * pull
+        gain += (step - before) * (step + before) * HALF - step * pull - _ROUNDING * abs(place * step)
+    return kinetic, fall, height, gain > ZERO
+
+
+@jit
+def shorten_frame(
+    cells: Any, velocity: Any, gravity: Any, bounds: Any, ratio: Any, path: Any, frame: Any, factor: Any,
+    only_gainers: Any, low: Any, high: Any,
+) -> Any:  # fmt: skip
+    """Multiply the proposed steps of a frame by a factor, of the particles that gain energy or of all."""
+    for p in range(low, high):
+        if only_gainers and not _balance(cells, velocity, gravity, ratio, path, frame, p)[3]:
+            continue
+        for d in range(cells.shape[1]):
+            here = path[frame - 1, p, d] if frame > 0 else cells[p, d]
+            arrived = here + factor * (path[frame, p, d] - here)
+            path[frame, p, d] = confine(arrived, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)

@@ -1,0 +1,152 @@
+"""What the kernels need of an emulator besides its weights and statistics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nmpm.decoders import Absolute, Acceleration, Blend, Decoder, Flip, Residual
+from nmpm.emulator.support import floor_rows
+from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
+
+if TYPE_CHECKING:
+    from nmpm.emulator.recipe import EmulatorRecipe
+
+Array = NDArray[Any]
+
+_P2G_NODES: Mapping[type[Transfer], int] = MappingProxyType({Nearest: 1, Linear: 2, Quadratic: 3})
+_G2P_NODES: Mapping[type[Transfer], int] = MappingProxyType({Nearest: 2, Linear: 2, Quadratic: 3})
+"""Nodes along an axis. Affine transfers have no kernels; subclasses may do something else, so exactly these count."""
+
+_DECODERS: Mapping[type[Decoder], Callable[[Any], tuple[float, ...]]] = MappingProxyType(
+    {
+        Absolute: lambda _: (0.0, 0.0, 0.0, 0.0),
+        Residual: lambda _: (0.0, 1.0, 1.0, 0.0),
+        Flip: lambda _: (1.0, 0.0, 1.0, 0.0),
+        Blend: lambda blend: (blend.flip, 1 - blend.flip, 1.0, 0.0),
+        Acceleration: lambda _: (0.0, 1.0, 1.0, 1.0),
+    }
+)
+"""Decoders as numbers, see `KernelParameters`."""
+
+
+@dataclass(frozen=True, eq=False)
+class KernelParameters:
+    """The numbers of an emulator.
+
+    Args:
+        shape, wraps: Cells along each axis, and whether it is periodic.
+        box: (2, D) the grid's lower corner and the cells' widths, in domain length.
+        bounds, ratio: As in `nmpm.emulator.fused`.
+        p2g_nodes, g2p_nodes: Nodes along an axis of the kernels of p2g and g2p.
+        particle_volume: In cells.
+        mass: (M,) of a particle of each material.
+        solid: Whether the grid state has a solid channel.
+        constants: Whether gravity is among its channels.
+        decoder: Shares of the particle's own and of the grid's velocity in the one at the start, and of gravity; 1 if
+            each frame's velocity is carried to the next.
+        rest_speed: Cells per frame; 0 for none.
+        obstacles: Whether there can be obstacles.
+        solids: Whether particles must keep clear of them.
+        floors: (D, 2) int64, as `nmpm.emulator.support.floor_rows`.
+        density_cap: Volume fraction above which cells are overfull; 0 for no cap.
+    """
+
+    shape: tuple[int, ...]
+    wraps: tuple[bool, ...]
+    box: Array
+    bounds: Array
+    ratio: Array
+    p2g_nodes: int
+    g2p_nodes: int
+    particle_volume: float
+    mass: Array
+    solid: bool
+    constants: bool
+    decoder: tuple[np.float32, ...]
+    rest_speed: float
+    obstacles: bool
+    solids: bool
+    floors: Array
+    density_cap: float
+
+    @cached_property
+    def grid(self) -> tuple[Any, ...]:
+        """Shape and periodic axes."""
+        return self.shape, self.wraps
+
+    @cached_property
+    def p2g_grid(self) -> tuple[Any, ...]:
+        """Shape, periodic axes and steps of p2g."""
+        return self.shape, self.wraps, (0,) * self.p2g_nodes
+
+    @cached_property
+    def g2p_grid(self) -> tuple[Any, ...]:
+        """Shape, periodic axes and steps of g2p."""
+        return self.shape, self.wraps, (0,) * self.g2p_nodes
+
+    @cached_property
+    def size(self) -> int:
+        """Number of cells."""
+        return math.prod(self.shape)
+
+    @cached_property
+    def volume_channels(self) -> tuple[int, int]:
+        """The grid state's first channel that is a volume fraction, and the one after the last."""
+        return len(self.mass) * len(self.shape), len(self.mass) * (len(self.shape) + 1)
+
+    @cached_property
+    def channels(self) -> int:
+        """Number of channels of the grid state."""
+        return self.volume_channels[1] + self.solid + len(self.shape) * self.constants
+
+    @property
+    def trains(self) -> bool:
+        """Whether trainings take the kernels with gradients, see `nmpm.emulator.fused.autograd`.
+
+        Not in three dimensions: beside them torch's strided 3-D convolutions in bfloat16 sometimes got weights'
+        gradients of unset memory (torch 2.13, CPU with AVX-512), which they do not beside tensor operations.
+        """
+        return len(self.shape) == 2 and self.p2g_nodes == self.g2p_nodes == 2 and not self.bounds[2].any()
+
+
+def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
+    """The parameters; None if the emulator has parts without kernels, or lies too far from the origin for float32."""
+    scene, grid, constraints = recipe.scene, recipe.grid, recipe.constraints
+    transfer, decoder = type(recipe.transfer), type(recipe.decoder)
+    if scene.dim == 1 or scene.fields or not grid.resolves(torch.float32):
+        return None
+    if transfer not in _P2G_NODES or decoder not in _DECODERS or constraints.bounds not in ("stop", "reflect"):
+        return None
+    spacing = np.array(grid.spacing)
+    low, high = (np.array(scene.bounds).T - np.array(grid.lower)) / spacing
+    low, high = np.where(grid.periodic, -np.inf, low), np.where(grid.periodic, np.inf, high)
+    ratio = spacing / spacing[0]
+    is_square = np.all(np.abs(ratio - 1) < 1e-6)
+    return KernelParameters(
+        shape=grid.shape,
+        wraps=grid.periodic,
+        box=np.array((grid.lower, grid.spacing), np.float32),
+        bounds=np.array((low, high, np.full(scene.dim, constraints.bounds == "reflect")), np.float32),
+        ratio=np.where(is_square, 1.0, ratio).astype(np.float32),
+        p2g_nodes=_P2G_NODES[transfer],
+        g2p_nodes=_G2P_NODES[transfer],
+        particle_volume=scene.particle_volume / grid.cell_volume,
+        mass=np.array(scene.densities or (1.0,) * len(scene.materials), np.float32),
+        solid=scene.walled,
+        constants=scene.gravity_varies,
+        decoder=tuple(map(np.float32, _DECODERS[decoder](recipe.decoder))),
+        rest_speed=constraints.rest_speed,
+        obstacles=scene.obstacles,
+        solids=constraints.solids,
+        floors=np.array(floor_rows(scene, grid), np.int64),
+        density_cap=constraints.density_cap,
+    )
