@@ -19,7 +19,7 @@ from rolling import roll_to_end
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
 from nmpm.emulator import Emulator, RolloutContext
-from nmpm.emulator.fused.direct import DirectCall
+from nmpm.emulator.fused.call import KernelCall
 from nmpm.errors import ConfigError
 from nmpm.evaluation.stress import ModelUnderTest
 from nmpm.particles import Particles
@@ -41,10 +41,10 @@ def late_state(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext
 
 def split_call(emulator: Emulator, particles: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:
     """The whole call, and each of its parts on the values that the call gives it."""
-    plan = emulator._plan
-    if plan is None:
-        raise ConfigError("Its parts are no kernels (`nmpm.emulator.fused.plan`): profile another model.")
-    call = DirectCall(emulator, plan, context)
+    parameters = emulator.kernel_parameters
+    if parameters is None:
+        raise ConfigError("Its parts are no kernels (`nmpm.emulator.fused.parameters`): profile another model.")
+    call = KernelCall(emulator, parameters, context)
     start = call.rasterise(particles)
     normalised = call.normalise(start)
     output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)

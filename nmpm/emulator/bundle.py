@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from nmpm.emulator.fused.views import Views
+from nmpm.emulator.fused.arrays import ArrayCache
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
-    from nmpm.emulator.fused.surroundings import Surroundings
+    from nmpm.emulator.fused.solids import SolidCache
 
 
 @dataclass(frozen=True)
@@ -81,17 +81,19 @@ class RolloutContext:
     Args:
         solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
         budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
-        surroundings: What the kernels have prepared of each scene's solids; None for nothing.
-        views: What the kernels have converted to arrays; None to convert everything in each call.
+        solid_caches: What kernels have prepared of each scene's solids; None to prepare it in each call.
+        array_cache: Tensors that kernels have converted to arrays; None to convert them in each call.
     """
 
     solid: Tensor
     budget: Tensor | None
-    surroundings: tuple[Surroundings, ...] | None = None
-    views: Views | None = None
+    solid_caches: tuple[SolidCache, ...] | None = None
+    array_cache: ArrayCache | None = None
 
     def scenes(self, chosen: list[int]) -> RolloutContext:
         """The context of part of the batch."""
-        surroundings = None if self.surroundings is None else tuple(self.surroundings[scene] for scene in chosen)
         budget = None if self.budget is None else self.budget[chosen]
-        return RolloutContext(self.solid[chosen], budget, surroundings, None if self.views is None else Views())
+        if self.solid_caches is None:
+            return RolloutContext(self.solid[chosen], budget)
+        caches = tuple(self.solid_caches[scene] for scene in chosen)
+        return RolloutContext(self.solid[chosen], budget, caches, ArrayCache())

@@ -23,8 +23,7 @@ from nmpm.emulator.bundle import Bundle as Bundle
 from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.fields import FieldScales
-from nmpm.emulator.fused.plan import make_plan
-from nmpm.emulator.fused.views import Views
+from nmpm.emulator.fused.parameters import kernel_parameters
 from nmpm.emulator.prediction import steps_for
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
@@ -68,7 +67,7 @@ class Emulator(nn.Module):
     def __init__(self, recipe: EmulatorRecipe) -> None:
         super().__init__()
         self.recipe = recipe
-        self._plan = make_plan(recipe)
+        self.kernel_parameters = kernel_parameters(recipe)
         self.runtime: Runtime = Eager()
         self.thread_choice: ThreadChoice | None = None
         self.grid = recipe.grid
@@ -178,7 +177,7 @@ class Emulator(nn.Module):
 
     def _with_recipe(self, recipe: EmulatorRecipe) -> Emulator:
         other = copy.copy(self)
-        other.recipe, other.grid, other._plan = recipe, recipe.grid, make_plan(recipe)
+        other.recipe, other.grid, other.kernel_parameters = recipe, recipe.grid, kernel_parameters(recipe)
         return other
 
     def with_grid_moved(self, shift: Sequence[float]) -> Emulator:
@@ -227,9 +226,7 @@ class Emulator(nn.Module):
         """
         self.field_scales.warn_of_missing(particles)
         solid = self.solid(particles)
-        surroundings = steps_for(self, self._plan, particles, solid).prepare_rollout(solid)
-        views = None if surroundings is None else Views()
-        return RolloutContext(solid, self.budget(particles), surroundings, views=views)
+        return steps_for(self, particles, solid).prepare_rollout(solid, self.budget(particles))
 
     def solid(self, particles: Particles) -> Tensor:
         """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
@@ -274,7 +271,7 @@ class Emulator(nn.Module):
 
     def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
         """The bundle, with only the network left to the runtime."""
-        return steps_for(self, self._plan, particles, context.solid).predict(self, particles, context)
+        return steps_for(self, particles, context.solid).predict(particles, context)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *options: Any) -> None:
         """As torch's, of plain weights also into a network that is wrapped by `torch.compile`."""

@@ -18,36 +18,36 @@ from torch import Tensor
 
 from nmpm._support.collectives import normal_like
 from nmpm.emulator.bundle import Bundle, BundleStart, RolloutContext
-from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.fused.arrays import ArrayCache
+from nmpm.emulator.fused.parameters import KernelParameters
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
 from nmpm.transfer.execution import kernels_take
 
 if TYPE_CHECKING:
-    from nmpm.emulator.fused.surroundings import Surroundings
     from nmpm.emulator.model import Emulator
 
 
+@dataclass(frozen=True)
 class Steps(ABC):
     """How an emulator's calls are computed."""
 
-    def prepare_rollout(self, solid: Tensor) -> tuple[Surroundings, ...] | None:  # noqa: ARG002 (nothing to prepare)
-        """What is prepared for a rollout among solids (B, C_solid, *S), for `RolloutContext.surroundings`."""
-        return None
+    emulator: Emulator
+
+    def prepare_rollout(self, solid: Tensor, budget: Tensor | None) -> RolloutContext:
+        """The context of a rollout; arguments as there."""
+        return RolloutContext(solid, budget)
 
     @abstractmethod
-    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
         """The next m frames, from these steps and the emulator's network."""
 
 
-@dataclass(frozen=True)
 class TensorSteps(Steps):
     """The steps as tensor operations; subclasses replace some of them."""
 
-    emulator: Emulator
-
-    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        device = particles.position.device.type
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
+        emulator, device = self.emulator, particles.position.device.type
         with _full_precision(device):
             cells, velocity, gravity, state = self.rasterise(particles, context.solid)
             normalised = emulator.normalise(state)
@@ -113,22 +113,20 @@ class FusedSteps(Steps):
     """All steps as kernels; only for what `steps_for` gives them to.
 
     Args:
-        plan: Of the emulator.
-        walls: (*S), the share of each cell that is wall.
+        parameters: Of the emulator.
     """
 
-    plan: Plan
-    walls: Tensor
+    parameters: KernelParameters
 
-    def prepare_rollout(self, solid: Tensor) -> tuple[Surroundings, ...] | None:
-        from nmpm.emulator.fused.surroundings import survey_rollout  # imported late, as Numba is
+    def prepare_rollout(self, solid: Tensor, budget: Tensor | None) -> RolloutContext:
+        from nmpm.emulator.fused.solids import prepare_solids  # imported late, as Numba is
 
-        return survey_rollout(self.plan, solid, self.walls)
+        return RolloutContext(solid, budget, prepare_solids(self.parameters, solid, self.emulator.walls), ArrayCache())
 
-    def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        from nmpm.emulator.fused.direct import predict
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
+        from nmpm.emulator.fused.call import predict
 
-        return predict(emulator, self.plan, particles, context)
+        return predict(self.emulator, self.parameters, particles, context)
 
 
 @dataclass(frozen=True)
@@ -136,48 +134,48 @@ class TrainingSteps(TensorSteps):
     """The steps of trainings as kernels with gradients; only for what `steps_for` gives them to.
 
     Args:
-        plan: Of the emulator.
+        parameters: Of the emulator.
     """
 
-    plan: Plan
+    parameters: KernelParameters
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        from nmpm.emulator.fused.training import Rasterise
+        from nmpm.emulator.fused.autograd import Rasterise
 
         own = particles
         cells, velocity, gravity, state = Rasterise.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
-            self.plan, own.position, own.velocity, own.gravity, own.material, own.mask, solid
+            self.parameters, own.position, own.velocity, own.gravity, own.material, own.mask, solid
         )
         return cells, velocity, gravity, state
 
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
-        from nmpm.emulator.fused.training import FreePath
+        from nmpm.emulator.fused.autograd import FreePath
 
         path: Tensor = FreePath.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
-            self.plan, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
+            self.parameters, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
             start.output, start.scale,
         )  # fmt: skip
         return path
 
 
-def steps_for(emulator: Emulator, plan: Plan | None, particles: Particles, solid: Tensor) -> Steps:
+def steps_for(emulator: Emulator, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
-    Kernels run on a CPU, in float32, for the parts of this package (`make_plan`) and outside of `without_kernels`:
-    in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation mode those without.
+    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`) and outside of
+    `without_kernels`: in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation
+    mode those without.
     Graphs that `torch.compile` traces take tensor operations.
     """
     own = (particles.position, particles.velocity)
     fixed = (particles.gravity, solid)
-    kernels = plan is not None and emulator.precision == torch.float32 and kernels_take(*own, particles.gravity)
-    if plan is None or not kernels or torch.compiler.is_compiling():
+    parameters, is_float32 = emulator.kernel_parameters, emulator.precision == torch.float32
+    if parameters is None or not is_float32 or not kernels_take(*own, particles.gravity):
+        return TensorSteps(emulator)
+    if torch.compiler.is_compiling() or _needs_gradients(*fixed):
         return TensorSteps(emulator)
     if emulator.training:
-        covered = plan.trains and not _needs_gradients(*fixed)
-        return TrainingSteps(emulator, plan) if covered else TensorSteps(emulator)
-    if _needs_gradients(*own, *fixed, *emulator.parameters()):
-        return TensorSteps(emulator)
-    return FusedSteps(plan, emulator.walls)
+        return TrainingSteps(emulator, parameters) if parameters.trains else TensorSteps(emulator)
+    return TensorSteps(emulator) if _needs_gradients(*own, *emulator.parameters()) else FusedSteps(emulator, parameters)
 
 
 def _needs_gradients(*tensors: Tensor) -> bool:

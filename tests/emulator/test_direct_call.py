@@ -9,10 +9,9 @@ from scenes import box, cloud
 
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.fused.arrays import output_arrays
-from nmpm.emulator.fused.batch import to_grid
-from nmpm.emulator.fused.direct import DirectCall
-from nmpm.emulator.fused.views import Views
+from nmpm.emulator.fused.arrays import ArrayCache, as_grid
+from nmpm.emulator.fused.call import KernelCall
+from nmpm.emulator.fused.state import output_arrays
 from nmpm.processors import Pointwise
 from nmpm.transfer import without_kernels
 
@@ -23,7 +22,7 @@ def small_emulator(scene, **parts):
 
 
 def test_views_follow_their_tensors():
-    views, values = Views(), torch.arange(6.0).reshape(2, 3)
+    views, values = ArrayCache(), torch.arange(6.0).reshape(2, 3)
     first = views.array("values", values)
     assert views.array("values", values) is first
     values += 1
@@ -34,7 +33,7 @@ def test_views_follow_their_tensors():
 
 
 def test_copies_are_not_kept():
-    views, values = Views(), torch.arange(6.0).reshape(2, 3).T
+    views, values = ArrayCache(), torch.arange(6.0).reshape(2, 3).T
     assert views.array("values", values).flags.c_contiguous
     values += 1
     assert np.array_equal(views.array("values", values), values.numpy())
@@ -53,7 +52,7 @@ def test_a_rollouts_context_follows_what_changes(change):
         particles = dataclasses.replace(particles, gravity=-particles.gravity)
     else:
         particles.mask[:, 40:] = False
-    unprepared = dataclasses.replace(context, views=None)
+    unprepared = dataclasses.replace(context, array_cache=None)
     assert not torch.equal(emulator(particles, context).position, before)
     assert torch.equal(emulator(particles, context).position, emulator(particles, unprepared).position)
 
@@ -67,9 +66,9 @@ def test_the_network_sees_what_tensor_operations_give(dim):
     emulator.input_high.fill_(0.3)
     emulator.input_mean.copy_(torch.randn_like(emulator.input_mean))
     emulator.input_std.copy_(1 + torch.rand_like(emulator.input_std))
-    call = DirectCall(emulator, emulator._plan, emulator.context(particles))
+    call = KernelCall(emulator, emulator.kernel_parameters, emulator.context(particles))
     start = call.rasterise(particles)
-    state = to_grid(emulator._plan, start.state)
+    state = as_grid(start.state, emulator.grid.shape)
     expected = emulator.normalise(state)
     assert expected.isnan().any()
     torch.testing.assert_close(call.normalise(start), expected, rtol=1e-6, atol=1e-6, equal_nan=True)

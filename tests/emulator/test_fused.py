@@ -15,7 +15,7 @@ from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.fused.direct import DirectCall
+from nmpm.emulator.fused.call import KernelCall
 from nmpm.emulator.prediction import FusedSteps, TensorSteps, steps_for
 from nmpm.emulator.rollouts import rollout
 from nmpm.particles import Particles
@@ -48,10 +48,10 @@ def scene_of(dim, walls, materials, obstacles=False, gravity=True, slim=False):
 def predict_both(emulator, particles):
     """A bundle's positions in cells, by kernels and by tensor operations."""
     with torch.no_grad():
-        assert isinstance(steps_for(emulator, emulator._plan, particles, emulator.solid(particles)), FusedSteps)
+        assert isinstance(steps_for(emulator, particles, emulator.solid(particles)), FusedSteps)
         fused = emulator(particles)
         with without_kernels():
-            assert isinstance(steps_for(emulator, emulator._plan, particles, emulator.solid(particles)), TensorSteps)
+            assert isinstance(steps_for(emulator, particles, emulator.solid(particles)), TensorSteps)
             tensors = emulator(particles)
     spacing = torch.tensor(emulator.grid.spacing)
     return [torch.stack([b.position[:, -1], b.velocity]) / spacing for b in (fused, tensors)]
@@ -136,8 +136,8 @@ def test_particles_far_from_obstacles_need_no_contact_to_the_bit(seed, dim, wall
     emulator, particles = emulator_of(scene, seed=seed), cloud(scene, 300, 2, speed, seed, statics=3)
     with torch.no_grad():
         context = emulator.context(particles)
-        unprepared = dataclasses.replace(context, surroundings=None)
-        assert context.surroundings[0].clearance.max() > 1
+        unprepared = dataclasses.replace(context, solid_caches=None)
+        assert context.solid_caches[0].clearance.max() > 1
         assert torch.equal(emulator(particles, context).position, emulator(particles, unprepared).position)
 
 
@@ -202,11 +202,11 @@ def test_padding_changes_nothing_beside_obstacles_however_fast_and_wherever_it_i
 
 def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):
     scene = box(obstacles=True)
-    for name in ("path._CHUNK", "rasterise._CHUNK", "batch._CHUNK"):
+    for name in ("call.CHUNK", "contact.CHUNK", "path.CHUNK", "rest.CHUNK", "state._CHUNK"):
         monkeypatch.setattr(f"nmpm.emulator.fused.{name}", 256)
     emulator = emulator_of(scene, constraints=Constraints(energy=True, rest_speed=0.01)).requires_grad_(False)
     particles, threads, positions = cloud(scene, 3000, 2, statics=20), torch.get_num_threads(), []
-    call = DirectCall(emulator, emulator._plan, emulator.context(particles))
+    call = KernelCall(emulator, emulator.kernel_parameters, emulator.context(particles))
     output = torch.randn(2, emulator.frames, 2, *emulator.grid.shape)
     try:
         for number in (1, 3):
@@ -250,7 +250,7 @@ def test_gradients_and_everything_else_take_tensor_operations():
     emulator, particles = emulator_of(scene), cloud(scene, 10)
 
     def fused(model=emulator, state=particles):
-        return isinstance(steps_for(model, model._plan, state, model.solid(state)), FusedSteps)
+        return isinstance(steps_for(model, state, model.solid(state)), FusedSteps)
 
     assert not fused()  # the weights want gradients
     with torch.no_grad():

@@ -30,7 +30,7 @@ def scene_of(dim, walls, materials, obstacles=False):
 
 
 def steps_of(emulator, particles):
-    return steps_for(emulator, emulator._plan, particles, emulator.solid(particles))
+    return steps_for(emulator, particles, emulator.solid(particles))
 
 
 def train_once(emulator, particles, bundles=2):

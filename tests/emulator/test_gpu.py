@@ -109,7 +109,7 @@ def test_bundles_are_those_of_tensor_operations(name, device):
         context = emulator.context(state)
         for _ in range(2):
             there = emulator.with_runtime("triton")(state, context)
-            here = TensorSteps(emulator).predict(emulator, state, context)
+            here = TensorSteps(emulator).predict(state, context)
             real = state.mask
             gap = (there.position - here.position).abs().amax((1, 3)) / emulator.grid.spacing[0]
             assert gap[real].max() < 1e-4

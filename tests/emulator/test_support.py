@@ -15,7 +15,7 @@ from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.fused.support import support as fill_support
+from nmpm.emulator.fused.rest import find_support
 from nmpm.emulator.rollouts import rollout
 from nmpm.emulator.support import MAX_DROP, REACH, Support, drops, floor_rows
 from nmpm.grid import Grid
@@ -203,7 +203,7 @@ def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obst
         state = support.filled[scene].flatten(1).T.contiguous().numpy()
         share = np.empty(0, np.float32) if support.obstacle is None else support.obstacle[scene].flatten().numpy()
         grid = (support.grid.shape, support.grid.periodic)
-        fill_support(state, (0, 1), share, pull[scene, 0].numpy(), grid, floors, held)
+        find_support(state, (0, 1), share, pull[scene, 0].numpy(), grid, floors, held)
         assert np.array_equal(held, expected[scene].flatten().numpy())
 
 

@@ -61,8 +61,11 @@ class Rasterise(torch.autograd.Function):
         volume = np.float32(own.particle_volume)
 
         def follow(b: int) -> None:
-            arrays = (values[b] for values in inputs)
-            rasterise_back(*arrays, own.grid, rows[b], volume, own.box, grad_state[b], grad_cells[b], grad_moved[b])
+            speeds, kind, real, here = (values[b] for values in inputs)
+            rasterise_back(
+                speeds, kind, real, here, own.grid, rows[b], volume, own.box, grad_state[b], grad_cells[b],
+                grad_moved[b],
+            )  # fmt: skip
 
         for_each(follow, len(cells), torch.get_num_threads())
         return None, torch.from_numpy(grad_cells), torch.from_numpy(grad_moved), *(None,) * 4

@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 _STATISTICS = ("input_low", "input_high", "input_mean", "input_std")
 
 
-def predict(
-    emulator: Emulator, parameters: KernelParameters, particles: Particles, context: RolloutContext
-) -> Bundle:
+def predict(emulator: Emulator, parameters: KernelParameters, particles: Particles, context: RolloutContext) -> Bundle:
     """The bundle of an emulator in evaluation mode, see `Emulator.predict`."""
     call = KernelCall(emulator, parameters, context)
     start = call.rasterise(particles)
@@ -66,9 +64,9 @@ class KernelCall:
 
     def normalise(self, start: StartArrays) -> Tensor:
         """(B, C_in, *S), as `Emulator.normalise` of the grid state."""
-        statistics = (self._statistic(name) for name in _STATISTICS)
+        low, high, mean, deviation = (self._statistic(name) for name in _STATISTICS)
         seen, rows = np.empty_like(start.state), (-1, self._parameters.channels)
-        normalise(start.state.reshape(rows), *statistics, seen.reshape(rows))
+        normalise(start.state.reshape(rows), low, high, mean, deviation, seen.reshape(rows))
         return as_grid(seen, self._parameters.shape)
 
     def path(self, start: StartArrays, output: Tensor) -> Array:
@@ -113,8 +111,8 @@ class KernelCall:
 
     @cached_property
     def _solids(self) -> tuple[SolidCache, ...]:
-        prepared = self._context.solid_caches
-        return prepare_solids(self._parameters, self._context.solid, self._emulator.walls) if prepared is None else prepared
+        context = self._context
+        return context.solid_caches or prepare_solids(self._parameters, context.solid, self._emulator.walls)
 
 
 @jit

@@ -165,8 +165,9 @@ def follow(
 
 @jit
 def slide(
-    path: Any, obstacle: Any, grid: Any, bounds: Any, pieces: Any, finer: Any, rows: Any, free: Any, place: Any, along: Any
-) -> Any:
+    path: Any, obstacle: Any, grid: Any, bounds: Any, pieces: Any, finer: Any, rows: Any, free: Any, place: Any,
+    along: Any,
+) -> Any:  # fmt: skip
     """Let particles go on along the surface from where they touch; arguments as of `follow`.
 
     What is left of the way is gone straight, evenly over the frames left, until the surface bends into it: looked at in

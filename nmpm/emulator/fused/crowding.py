@@ -46,7 +46,7 @@ def spread_crowds(
     if flow is None:
         return
     obstacle, spread = solids.obstacle if parameters.solids else _NONE, np.empty_like(path)
-    move = partial(drift, flow, path, start.mask, obstacle, *parameters.grid, parameters.bounds, spread)
+    move = partial(drift, flow, path, start.mask, obstacle, parameters.grid, parameters.bounds, spread)
     map_ranges(move, split(len(start.cells), CHUNK), threads)
     share = 1.0 if budget is None else _affordable_share(start, path, spread, parameters, budget, threads)
     path[:] = spread if share == 1 else path + np.float32(share) * (spread - path)
@@ -58,7 +58,7 @@ def _find_flow(
     """(size, D) displacements at the nodes; None where no cell is overfull."""
     if free is None or not len(start.cells):
         return None
-    count = partial(count_particles, path[-1], start.mask, *parameters.grid)
+    count = partial(count_particles, path[-1], start.mask, parameters.grid)
     parts = map_ranges(count, split(len(start.cells), max(_COUNTED, 4 * parameters.size)), threads)
     counts = parts[0]
     for part in parts[1:]:
@@ -93,14 +93,14 @@ def _affordable_share(
 
 
 @jit
-def count_particles(cells: Any, mask: Any, shape: Any, wraps: Any, low: Any, high: Any) -> Any:
+def count_particles(cells: Any, mask: Any, grid: Any, low: Any, high: Any) -> Any:
     """(size, 1) particles `low` to `high` on each node, linearly."""
     size = 1
-    for extent in shape:
+    for extent in grid[0]:
         size *= extent
     counts = np.zeros((size, 1), np.float32)
     nothing, only = np.empty((high - low, 0), np.float32), np.empty(0, np.int64)
-    scatter(nothing, only, mask[low:high], cells[low:high], shape, wraps, _LINEAR, counts)
+    scatter(nothing, only, mask[low:high], cells[low:high], grid[0], grid[1], _LINEAR, counts)
     return counts
 
 
@@ -183,15 +183,14 @@ def _add_difference(entering: Any, leaving: Any, left: Any) -> Any:
 
 @jit
 def drift(
-    flow: Any, path: Any, mask: Any, obstacle: Any, shape: Any, wraps: Any, bounds: Any, spread: Any, low: Any, high: Any
+    flow: Any, path: Any, mask: Any, obstacle: Any, grid: Any, bounds: Any, spread: Any, low: Any, high: Any
 ) -> Any:
     """Fill in the path with the displacement at its end spread evenly over its frames.
 
     Args:
         flow: (size, D), from `push`.
-        path, mask, bounds, low, high: As in `nmpm.emulator.fused`; padding stays.
+        path, mask, grid, bounds, low, high: As in `nmpm.emulator.fused`; padding stays.
         obstacle: Likewise; nobody is spread into it.
-        shape, wraps: Of the grid.
         spread: (m, N, D), is filled.
     """
     frames, dim = path.shape[0], path.shape[2]
@@ -199,7 +198,7 @@ def drift(
     places, values = np.empty((frames, dim), np.float32), np.empty(frames, np.float32)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
-        gather(flow, only, path[frames - 1, begin:end], shape, wraps, _LINEAR, shift)
+        gather(flow, only, path[frames - 1, begin:end], grid[0], grid[1], _LINEAR, shift)
         for p in range(end - begin):
             for d in range(dim):
                 way = shift[p, d] if mask[begin + p] else ZERO
@@ -213,7 +212,7 @@ def drift(
                 for p in range(len(here)):
                     moved[p, d] = confine(here[p, d] + part * shift[p, d], lowest, highest, reflects)
         if len(obstacle):
-            _take_back(path, obstacle, (shape, wraps), shift, begin, end, places, values, spread)
+            _take_back(path, obstacle, grid, shift, begin, end, places, values, spread)
 
 
 @jit

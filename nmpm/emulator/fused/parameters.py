@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Decoder, Flip, Residual
 from nmpm.emulator.support import floor_rows
-from nmpm.transfer import Affine, Linear, Nearest, Quadratic, Transfer
+from nmpm.transfer import Linear, Nearest, Quadratic, Transfer
 
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe

@@ -120,15 +120,15 @@ def free_path(
     """
     frames, dim = len(fields), cells.shape[1]
     energies = np.zeros(frames)
-    gathered, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
+    scratch, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
         start, kinds = cells[begin:end], material[begin:end]
-        _fill_carried(start, velocity[begin:end], kinds, grid, state, decoder, gathered, carried[begin:end])
+        _fill_carried(start, velocity[begin:end], kinds, grid, state, decoder, scratch, carried[begin:end])
         for frame in range(frames):
             here = path[frame - 1, begin:end] if frame > 0 else start
             _move_block(
-                cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, gathered, kept
+                cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, scratch, kept
             )
             if len(mass):
                 arrived = path[frame, begin:end]
@@ -208,8 +208,8 @@ def energy(cells: Any, arrived: Any, before: Any, gravity: Any, mass: Any, ratio
 
 @jit
 def propose_frame(
-    cells: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, fields: Any, decoder: Any, bounds: Any,
-    ratio: Any, carried: Any, path: Any, frame: Any, low: Any, high: Any,
+    cells: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, fields: Any, decoder: Any,
+    bounds: Any, ratio: Any, carried: Any, path: Any, frame: Any, low: Any, high: Any,
 ) -> Any:  # fmt: skip
     """Fill in a frame of the path as if it were free.
 
@@ -219,11 +219,11 @@ def propose_frame(
     """
     sums = np.zeros(5)
     dim = cells.shape[1]
-    gathered, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
+    scratch, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
         _move_block(
-            cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, gathered, kept
+            cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, scratch, kept
         )
         for p in range(begin, end):
             kinetic, fall, height, gains = _balance(cells, velocity, gravity, ratio, path, frame, p)

@@ -20,7 +20,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class StartArrays(NamedTuple):
-    """Particles and grid state at a bundle's start, see `nmpm.emulator.fused`; of B scenes with a first axis for them."""
+    """Particles and grid state at a bundle's start, see `nmpm.emulator.fused`; of B scenes: with a first axis (B,)."""
 
     cells: Array
     velocity: Array

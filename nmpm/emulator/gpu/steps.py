@@ -13,7 +13,7 @@ from nmpm.emulator.bundle import BundleStart, RolloutContext
 from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
 from nmpm.emulator.contact import SURFACE, obstacle_share
 from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
-from nmpm.emulator.fused.plan import Plan
+from nmpm.emulator.fused.parameters import KernelParameters
 from nmpm.emulator.gpu import contact, crowding, flight, grid
 from nmpm.emulator.prediction import TensorSteps
 from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
@@ -31,47 +31,47 @@ class TritonSteps(TensorSteps):
     """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.Triton` takes. States are contiguous.
 
     Args:
-        plan: Of the emulator.
+        parameters: Of the emulator.
     """
 
-    plan: Plan
+    parameters: KernelParameters
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        plan, materials = self.plan, len(self.plan.mass)
+        own, materials = self.parameters, len(self.parameters.mass)
         cells, velocity, gravity = (values.contiguous() for values in self.emulator.in_cells(particles))
-        sums = cells.new_zeros(len(cells), *plan.shape, 3 * materials)
+        sums = cells.new_zeros(len(cells), *own.shape, 3 * materials)
         grid.scatter[_programs(cells)](
             cells, velocity, particles.material, particles.mask, sums, cells.shape[1], **self._axes,
             MATERIALS=materials, BLOCK=_BLOCK,
         )  # fmt: skip
         count = sums[..., 2 * materials :]
         mean = sums[..., : 2 * materials] / torch.where(count > 0, count, 1.0).repeat_interleave(2, dim=-1)
-        parts = [mean, count * plan.particle_volume, solid.movedim(1, -1)]
-        if plan.constants:
-            parts.append(gravity.unsqueeze(1).expand(-1, *plan.shape, -1))
+        parts = [mean, count * own.particle_volume, solid.movedim(1, -1)]
+        if own.constants:
+            parts.append(gravity.unsqueeze(1).expand(-1, *own.shape, -1))
         return cells, velocity, gravity, torch.cat(parts, dim=-1).movedim(-1, 1)
 
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
-        plan, (tiles, batch), frames = self.plan, _programs(start.cells), start.output.shape[1]
+        own, (tiles, batch), frames = self.parameters, _programs(start.cells), start.output.shape[1]
         path = start.cells.new_empty(batch, frames + 1, start.cells.shape[1], 2)
         sums = path.new_empty(batch, frames, tiles, flight.SUMS.value)
         share, weight = self._share(context), self._weight(start)
         self._advance(start, weight, context.budget, path, sums)
-        if plan.obstacles and plan.solids:
+        if own.obstacles and own.solids:
             self._hold(path, weight, share, sums)
-        if plan.rest_speed:
+        if own.rest_speed:
             self._rest(start, path, share)
         return path[:, 1:]
 
     def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
-        plan, (tiles, batch), frames = self.plan, _programs(start.cells), path.shape[1]
+        own, (tiles, batch), frames = self.parameters, _programs(start.cells), path.shape[1]
         weight, count = self._weight(start), path.shape[2]
         path = torch.cat([start.cells.unsqueeze(1), path], dim=1)
         flow = self._flow(path, weight, context.solid)
         spreads, energies = torch.empty_like(path), path.new_empty(batch, frames + 1, tiles, 2)
         crowding.spread[tiles, batch](
             path, weight, start.gravity, self._share(context), flow, spreads, energies, frames, count, tiles,
-            *self._limits, float(plan.ratio[1]), **self._axes, CONTACT=plan.obstacles and plan.solids, SURFACE=SURFACE,
+            *self._limits, float(own.ratio[1]), **self._axes, CONTACT=own.obstacles and own.solids, SURFACE=SURFACE,
             SHIFT=MAX_SHIFT, BLOCK=_BLOCK,
         )  # fmt: skip
         if context.budget is not None:
@@ -83,13 +83,13 @@ class TritonSteps(TensorSteps):
     @property
     def _axes(self) -> dict[str, int]:
         """What kernels are told of the grid."""
-        (nx, ny), (wx, wy) = self.plan.shape, self.plan.wraps
+        (nx, ny), (wx, wy) = self.parameters.shape, self.parameters.wraps
         return {"nx": nx, "ny": ny, "WX": int(wx), "WY": int(wy)}
 
     @property
     def _limits(self) -> tuple[float, ...]:
         """Lowest and highest position along the first and the second axis, in cells."""
-        low, high, _ = self.plan.limits
+        low, high, _ = self.parameters.bounds
         return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
     def _weight(self, start: BundleStart) -> Tensor:
@@ -99,18 +99,18 @@ class TritonSteps(TensorSteps):
     def _share(self, context: RolloutContext) -> Tensor:
         """(B, 1, *S) share of each cell's room that is obstacle; of no use where there are no obstacles."""
         walls = self.emulator.walls
-        return obstacle_share(context.solid, walls).contiguous() if self.plan.obstacles else walls
+        return obstacle_share(context.solid, walls).contiguous() if self.parameters.obstacles else walls
 
     def _advance(self, start: BundleStart, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor) -> None:
-        plan, fields, (batch, frames, tiles, _) = self.plan, start.fields, sums.shape
-        kept, of_grid, fall, keeps = plan.decoder
+        own, fields, (batch, frames, tiles, _) = self.parameters, start.fields, sums.shape
+        kept, of_grid, fall, keeps = map(float, own.decoder)
         state, carried = start.state.movedim(1, -1).contiguous(), torch.empty_like(start.cells)
         for frame in range(frames + 1):
             flight.advance[tiles, batch](
                 start.cells, start.velocity, start.material, weight, start.gravity, state, fields,
                 sums if budget is None else budget, carried, path, sums, frame, frames, path.shape[2], tiles,
-                plan.channels, *self._limits, float(plan.ratio[1]), *fields.stride(), **self._axes,
-                MATERIALS=len(plan.mass), OWN=kept, GRID=of_grid, FALL=fall, KEEPS=keeps > 0,
+                own.channels, *self._limits, float(own.ratio[1]), *fields.stride(), **self._axes,
+                MATERIALS=len(own.mass), OWN=kept, GRID=of_grid, FALL=fall, KEEPS=keeps > 0,
                 LIMITED=budget is not None, FIRST=frame == 0, LAST=frame == frames, BLOCK=_BLOCK, TILES=_power(tiles),
             )  # fmt: skip
 
@@ -125,34 +125,34 @@ class TritonSteps(TensorSteps):
         )
 
     def _rest(self, start: BundleStart, path: Tensor, share: Tensor) -> None:
-        plan, longest, batch = self.plan, max(self.plan.shape), len(path)
-        held = start.mask.new_empty(batch, plan.size, dtype=torch.int8)
-        (left, right), (down, up) = plan.floors
-        known: dict[str, Any] = {"OBSTACLES": plan.obstacles, "SURFACE": SURFACE} | self._axes
+        own, longest, batch = self.parameters, max(self.parameters.shape), len(path)
+        held = start.mask.new_empty(batch, own.size, dtype=torch.int8)
+        (left, right), (down, up) = own.floors.tolist()
+        known: dict[str, Any] = {"OBSTACLES": own.obstacles, "SURFACE": SURFACE} | self._axes
         grid.support[triton.cdiv(longest, _COLUMNS), batch](
             start.filled.contiguous(), share, start.gravity, held, **known, LEFT=left, RIGHT=right, DOWN=down, UP=up,
             REACH=REACH, ENOUGH=ENOUGH, ROWS=_power(longest), COLUMNS=_COLUMNS,
         )  # fmt: skip
         flight.rest[_programs(start.cells)](
-            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, plan.rest_speed, **known,
+            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, own.rest_speed, **known,
             FREE_FALL=FREE_FALL_SHARE, DROP=MAX_DROP, BLOCK=_BLOCK,
         )  # fmt: skip
 
     def _flow(self, path: Tensor, weight: Tensor, solid: Tensor) -> Tensor:
         """(B, *S, 2) displacements at the nodes that spread overfull cells at the path's end."""
-        plan, (batch, frames, count, _) = self.plan, path.shape
-        taken, per_scene = (solid, plan.size) if plan.solid else (self.emulator.walls, 0)
-        counts = path.new_zeros(batch, *plan.shape)
+        own, (batch, frames, count, _) = self.parameters, path.shape
+        taken, per_scene = (solid, own.size) if own.solid else (self.emulator.walls, 0)
+        counts = path.new_zeros(batch, *own.shape)
         crowding.count_ends[_programs(path[:, 0])](path, weight, counts, count, frames - 1, **self._axes, BLOCK=_BLOCK)
-        before, after, over_nodes = torch.empty_like(counts), torch.empty_like(counts), (_blocks(plan.size), batch)
-        factor = 1 / float(plan.ratio[1]) ** 2
+        before, after, over_nodes = torch.empty_like(counts), torch.empty_like(counts), (_blocks(own.size), batch)
+        factor = 1 / float(own.ratio[1]) ** 2
         for sweep in range(SWEEPS):
             before, after = after, before
             crowding.relax[over_nodes](
-                counts, taken, per_scene, before, after, plan.particle_volume / plan.density_cap, factor, **self._axes,
+                counts, taken, per_scene, before, after, own.particle_volume / own.density_cap, factor, **self._axes,
                 CLOSED=CLOSED, FIRST=sweep == 0, BLOCK=_BLOCK,
             )  # fmt: skip
-        flow = path.new_empty(batch, *plan.shape, 2)
+        flow = path.new_empty(batch, *own.shape, 2)
         crowding.find_flow[over_nodes](taken, per_scene, after, flow, factor, **self._axes, BLOCK=_BLOCK)
         return flow
 

@@ -83,13 +83,13 @@ class Triton(CudaGraph):
     automatic: ClassVar[bool] = False
 
     def unsupported_reason(self, emulator: Emulator) -> str:
-        scene, bounds = emulator.scene, emulator.constraints.bounds
+        scene, bounds, parameters = emulator.scene, emulator.constraints.bounds, emulator.kernel_parameters
         rules = {
             f"{scene.dim} dimensions": scene.dim != 2,
             f"fields ({', '.join(scene.fields)})": bool(scene.fields),
             f"the transfer {type(emulator.transfer).__name__}": type(emulator.transfer) is not Linear,
             f"constraints.bounds {bounds}": bounds != "stop",
-            f"the decoder {type(emulator.decoder).__name__}, or for bounds so far off": emulator._plan is None,
+            f"the decoder {type(emulator.decoder).__name__}, or for bounds so far off": parameters is None,
             f"{emulator.precision}": emulator.precision != torch.float32,
             "deterministic algorithms": torch.are_deterministic_algorithms_enabled(),
         }
@@ -105,10 +105,10 @@ class Triton(CudaGraph):
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
         from nmpm.emulator.gpu.steps import TritonSteps
 
-        if emulator._plan is None:
+        if emulator.kernel_parameters is None:
             raise ConfigError(self.unsupported_reason(emulator))
-        steps = TritonSteps(emulator, emulator._plan)
-        return steps.predict(emulator, particles.map(Tensor.contiguous), context)
+        steps = TritonSteps(emulator, emulator.kernel_parameters)
+        return steps.predict(particles.map(Tensor.contiguous), context)
 
 
 class Recorded:
