@@ -88,7 +88,7 @@ KINDS = ("flip", "flip", "flip", "cut", "insert", "write", "repeat")
 BLOCKS = (
     b"\xff" * 4,
     b"\xff" * 8,
-    b"\x00" * 4,
+    bytes(4),
     b"\x80",
     b"\x7f\xff\xff\xff",
     b"9" * 400,
@@ -101,14 +101,11 @@ BLOCKS = (
 
 def random_changes(rng: random.Random) -> list[Change]:
     """One to three changes."""
-    return [
-        (
-            rng.choice(KINDS),
-            rng.random(),
-            rng.choice(BLOCKS) if rng.random() < 0.3 else rng.randbytes(rng.randint(1, 9)),
-        )
-        for _ in range(rng.randint(1, 3))
-    ]
+    changes = []
+    for _ in range(rng.randint(1, 3)):
+        kind, place = rng.choice(KINDS), rng.random()
+        changes.append((kind, place, rng.choice(BLOCKS) if rng.random() < 0.3 else rng.randbytes(rng.randint(1, 9))))
+    return changes
 
 
 def _read_foreign(folder: Path) -> None:

@@ -31,7 +31,6 @@ def test_is_converted_once_and_again_after_a_change(foreign):
     assert native_folder(foreign, Options(gravity=(0.0, -9.81))) != first
     os.utime(foreign / "train.tfrecord", ns=(1, 1))
     assert native_folder(foreign) != first
-    assert read_metadata(first).particle_types[5] == "water"
 
 
 def test_other_formats_can_be_trained_on_directly(foreign):
@@ -47,14 +46,11 @@ def test_other_formats_can_be_trained_on_directly(foreign):
 
 
 def test_a_gravity_that_contradicts_a_foreign_format_is_refused(foreign):
-    stated = METADATA | {"gravity": [0.0, -9.81]}
-    (foreign / "metadata.json").write_text(json.dumps(stated))
+    (foreign / "metadata.json").write_text(json.dumps(METADATA | {"gravity": [0.0, -9.81]}))
     native_folder(foreign, Options(gravity=(0.0, -9.81)))
     for _ in range(2):  # from the cache too
         with pytest.raises(ConfigError, match=r"\[0.0, -1.0\] contradicts .*ramps/metadata.json.*\[0.0, -9.81\]"):
             native_folder(foreign, Options(gravity=(0.0, -1.0)))
-    with pytest.raises(ConfigError, match=r"contradicts .*ramps/metadata.json"):
-        _ = TrajectoryDataModule(path=str(foreign), gravity=[0.0, -1.0], horizon=4, batch_size=1).scene
 
 
 def test_a_gravity_that_is_only_assumed_may_be_stated(tmp_path, monkeypatch):

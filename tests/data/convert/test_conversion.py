@@ -9,10 +9,9 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.data.convert import ForeignDataset, Options, convert
-from nmpm.data.convert.base import Rereadable
+from nmpm.data.convert import ForeignDataset, Options, Rereadable, convert
 from nmpm.data.convert.conversion import write_native
-from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.made_up import made_up_metadata, made_up_trajectory
@@ -20,6 +19,11 @@ from tests.made_up import made_up_metadata, made_up_trajectory
 
 def source_of(*trajectories: Trajectory, **changes) -> ForeignDataset:
     return ForeignDataset(made_up_metadata(**changes), {"train": Rereadable(lambda: iter(trajectories))})
+
+
+def broken():
+    yield made_up_trajectory(5, 3)
+    raise DataError("the second is damaged.")
 
 
 def test_an_existing_destination_is_not_overwritten(tmp_path):
@@ -30,14 +34,15 @@ def test_an_existing_destination_is_not_overwritten(tmp_path):
     assert (tmp_path / "taken" / "precious.txt").read_text() == "mine"
 
 
-def test_an_error_during_conversion_leaves_no_files(tmp_path):
-    def broken():
-        yield made_up_trajectory(5, 3)
-        raise DataError("the second is damaged")
-
+def test_an_error_leaves_no_files_or_is_collected(tmp_path):
+    source = ForeignDataset(made_up_metadata(), {"train": Rereadable(broken)})
     with pytest.raises(DataError, match="second is damaged"):
-        write_native(ForeignDataset(made_up_metadata(), {"train": Rereadable(broken)}), tmp_path / "out")
+        write_native(source, tmp_path / "out")
     assert not list(tmp_path.iterdir())
+    problems: list[str] = []
+    write_native(source, tmp_path / "out", problems)
+    assert problems == ["the second is damaged. Trajectories after it are not read."]
+    assert len(Split(tmp_path / "out" / "train.h5")) == 1
 
 
 def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_removes_its_files(tmp_path):
@@ -45,8 +50,7 @@ def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_removes_its_file
 import sys, time
 sys.path.insert(0, {str(Path.cwd())!r})
 from pathlib import Path
-from nmpm.data.convert import ForeignDataset
-from nmpm.data.convert.base import Rereadable
+from nmpm.data.convert import ForeignDataset, Rereadable
 from nmpm.data.convert.conversion import write_native
 from tests.made_up import made_up_metadata, made_up_trajectory
 def slow():
@@ -67,6 +71,7 @@ write_native(ForeignDataset(made_up_metadata(), {{"train": Rereadable(slow)}}), 
 
 
 def test_notes_on_inconsistencies(tmp_path):
+    assert write_native(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "consistent") == ()
     still, moving = made_up_trajectory(5, 3, statics=2), made_up_trajectory(5, 3, seed=1, statics=2)
     moving.position[:, -1, 0] += np.linspace(0, 0.1, 5, dtype=np.float32)
     moving.position[2, 0, 1] = 0.95
@@ -83,19 +88,10 @@ def test_notes_on_inconsistencies(tmp_path):
     assert infer_scene(tmp_path / "out").domain[1][1] >= 0.95
 
 
-def test_no_notes_on_consistent_data(tmp_path):
-    notes = write_native(source_of(made_up_trajectory(12, 3, statics=2)), tmp_path / "out")
-    assert notes == ()
-
-
-def test_unknown_types_are_refused_with_a_suggestion(tmp_path):
-    trajectory = made_up_trajectory(5, 3)
-    strange = Trajectory(trajectory.position, np.full(3, 42))
+def test_unknown_types_and_formats_are_refused_with_a_suggestion(tmp_path):
+    strange = Trajectory(made_up_trajectory(5, 3).position, np.full(3, 42))
     with pytest.raises(DataError, match=r"train split, trajectory 0: unknown particle type 42"):
         write_native(source_of(strange), tmp_path / "out")
-
-
-def test_an_unknown_format_is_refused(tmp_path):
     (tmp_path / "a.txt").write_text("hello")
     with pytest.raises(DataError, match=r"no known format \(native, deepmind.*found a\.txt"):
         convert(tmp_path, tmp_path / "out")
@@ -105,62 +101,45 @@ def test_an_unknown_format_is_refused(tmp_path):
         convert(tmp_path, tmp_path / "out", "tf")
 
 
-class TestNative:
-    def test_stated_options_enter_the_metadata(self, make_dataset, tmp_path):
-        folder = make_dataset(statics=1)
-        convert(folder, tmp_path / "out", options=Options(types={7: "honey"}, gravity=(0.0, -1.0), dt=0.5))
-        metadata = read_metadata(tmp_path / "out")
-        assert metadata.particle_types == {3: "boundary", 7: "honey"}
-        assert (metadata.dt, metadata.gravity) == (0.5, (0.0, -1.0))
-        for name in ("train", "valid", "test"):
-            old, new = Split(folder / f"{name}.h5"), Split(tmp_path / "out" / f"{name}.h5")
-            for index in range(len(old)):
-                np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
-
-    def test_types_are_renumbered(self, make_dataset, tmp_path):
-        folder = make_dataset(statics=2)
-        convert(folder, tmp_path / "out", ids={7: 0, 3: 1})
-        metadata = read_metadata(tmp_path / "out")
-        assert metadata.particle_types == {0: "goop", 1: "boundary"}
-        assert metadata.static_types == {1}
-        assert Split(tmp_path / "out" / "train.h5").particle_type(0).tolist() == [0] * 5 + [1] * 2
-
-    @pytest.mark.parametrize(
-        ("ids", "message"),
-        [({5: 0}, "no particle type 5"), ({7: 0, 3: 0}, "the same id"), ({7: 3}, "type 3 occurs, but its id")],
-    )
-    def test_renumbering_loses_no_type(self, make_dataset, tmp_path, ids, message):
-        with pytest.raises(ConfigError, match=message):
-            convert(make_dataset(statics=2), tmp_path / "out", ids=ids)
-        assert not (tmp_path / "out").exists()
-
-    def test_fields_and_periodic_axes_survive(self, recorded, tmp_path):
-        options = Options(family="jax-sph", periodic=(True, False), dt=0.04545)
-        convert(recorded / "jaxsph-heated-channel-2d", tmp_path / "channel", options=options)
-        old = Split(recorded / "jaxsph-heated-channel-2d" / "test.h5")
-        new = Split(tmp_path / "channel" / "test.h5")
+def test_stated_options_enter_the_metadata(make_dataset, tmp_path):
+    folder = make_dataset(statics=1)
+    convert(folder, tmp_path / "out", options=Options(types={7: "honey"}, gravity=(0.0, -1.0), dt=0.5))
+    metadata = read_metadata(tmp_path / "out")
+    assert metadata.particle_types == {3: "boundary", 7: "honey"}
+    assert (metadata.dt, metadata.gravity) == (0.5, (0.0, -1.0))
+    for name in ("train", "valid", "test"):
+        old, new = Split(folder / f"{name}.h5"), Split(tmp_path / "out" / f"{name}.h5")
         for index in range(len(old)):
-            with h5py.File(old.path) as file:
-                temperature = file[old.names[index]]["temperature"][()]
-            np.testing.assert_array_equal(new.read_with_fields(index).fields["temperature"], temperature)
-            np.testing.assert_array_equal(new.read(index).position, old.read(index).position)
-        metadata = read_metadata(tmp_path / "channel")
-        assert metadata.periodic == (True, False)
-        assert metadata.dt == pytest.approx(0.04545)
-        assert metadata.particle_types[3] == "heated wall"
-        # Shortest ways across the period: the file's own figures for the fluid.
-        assert metadata.extra["vel_std"] == pytest.approx(metadata.extra["stated_statistics"]["vel_std"], rel=0.05)
+            np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
 
-    def test_converted_data_are_readable_the_way_lagrangebench_reads(self, tmp_path):
-        """As LagrangeBench documents it: a group per trajectory, `position` (T, N, D), `particle_type` (N,)."""
-        write_split(tmp_path / "train.h5", [made_up_trajectory(6, 4), made_up_trajectory(6, 4, seed=1)])
-        write_metadata(tmp_path, made_up_metadata())
-        with h5py.File(tmp_path / "train.h5", "r") as file:
-            keys = list(file.keys())
-            assert keys == ["00000", "00001"]
-            for key in keys:
-                position, kind = file[key]["position"], file[key]["particle_type"]
-                assert position.dtype == np.float32
-                assert position.shape == (6, 4, 2)
-                assert np.issubdtype(kind.dtype, np.integer)
-                assert kind.shape == (4,)
+
+def test_types_are_renumbered_and_none_is_lost(make_dataset, tmp_path):
+    folder = make_dataset(statics=2)
+    for ids, message in (({5: 0}, "no particle type 5"), ({7: 0, 3: 0}, "the same id"), ({7: 3}, "type 3 occurs")):
+        with pytest.raises(ConfigError, match=message):
+            convert(folder, tmp_path / "out", ids=ids)
+        assert not (tmp_path / "out").exists()
+    convert(folder, tmp_path / "out", ids={7: 0, 3: 1})
+    metadata = read_metadata(tmp_path / "out")
+    assert metadata.particle_types == {0: "goop", 1: "boundary"}
+    assert metadata.static_types == {1}
+    assert Split(tmp_path / "out" / "train.h5").particle_type(0).tolist() == [0] * 5 + [1] * 2
+
+
+def test_recorded_fields_and_periodic_axes_survive(recorded, tmp_path):
+    (tmp_path / "old").mkdir()
+    for name in ("test.h5", "metadata.json"):
+        (tmp_path / "old" / name).symlink_to(recorded / "jaxsph-heated-channel-2d" / name)
+    convert(tmp_path / "old", tmp_path / "new", options=Options("jax-sph", periodic=(True, False), dt=0.04545))
+    new = Split(tmp_path / "new" / "test.h5")
+    with h5py.File(tmp_path / "old" / "test.h5") as file:
+        for index, group in enumerate(file.values()):
+            read = new.read_with_fields(index)
+            np.testing.assert_array_equal(read.fields["temperature"], group["temperature"][()])
+            np.testing.assert_array_equal(read.position, group["position"][()])
+    metadata = read_metadata(tmp_path / "new")
+    assert metadata.periodic == (True, False)
+    assert metadata.dt == pytest.approx(0.04545)
+    assert metadata.particle_types[3] == "heated wall"
+    # Shortest ways across the period: the file's own figures for the fluid.
+    assert metadata.extra["vel_std"] == pytest.approx(metadata.extra["stated_statistics"]["vel_std"], rel=0.05)

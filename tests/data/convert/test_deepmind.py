@@ -31,7 +31,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_all_values_are_converted(folder, tmp_path):
-    convert(folder, tmp_path / "native")
+    notes = convert(folder, tmp_path / "native", options=Options("jax-sph", {5: "oil", 3: "boundary"}))
+    assert any("jax-sph family" in note for note in notes)
     split = Split(tmp_path / "native" / "train.h5")
     assert len(split) == 2
     for index in range(2):
@@ -42,8 +43,8 @@ def test_all_values_are_converted(folder, tmp_path):
         np.testing.assert_array_equal(trajectory.fields["step_context"], np.full((5, 6), index))
         assert trajectory.attributes["key"] == 7
     metadata = read_metadata(tmp_path / "native")
-    assert metadata.particle_types[5] == "water"
-    assert metadata.static_types == {3}
+    assert metadata.particle_types[5] == "oil"
+    assert metadata.static_types == {1, 3}
     assert metadata.extra["default_connectivity_radius"] == 0.015
     assert infer_scene(tmp_path / "native").obstacles
 
@@ -55,49 +56,41 @@ def test_a_single_file_is_a_dataset(folder, tmp_path):
     assert any("test_sub.tfrecord becomes the test split" in note for note in notes)
 
 
-def test_notes_name_the_family(folder, tmp_path):
-    assert any("deepmind family" in note for note in convert(folder, tmp_path / "a"))
-    assert any("jax-sph family" in n for n in convert(folder, tmp_path / "b", options=Options("jax-sph", {5: "oil"})))
-    assert read_metadata(tmp_path / "b").particle_types[5] == "oil"
-
-
-def test_wrong_dim_is_explained(folder, tmp_path):
+def test_inconsistent_content_is_refused_by_name(folder, tmp_path):
+    with pytest.raises(ConfigError, match=r"gravity = .* each of the data's 2 axes"):
+        convert(folder, tmp_path / "native", options=Options(gravity=(0.0, 0.0, -9.81)))
     (folder / "metadata.json").write_text(json.dumps(METADATA | {"dim": 3, "bounds": [[0, 1]] * 3}))
     with pytest.raises(DataError, match=r"record 0: 5 frames, 4 particles: each frame needs 4 x 3 .* has 8"):
         convert(folder, tmp_path / "native")
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["ramps"]
-
-
-def test_a_missing_feature_is_named(folder, tmp_path):
     payload = records.sequence_example({"key": records.integer_feature(0)}, {"place": [records.bytes_feature(b"")]})
     records.write_records(folder / "train.tfrecord", records.record(payload))
     with pytest.raises(DataError, match=r"needs the features `particle_type` and `position`; found key, place"):
         convert(folder, tmp_path / "native")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["ramps"]
 
 
-def test_options_must_fit_the_axes(folder, tmp_path):
-    with pytest.raises(ConfigError, match=r"gravity = .* each of the data's 2 axes"):
-        convert(folder, tmp_path / "native", options=Options(gravity=(0.0, 0.0, -9.81)))
+def test_recorded_sand_equals_the_pickled_rollout(recorded, tmp_path):
+    convert(recorded / "deepmind-sand-subset", tmp_path / "sand", "deepmind")
+    convert(recorded / "deepmind-sand-subset" / "rollout_test_s0.pkl", tmp_path / "rollout")
+    trajectory = Split(tmp_path / "sand" / "test.h5").read(0)
+    rolled = Split(tmp_path / "rollout" / "test.h5").read_with_fields(0)
+    assert trajectory.position.shape == (321, 256, 2)
+    assert set(trajectory.particle_type.tolist()) == {6}
+    np.testing.assert_array_equal(rolled.position, trajectory.position[:320])
+    assert rolled.fields["predicted_rollout"].shape == (320, 256, 2)
+    # Only these bytes, of a file whose content is known, are unpickled outside of the converter.
+    with (recorded / "deepmind-sand-subset" / "rollout_test_s0.pkl").open("rb") as file:
+        rollout = pickle.load(file)  # noqa: S301
+    truth = np.concatenate([rollout["initial_positions"], rollout["ground_truth_rollout"]])
+    np.testing.assert_array_equal(trajectory.position[:320], truth)
 
 
-class TestRecorded:
-    def test_sand_equals_the_pickled_rollout(self, recorded, tmp_path):
-        convert(recorded / "deepmind-sand-subset", tmp_path / "sand", "deepmind")
-        trajectory = Split(tmp_path / "sand" / "test.h5").read(0)
-        assert trajectory.position.shape == (321, 256, 2)
-        assert set(trajectory.particle_type.tolist()) == {6}
-        # Only these bytes, of a file whose content is known, are unpickled outside of the converter.
-        with (recorded / "deepmind-sand-subset" / "rollout_test_s0.pkl").open("rb") as file:
-            rollout = pickle.load(file)  # noqa: S301
-        truth = np.concatenate([rollout["initial_positions"], rollout["ground_truth_rollout"]])
-        np.testing.assert_array_equal(trajectory.position[:320], truth)
-
-    def test_forces_and_a_moving_tool_are_kept(self, recorded, tmp_path):
-        notes = convert(recorded / "mpm-excavation-3d", tmp_path / "sand")
-        trajectory = Split(tmp_path / "sand" / "train.h5").read_with_fields(0)
-        assert trajectory.position.shape == (11, 26945, 3)
-        assert trajectory.fields["force"].shape == (11, 3)
-        tool = trajectory.position[:, trajectory.particle_type == 3]
-        assert np.abs(tool[-1] - tool[0]).max() > 1e-3
-        assert any("static type move in 1 of 1" in note for note in notes)
-        assert read_metadata(tmp_path / "sand").extra["moving_boundaries"] is True
+@pytest.mark.slow
+def test_recorded_forces_and_a_moving_tool_are_kept(recorded, tmp_path):
+    notes = convert(recorded / "mpm-excavation-3d", tmp_path / "sand")
+    trajectory = Split(tmp_path / "sand" / "train.h5").read_with_fields(0)
+    assert trajectory.position.shape == (11, 26945, 3)
+    assert trajectory.fields["force"].shape == (11, 3)
+    tool = trajectory.position[:, trajectory.particle_type == 3]
+    assert np.abs(tool[-1] - tool[0]).max() > 1e-3
+    assert any("static type move in 1 of 1" in note for note in notes)

@@ -39,20 +39,22 @@ class Runs:
         return self.what
 
 
-@given(
-    array=arrays.arrays(
-        st.sampled_from([np.float32, np.float64, np.int64, np.uint8, np.bool_]), arrays.array_shapes(min_side=0)
-    ),
-    protocol=st.integers(0, 5),
-)
-@settings(deadline=None)
+KINDS = st.sampled_from([np.float32, np.float64, np.int64, np.uint8, np.bool_])
+
+
+@given(array=arrays.arrays(KINDS, arrays.array_shapes(min_side=0)), protocol=st.integers(0, 5))
+@settings(deadline=None, max_examples=50)
 def test_arrays_come_back_as_they_were(array, protocol):
-    content = {"a": array, "b": [array[None], ("text", 1.5, None, array.dtype.type(1))]}
+    nested = np.empty(2, object)
+    nested[:] = array, [1, "text"]
+    content = {"a": array, "b": [array.T, ("text", 1.5, None, array.dtype.type(1))], "c": nested}
     back = load_pickled(pickle.dumps(content, protocol), "here")
     np.testing.assert_array_equal(back["a"], array)
     assert back["a"].dtype == array.dtype
-    np.testing.assert_array_equal(back["b"][0], array[None])
+    np.testing.assert_array_equal(back["b"][0], array.T)
     assert back["b"][1] == ("text", 1.5, None, array.dtype.type(1))
+    np.testing.assert_array_equal(back["c"][0], array)
+    assert back["c"][1] == [1, "text"]
 
 
 @pytest.mark.parametrize(
@@ -77,25 +79,14 @@ def test_pickles_that_request_other_names_are_refused(evil, named, tmp_path, mon
 
 
 def test_pickles_cannot_allocate_arrays_directly():
-    with pytest.raises(DataError, match="cannot be read as pickled arrays"):
-        load_pickled(pickle.dumps(Runs(np.ndarray, (2**40,))), "here")
-    with pytest.raises(DataError, match="cannot be read as pickled arrays"):
-        load_pickled(b"\x80\x04K\x01Q.", "here")
-
-
-@given(data=st.binary(max_size=200))
-@settings(deadline=None, max_examples=300)
-def test_random_bytes_never_crash_or_execute(data):
-    try:
-        load_pickled(data, "here")
-    except DataError as error:
-        assert str(error).startswith("here: ")  # noqa: PT017 - both ways are right
+    for data in (pickle.dumps(Runs(np.ndarray, (2**40,))), b"\x80\x04K\x01Q."):
+        with pytest.raises(DataError, match="cannot be read as pickled arrays"):
+            load_pickled(data, "here")
 
 
 def test_a_rollout_becomes_a_trajectory_with_its_prediction(tmp_path):
     content = rollout()
-    path = write(tmp_path / "rollout_test_0.pkl", content, 2)
-    notes = convert(path, tmp_path / "out")
+    notes = convert(write(tmp_path / "rollout_test_0.pkl", content, 2), tmp_path / "out")
     trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     truth = np.concatenate([content["initial_positions"], content["ground_truth_rollout"]])
     predicted = np.concatenate([content["initial_positions"], content["predicted_rollout"]])
@@ -105,27 +96,21 @@ def test_a_rollout_becomes_a_trajectory_with_its_prediction(tmp_path):
     assert any("predicted_rollout" in note for note in notes)
 
 
-def test_a_pickle_without_the_rollout_keys_names_the_missing_ones(tmp_path):
-    path = write(tmp_path / "rollout_0.pkl", {"initial_positions": 1})
-    with pytest.raises(DataError, match=r"a rollout is a dict of initial_positions, ground_truth"):
-        convert(path, tmp_path / "out")
-    path = write(tmp_path / "rollout_0.pkl", rollout(particle_types=np.array([5, 5])))
-    with pytest.raises(DataError, match=r"rollout_0\.pkl: .*4 particles but particle_type has 2"):
-        convert(path, tmp_path / "out")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"initial_positions": 1}, r"a rollout is a dict of initial_positions, ground_truth"),
+        (rollout(particle_types=np.array([5, 5])), r"rollout_0\.pkl: .*4 particles but particle_type has 2"),
+        (rollout(initial_positions=[[1.0]]), "initial_positions: expected an array of numbers, found list"),
+        (rollout(metadata=[]), "metadata must map keys to values"),
+    ],
+)
+def test_other_content_is_refused_by_name(tmp_path, content, message):
+    with pytest.raises(DataError, match=message):
+        convert(write(tmp_path / "rollout_0.pkl", content), tmp_path / "out")
 
 
 def test_arrays_of_number_objects_are_converted_others_refused():
     np.testing.assert_array_equal(number_array(np.array([1, 2.5, np.int64(3)], object), "here"), [1, 2.5, 3])
     with pytest.raises(DataError, match="here: expected numbers, found other objects"):
         number_array(np.array(["a", 1], object), "here")
-
-
-def test_recorded_rollout_equals_the_record_beside_it(recorded, tmp_path):
-    folder = recorded / "deepmind-sand-subset"
-    convert(folder / "rollout_test_s0.pkl", tmp_path / "rollout")
-    convert(folder / "test_sub.tfrecord", tmp_path / "record")
-    rolled = Split(tmp_path / "rollout" / "test.h5").read_with_fields(0)
-    record = Split(tmp_path / "record" / "test.h5").read_with_fields(0)
-    assert rolled.position.shape == (320, 256, 2)
-    np.testing.assert_array_equal(rolled.position, record.position[:320])
-    assert rolled.fields["predicted_rollout"].shape == (320, 256, 2)
