@@ -75,7 +75,7 @@ def run_command(words: list[str], note: str = "") -> int:
     """
     load_plugins()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    set_loader(PARSER_MODE, load_checked, (YAMLError, ValueError))
+    set_loader(PARSER_MODE, load_checked, (YAMLError, ValueError, RecursionError))
     # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
     sys.argv = [sys.argv[0], *words]
     locks: list[int] = []
