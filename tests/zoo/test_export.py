@@ -1,6 +1,5 @@
 import dataclasses
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +14,6 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
@@ -25,8 +23,7 @@ from nmpm.particles import Particles
 from nmpm.processors import GridLayout, GridProcessor, Pointwise, Processor
 from nmpm.scene import Scene
 from nmpm.transfer import Affine, Linear, Nearest
-from nmpm.zoo.export import FORMATS, Network, Solid, Step, description
-from nmpm.zoo.export.formats import Format
+from nmpm.zoo.export import FORMATS, Format, Network, Solid, Step, description
 
 RUNNER = Path(__file__).parents[2] / "docs" / "run_onnx.py"
 FREE = Constraints(solids=False)
@@ -102,7 +99,12 @@ def session_of(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
-@pytest.mark.parametrize("name", ["2-D", "two materials, a periodic axis", "3-D, gravity varies, obstacles"])
+def some_slow(*quick: str) -> list:
+    """The emulators, but for these marked as slow: each is exported in seconds."""
+    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in EMULATORS]
+
+
+@pytest.mark.parametrize("name", some_slow("two materials, a periodic axis")[:3])
 def test_an_onnx_step_is_the_emulator_for_any_number_of_scenes_and_particles(name, exported):
     emulator, path = exported(name)
     scene, step, session = emulator.scene, Step(emulator), session_of(path)
@@ -139,9 +141,8 @@ def test_the_network_and_the_solid_fraction_by_themselves(tmp_path):
     emulator.input_std.mul_(0.3)
     form = FORMATS["onnx"]
     for part in (Network(emulator), Solid(emulator)):
-        path = tmp_path / "part.onnx"
-        form.write(part, description(part, "mine", "made up"), path)
-        assert form.difference(part, path, batch=3, count=11) < 1e-5
+        form.write(part, {}, tmp_path / "part.onnx")
+        assert form.difference(part, tmp_path / "part.onnx", batch=3, count=11) < 1e-5
 
 
 def test_a_file_says_what_it_is(exported):
@@ -176,7 +177,7 @@ def test_a_compiled_package_is_the_emulator(tmp_path):
     assert json.loads(about["scene"])["materials"] == ["goop"]
 
 
-@pytest.mark.parametrize("name", EMULATORS)
+@pytest.mark.parametrize("name", some_slow("held"))
 def test_numpy_and_onnxruntime_are_enough(name, exported, tmp_path):
     emulator, path = exported(name)
     scene = emulator.scene
@@ -239,8 +240,13 @@ def test_what_cannot_be_exported_is_said(tmp_path):
     write = FORMATS["onnx"].write
     with pytest.raises(ConfigError, match=r"torch\.export cannot follow Deciding"):
         write(Network(emulator_of(box(), processor=Deciding())), {}, tmp_path / "no.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_an_operation_that_onnx_lacks_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"cannot be written as ONNX.*--format pt2"):
-        write(Step(emulator_of(box(), transfer=Affine())), {}, tmp_path / "no.onnx")
+        FORMATS["onnx"].write(Step(emulator_of(box(), transfer=Affine())), {}, tmp_path / "no.onnx")
     assert not list(tmp_path.iterdir())
 
 
@@ -263,13 +269,6 @@ def test_a_zoo_model_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert "simulated by nmpm" in about["training_data"]
 
 
-def test_a_model_by_its_path_is_named_after_its_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(shipped_folder("zoo") / "goop", tmp_path / "models" / "mine")
-    assert main(["export", str(tmp_path / "models" / "mine"), "--processor"]) == 0
-    assert (tmp_path / "mine-processor.onnx").is_file()
-
-
 def test_a_file_that_differs_from_its_model_is_deleted(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Format, "difference", lambda *_, **__: 0.5)
@@ -287,9 +286,12 @@ def test_a_file_that_differs_from_its_model_is_deleted(tmp_path, monkeypatch, ca
         (["export", "goop", "--format", "pt2", "--out", "goop.onnx"], "its name must end in .pt2"),
         (["export", "goop", "--out", "nowhere/goop.onnx"], "the folder nowhere does not exist"),
         (["export", "waterramps"], "Export with --free"),
+        (["export", "goop", "--device", "cuda"], "ONNX files run on any device"),
     ],
 )
-def test_a_wrong_call_is_said(words, message, capsys):
+def test_a_wrong_call_is_said(words, message, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     assert main(words) == 1
     assert message in capsys.readouterr().err
 
@@ -299,13 +301,6 @@ def test_a_part_computes_on_the_device_that_it_is_moved_to(kind, monkeypatch):
     """On torch's meta device, which raises where devices are mixed."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     part = kind(emulator_of(box(materials=("water", "sand")), Constraints(energy=True, solids=False))).to("meta")
-    outputs = part(**part.draw_inputs(2, 7))
+    outputs = part(**part.example(2, 7))
     assert {output.device.type for output in outputs} == {"meta"}
     assert [output.shape[0] for output in outputs] == [2] * len(part.outputs)
-
-
-def test_onnx_files_are_for_no_device(monkeypatch, capsys):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    assert main(["export", "goop", "--device", "cuda"]) == 1
-    assert "ONNX files run on any device" in capsys.readouterr().err

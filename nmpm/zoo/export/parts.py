@@ -31,13 +31,13 @@ class Value:
         name: Its name in the file.
         shape: Its sizes, those that vary by their name in `VARYING`.
         description: Its meaning, with its unit.
-        dtype: Its type.
+        scale: Of an output: what one cell is in its unit, or 1.
     """
 
     name: str
     shape: tuple[str | int, ...]
     description: str
-    dtype: torch.dtype = torch.float32
+    scale: float = 1.0
 
 
 class Part(nn.Module, ABC):
@@ -67,23 +67,15 @@ class Part(nn.Module, ABC):
         """Where the part computes."""
         return self.emulator.device
 
-    def draw_inputs(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
-        """The inputs of `example` on the part's device."""
-        return {name: values.to(self.device) for name, values in self.example(batch, count, seed).items()}
-
     @abstractmethod
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
-        """Random inputs on the CPU, for tracing and for comparing programs with the emulator.
+        """Random inputs on the part's device, for tracing and for comparing programs with the emulator.
 
         Args:
             batch: Scenes.
             count: Particles, of obstacles too.
             seed: Of the numbers.
         """
-
-    def scale(self, output: str) -> float:  # noqa: ARG002 (outputs in cells or without a unit need no scale)
-        """The factor by which an output is divided to be in cells."""
-        return 1.0
 
 
 class Step(Part):
@@ -104,7 +96,7 @@ class Step(Part):
         possible = {
             "position": Value("position", state, "domain length"),
             "velocity": Value("velocity", state, "domain length per frame"),
-            "material": Value("material", ("B", "N"), f"index of each particle's material: {names}", torch.int64),
+            "material": Value("material", ("B", "N"), f"index of each particle's material: {names}"),
             "gravity": Value("gravity", ("B", scene.dim), "domain length per frame squared"),
             "solid": Value("solid", ("B", 1, *shape), "share of each cell that is wall or obstacle, from 0 to 1"),
             "budget": Value("budget", ("B",), budget),
@@ -116,8 +108,10 @@ class Step(Part):
             "budget": emulator.constraints.energy,
         }
         self.inputs = tuple(value for name, value in possible.items() if needed.get(name, True))
-        positions = Value("positions", ("B", emulator.frames, "N", scene.dim), "the next frames, in domain length")
-        velocity = Value("next_velocity", state, "at the last frame, in domain length per frame: the next call's")
+        cell, following = min(emulator.grid.spacing), "at the last frame, in domain length per frame: the next call's"
+        frames = ("B", emulator.frames, "N", scene.dim)
+        positions = Value("positions", frames, "the next frames, in domain length", cell)
+        velocity = Value("next_velocity", state, following, cell)
         kept = Value("next_budget", ("B",), "the budget that was kept: the next call's")
         self.outputs = (positions, velocity, kept) if emulator.constraints.energy else (positions, velocity)
         known = torch.tensor(scene.gravity or (0.0,) * scene.dim) * scene.dt**2
@@ -137,11 +131,11 @@ class Step(Part):
         """The outputs for the inputs that this emulator needs."""
         state = self._state(position, velocity, material, gravity)
         solid = self.emulator.solid(state) if solid is None else solid
-        own = self.emulator.budget(state)
-        if own is None or budget is None:
-            bundle = self.emulator(state, RolloutContext(solid, own))
+        current = self.emulator.budget(state)
+        if current is None or budget is None:
+            bundle = self.emulator(state, RolloutContext(solid, current))
             return bundle.position, bundle.velocity
-        kept = torch.where(budget.isnan(), own, budget)
+        kept = torch.where(budget.isnan(), current, budget)
         bundle = self.emulator(state, RolloutContext(solid, kept))
         return bundle.position, bundle.velocity, kept
 
@@ -171,10 +165,7 @@ class Step(Part):
             "solid": wall_fraction(scene, grid).expand(batch, 1, *grid.shape).clone(),
             "budget": torch.full((batch,), float("nan")),
         }
-        return {value.name: values[value.name] for value in self.inputs}
-
-    def scale(self, output: str) -> float:
-        return 1.0 if output == "next_budget" else min(self.emulator.grid.spacing)
+        return {value.name: values[value.name].to(self.device) for value in self.inputs}
 
 
 class Network(Part):
@@ -197,15 +188,11 @@ class Network(Part):
         return (fields,)
 
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:  # noqa: ARG002 (no particles here)
+        """Grid states with the mean and standard deviation of the emulator's inputs."""
         emulator = self.emulator
         shape = (batch, len(emulator.scene.input_channels), *emulator.grid.shape)
-        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-        return {"grid": noise}
-
-    def draw_inputs(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
-        """Grid states with the mean and standard deviation of the emulator's inputs."""
-        noise = super().draw_inputs(batch, count, seed)["grid"]
-        return {"grid": self.emulator.input_mean + self.emulator.input_std * noise}
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed)).to(self.device)
+        return {"grid": emulator.input_mean + emulator.input_std * noise}
 
 
 class Solid(Part):
@@ -237,7 +224,8 @@ class Solid(Part):
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
         scene, random = self.emulator.scene, torch.Generator().manual_seed(seed)
         low, high = torch.tensor(scene.bounds).T
-        return {"obstacle": low + (high - low) * torch.rand(batch, count, scene.dim, generator=random)}
+        obstacle = low + (high - low) * torch.rand(batch, count, scene.dim, generator=random)
+        return {"obstacle": obstacle.to(self.device)}
 
 
 def _check_constraints(emulator: Emulator) -> None:
