@@ -45,8 +45,8 @@ class HubId:
     @classmethod
     def parse(cls, text: str) -> Self | None:
         """The id that "owner/repository@revision" means; None for other texts."""
-        found = ID.fullmatch(text)
-        return None if found is None else cls(found["repository"], found["revision"])
+        match = ID.fullmatch(text)
+        return None if match is None else cls(match["repository"], match["revision"])
 
     def __str__(self) -> str:
         return f"{self.repository}@{self.revision}"
@@ -70,12 +70,12 @@ def download(identifier: HubId) -> Path:
         f" cannot be read. If the copy on this machine is damaged, delete {folder.parents[1]} and load it again online."
     )
     try:  # the hub's client would keep what it has
-        fetched = folder if constants.HF_HUB_OFFLINE else _snapshot(identifier, again=True)
+        again = folder if constants.HF_HUB_OFFLINE else _snapshot(identifier, force_download=True)
     except ZooError as error:
         raise ZooError(f"{damage} {error}") from error
-    if not _is_whole(fetched):
+    if not _is_whole(again):
         raise ZooError(damage)
-    return fetched
+    return again
 
 
 def _is_whole(folder: Path) -> bool:
@@ -87,30 +87,24 @@ def _is_whole(folder: Path) -> bool:
         return False
 
 
-def _snapshot(identifier: HubId, again: bool = False) -> Path:
-    """The folder of a model's files in the hub's cache, fetched where they are not there, or `again`.
+def _snapshot(identifier: HubId, force_download: bool = False) -> Path:
+    """The folder of a model's files in the hub's cache, downloaded where they are not there.
 
     Raises:
         ZooError: if there is no such model or revision, or it cannot be reached.
     """
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import (
-        LocalEntryNotFoundError,
-        RepositoryNotFoundError,
-        RevisionNotFoundError,
-    )
+    from huggingface_hub import errors, snapshot_download
 
+    name, revision = identifier.repository, identifier.revision
     try:
         return Path(
-            snapshot_download(
-                identifier.repository, revision=identifier.revision, allow_patterns=list(FILES), force_download=again
-            )
+            snapshot_download(name, revision=revision, allow_patterns=list(FILES), force_download=force_download)
         )
-    except RepositoryNotFoundError as error:
-        raise ZooError(f"The hub has no model {identifier.repository}, or it is private: hf auth login.") from error
-    except RevisionNotFoundError as error:
-        raise ZooError(f"{identifier.repository} has no revision {identifier.revision}.") from error
-    except LocalEntryNotFoundError as error:
+    except errors.RepositoryNotFoundError as error:
+        raise ZooError(f"The hub has no model {name}, or it is private: hf auth login.") from error
+    except errors.RevisionNotFoundError as error:
+        raise ZooError(f"{name} has no revision {revision}.") from error
+    except errors.LocalEntryNotFoundError as error:
         raise ZooError(f"{identifier} is not in the cache, and the hub cannot be reached.") from error
     except Exception as error:  # the client's transport raises errors of its own
         raise ZooError(f"{identifier} cannot be downloaded ({type(error).__name__}): {one_line(error)}") from error
@@ -125,10 +119,8 @@ def pull(identifier: HubId, target: Path, name: str) -> Path:
         name: Of the new entry; its card and README have it, and the card the commit as `source`.
 
     Raises:
-        ZooError: as `download`; if the entry exists, or the model cannot be loaded.
+        ZooError: as `download`; if the model cannot be loaded.
     """
-    if (target / CARD).exists():
-        raise ZooError(f"{target} exists: choose another name, or remove it first.")
     folder = download(identifier)
     load_entry(folder)
     card = read_card(folder) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
@@ -172,22 +164,22 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
         (Path(folder) / "README.md").write_text(f"---\n{to_yaml(hub_metadata(card))}---\n\n{page}", encoding="utf-8")
         api = HfApi()
         try:
-            if private and _is_public(api, repository):
-                raise ZooError(
-                    f"{repository} exists and is public: push to another repository, make it private in its settings,"
-                    " or leave --private out."
+            public = private and _is_public(api, repository)
+            if not public:
+                api.create_repo(repository, private=private, exist_ok=True)
+                commit = api.upload_folder(
+                    repo_id=repository,
+                    folder_path=folder,
+                    commit_message=f"nmpm: {card.get('name', entry.name)}",
+                    delete_patterns=list(FILES),  # of a former entry that had more of them
                 )
-            api.create_repo(repository, private=private, exist_ok=True)
-            commit = api.upload_folder(
-                repo_id=repository,
-                folder_path=folder,
-                commit_message=f"nmpm: {card.get('name', entry.name)}",
-                delete_patterns=list(FILES),  # of a former entry that had more of them
-            )
-        except ZooError:
-            raise
         except Exception as error:  # the client's transport raises errors of its own
             raise ZooError(f"{repository} cannot be uploaded ({type(error).__name__}): {one_line(error)}") from error
+    if public:
+        raise ZooError(
+            f"{repository} exists and is public: push to another repository, make it private in its settings, or leave"
+            " --private out."
+        )
     return HubId(repository, str(commit.oid))
 
 

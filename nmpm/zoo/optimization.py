@@ -79,8 +79,8 @@ def _check_deviation(emulator: Emulator, faster: Emulator, state: Particles) -> 
     """
     moving = _stirred(emulator, state)
     exact = _positions(emulator.with_network(torch.float32), moving)
-    own, other = (_distance(_positions(form, moving), exact) for form in (emulator, faster))
-    limit = TOLERANCE + 2 * own
+    reference, other = (_distance(_positions(form, moving), exact) for form in (emulator, faster))
+    limit = TOLERANCE + 2 * reference
     name, precision = faster.runtime.name, str(emulator.network_precision).removeprefix("torch.")
     _LOG.info("The runtime %s, %s: within %.1e cells of torch in float32 after a bundle.", name, precision, other)
     if not other <= limit:

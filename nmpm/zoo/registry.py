@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import builtins
 import re
-from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,12 @@ class Zoo:
         Raises:
             ZooError: if `root` is given and is not a folder.
         """
-        return sorted({name for folder in _roots(root) for name in _names(folder)})
+        names = {
+            card.parent.relative_to(folder).as_posix()
+            for folder in _roots(root)
+            for card in (*folder.glob(f"*/{CARD}"), *folder.glob(f"*/*/{CARD}"))
+        }
+        return sorted(name for name in names if _is_name(name))
 
     @staticmethod
     def folder(name: str, root: Root = None) -> Path:
@@ -60,7 +65,7 @@ class Zoo:
         """
         check_name(name)
         for zoo in _roots(root):
-            if _exists(zoo / name / CARD):
+            if (zoo / name / CARD).exists():
                 return zoo / name
         raise _unknown_model(name, root)
 
@@ -80,10 +85,10 @@ class Zoo:
         Raises:
             ZooError: if there is none.
         """
-        found = [known for known in Zoo.list(root) if known == name or known.startswith(f"{name}/")]
-        if not found:
+        variants = [other for other in Zoo.list(root) if other == name or other.startswith(f"{name}/")]
+        if not variants:
             raise _unknown_model(name, root)
-        return found
+        return variants
 
     @staticmethod
     def load(
@@ -125,12 +130,10 @@ class Zoo:
         if variant is None and not limits:
             return load_model(name, device, root)
         _check_variants(name, root)
-        chosen = str(name) if variant is None else f"{name}/{variant}"
-        return (
-            _load_within(chosen, limits, root, find_device(device), calibrate)
-            if limits
-            else load_model(chosen, device, root)
-        )
+        full_name = str(name) if variant is None else f"{name}/{variant}"
+        if limits:
+            full_name = _choose_variant(full_name, limits, root, find_device(device), calibrate)
+        return load_model(full_name, device, root)
 
 
 def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root = None) -> Pretrained:
@@ -150,7 +153,14 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
         ConfigError: if this machine does not have the device, or a newer nmpm wrote the model.
     """
     target = find_device(device)
-    return _load_path(find_model(model, root)).to(target)
+    path = find_model(model, root)
+    if not path.is_dir():
+        return load_checkpoint(path).to(target)
+    if (path / CARD).exists():
+        return load_entry(path).to(target)
+    if (path / BEST).exists():
+        return load_checkpoint(path / BEST).to(target)
+    raise ZooError(f"{path} holds no model: neither an entry of the zoo ({CARD}) nor a run ({BEST}).")
 
 
 def find_model(model: str | Path, root: Root = None) -> Path:
@@ -160,7 +170,9 @@ def find_model(model: str | Path, root: Root = None) -> Path:
         ZooError: if there is no such model.
     """
     name, path = str(model), Path(model)
-    if root is not None or _is_in_zoo(model):
+    # `Path("goop")` is always a path.
+    in_zoo = isinstance(model, str) and _is_name(model) and any((zoo / model / CARD).exists() for zoo in _roots(None))
+    if root is not None or in_zoo:
         return Zoo.folder(name, root)
     if path.suffix == ".ckpt" or _exists(path):
         return path
@@ -177,47 +189,54 @@ def find_entry(model: str | Path, root: Root = None) -> Path:
         ZooError: if there is no such model, or it is a run or a checkpoint.
     """
     folder = find_model(model, root)
-    if not _exists(folder / CARD):
+    if not (folder / CARD).exists():
         raise ZooError(
             f"{one_line(folder)} has no {CARD}: `nmpm zoo add RUN NAME` makes an entry of a run, with a card."
         )
     return folder
 
 
-def _load_within(name: str, limits: Limits, root: Root, device: torch.device, calibrate: bool) -> Pretrained:
-    cards = _readable_cards(Zoo.variants(name, root), root)
+def check_name(name: str) -> None:
+    """Check that an entry can have this name.
+
+    Raises:
+        ZooError: if not, such as one that would lead out of the zoo.
+    """
+    if not _is_name(name):
+        raise ZooError(
+            f"{one_line(repr(name), NAME_LENGTH)} cannot name a model: use at most {NAME_LENGTH} lower-case letters,"
+            " digits, - and _, with at most one / between dataset and variant."
+        )
+
+
+def _choose_variant(name: str, limits: Limits, root: Root, device: torch.device, calibrate: bool) -> str:
+    """The variant within the limits; damaged ones are left out.
+
+    Raises:
+        ZooError: if all cards are damaged, or as `choose`.
+    """
+    cards, damaged = {}, []
+    for variant in Zoo.variants(name, root):
+        try:
+            cards[variant] = Zoo.card(variant, root)
+        except ZooError as error:
+            damaged.append(error)
+    if damaged and not cards:
+        raise damaged[0]
     machine = limits.hardware or device_name(device)
 
     def milliseconds(variant: str) -> float | None:
         if not calibrate:
             return stated_milliseconds(cards[variant]).get(machine)
-        try:
+        with suppress(ZooError):  # damaged
             return float(measure_speed(load_model(variant, device, root))["ms_per_frame"])
-        except ZooError:  # damaged: the others can still be chosen
-            return None
+        return None
 
-    return load_model(choose(cards, limits, milliseconds), device, root)
-
-
-def _readable_cards(names: Sequence[str], root: Root) -> dict[str, dict[str, Any]]:
-    """The cards of models by name, without damaged ones.
-
-    Raises:
-        ZooError: if all are damaged.
-    """
-    cards, damaged = {}, []
-    for name in names:
-        try:
-            cards[name] = Zoo.card(name, root)
-        except ZooError as error:
-            damaged.append(error)
-    if damaged and not cards:
-        raise damaged[0]
-    return cards
+    return choose(cards, limits, milliseconds)
 
 
 def _check_variants(model: str | Path, root: Root) -> None:
-    """Make sure that a model is given by a name, of which there may be variants.
+    """Check that a model is given by a name, of which there may be variants.
 
     Raises:
         ConfigError: if it is a path or an id.
@@ -231,46 +250,17 @@ def _check_variants(model: str | Path, root: Root) -> None:
         )
 
 
-def check_name(name: str) -> str:
-    """The name, if it is one that an entry can have.
-
-    Raises:
-        ZooError: if it is not, such as one that would lead out of the zoo.
-    """
-    if not _is_name(name):
-        raise ZooError(
-            f"{one_line(repr(name), NAME_LENGTH)} cannot name a model: use at most {NAME_LENGTH} lower-case letters,"
-            " digits, - and _, with at most one / between dataset and variant."
-        )
-    return name
-
-
-def _load_path(path: Path) -> Pretrained:
-    if not path.is_dir():
-        return load_checkpoint(path)
-    if (path / CARD).exists():
-        return load_entry(path)
-    if (path / BEST).exists():
-        return load_checkpoint(path / BEST)
-    raise ZooError(f"{path} holds no model: neither an entry of the zoo ({CARD}) nor a run ({BEST}).")
-
-
 def _unknown_model(name: str, root: Root = None) -> ZooError:
-    known = Zoo.list(root)
-    datasets = {other.partition("/")[0] for other in known}
+    names = Zoo.list(root)
     dataset = name.partition("/")[0]
-    if dataset in datasets and dataset != name:
-        near = f" Of {dataset} it has {', '.join(other for other in known if other.partition('/')[0] == dataset)}."
+    variants = [other for other in names if other.partition("/")[0] == dataset]
+    if variants and dataset != name:
+        near = f" Of {dataset} it has {', '.join(variants)}."
     else:
-        near = suggestion(name[:NAME_LENGTH], sorted({*known, *datasets}))
+        near = suggestion(name[:NAME_LENGTH], sorted({*names, *(other.partition("/")[0] for other in names)}))
     path = " No such path exists either." if root is None and not _exists(Path(name)) else ""
     shown = one_line(repr(name), NAME_LENGTH)
-    return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(known) or 'none'}.{near}{path}")
-
-
-def _is_in_zoo(model: str | Path) -> bool:
-    """Whether it is the name of a model of the user's or the shipped zoo; `Path("goop")` is always a path."""
-    return isinstance(model, str) and _is_name(model) and any(_exists(zoo / model / CARD) for zoo in _roots(None))
+    return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(names) or 'none'}.{near}{path}")
 
 
 def _is_name(name: str) -> bool:
@@ -278,15 +268,11 @@ def _is_name(name: str) -> bool:
 
 
 def _exists(path: Path) -> bool:
+    """Whether a path exists; False for a name that is too long, or has a null character."""
     try:
         return path.exists()
-    except (OSError, ValueError):  # a name that is too long, or has a null character
+    except (OSError, ValueError):
         return False
-
-
-def _names(root: Path) -> list[str]:
-    cards = (*root.glob(f"*/{CARD}"), *root.glob(f"*/*/{CARD}"))
-    return [name for card in cards if _is_name(name := card.parent.relative_to(root).as_posix())]
 
 
 def _roots(root: Root) -> tuple[Path, ...]:

@@ -44,14 +44,14 @@ class StateBuilder:
 
     def __init__(self, emulator: Emulator, position: Any, dtype: torch.dtype) -> None:
         self.emulator, self.scene, self.dtype = emulator, emulator.scene, dtype
-        found = _numbers("position", position)
+        points = _numbers("position", position)
         dim = self.scene.dim
-        if found.dim() not in (2, 3) or found.shape[-1] != dim or not found.numel():
+        if points.dim() not in (2, 3) or points.shape[-1] != dim or not points.numel():
             raise DataError(
-                f"position has the shape {tuple(found.shape)}; it must be (N, {dim}) or (B, N, {dim}) for this model's"
+                f"position has the shape {tuple(points.shape)}; it must be (N, {dim}) or (B, N, {dim}) for this model's"
                 f" {dim}-D scenes, with at least one particle."
             )
-        self.position = found.reshape(-1, *found.shape[-2:])
+        self.position = points.reshape(-1, *points.shape[-2:])
         self.batch, self.count = self.position.shape[:2]
 
     def build(
@@ -92,15 +92,15 @@ class StateBuilder:
     def _fields(self, given: Mapping[str, Any]) -> dict[str, Tensor]:
         """The fields of the scene, (B, N) or (B, 1)."""
         warn_of_ignored(self.scene, given)
-        found: dict[str, Tensor] = {}
+        fields: dict[str, Tensor] = {}
         for name in (name for name in self.scene.fields if name in given):
             count = 1 if name in self.scene.parameters else self.count
             values = _numbers(name, given[name])
             if count == 1 and tuple(values.shape) == (self.batch,):
                 values = values.unsqueeze(1)
             shape = (self.batch, count)
-            found[name] = self._expand(name, values, [(), shape[1:], shape], shape).to(self.dtype)
-        return found
+            fields[name] = self._expand(name, values, [(), shape[1:], shape], shape).to(self.dtype)
+        return fields
 
     def _velocity(self, given: Any) -> Tensor:
         shape = (self.batch, self.count, self.scene.dim)
@@ -118,15 +118,15 @@ class StateBuilder:
             names = np.asarray(given)
             if names.dtype.kind in "UO":
                 given = np.vectorize(self._index_of, otypes=[np.int64])(names)
-        found = self._expand("material", given, [(), shape[1:], shape], shape)
-        wrong = (found != found.round()) | (found < 0) | (found >= len(materials))
+        indices = self._expand("material", given, [(), shape[1:], shape], shape)
+        wrong = (indices != indices.round()) | (indices < 0) | (indices >= len(materials))
         if wrong.any():
             scene, particle = map(int, wrong.nonzero()[0])
             raise DataError(
-                f"Scene {scene}, particle {particle}: material {found[scene, particle]:g} is not an index into"
+                f"Scene {scene}, particle {particle}: material {indices[scene, particle]:g} is not an index into"
                 f" {list(materials)}. Type ids of datasets are not indices: give names, such as {materials[0]!r}."
             )
-        return found.long().contiguous()
+        return indices.long().contiguous()
 
     def _index_of(self, name: object) -> int:
         if name not in self.scene.materials:
@@ -142,13 +142,13 @@ class StateBuilder:
             return self.position.new_zeros(self.batch, 0, dim)
         if not self.scene.obstacles:
             raise DataError("obstacle: the model was trained without obstacles and would not see them; leave it out.")
-        found = _numbers("obstacle", given)
-        count = found.shape[-2] if found.dim() > 1 else 0
+        points = _numbers("obstacle", given)
+        count = points.shape[-2] if points.dim() > 1 else 0
         shape = (self.batch, count, dim)
-        found = self._expand("obstacle", found, [shape[1:], shape], shape)
-        if not found.isfinite().all():
+        points = self._expand("obstacle", points, [shape[1:], shape], shape)
+        if not points.isfinite().all():
             raise DataError("obstacle has values that are not finite.")
-        return found
+        return points
 
     def _add_bodies(self, solid: Tensor, given: Bodies) -> tuple[Tensor, Tensor]:
         """(B, M, D) obstacle particles with those of bodies, and their shares (B, M)."""
@@ -173,44 +173,44 @@ class StateBuilder:
         Raises:
             DataError: if it is not the model's, or needed.
         """
-        return (self._gravity(given) * self.scene.dt**2).to(self.dtype)
+        return (self._gravity_per_second(given) * self.scene.dt**2).to(self.dtype)
 
-    def _gravity(self, given: Any) -> Tensor:
+    def _gravity_per_second(self, given: Any) -> Tensor:
         scene, shape = self.scene, (self.batch, self.scene.dim)
         if given is None:
             if scene.gravity_varies:
                 raise DataError("gravity is needed, in length/s²: this model's scenes differ in it.")
             return self._expand("gravity", scene.gravity or (0.0,) * scene.dim, [shape[1:]], shape)
-        found = self._expand("gravity", given, [shape[1:], shape], shape)
-        if not found.isfinite().all():
-            raise DataError(f"gravity = {found.tolist()} must be finite.")
+        values = self._expand("gravity", given, [shape[1:], shape], shape)
+        if not values.isfinite().all():
+            raise DataError(f"gravity = {values.tolist()} must be finite.")
         if scene.gravity_varies:
-            self._check_gravity_range(found)
+            self._check_gravity_range(values)
         else:
-            self._check_fixed_gravity(found)
-        return found
+            self._check_fixed_gravity(values)
+        return values
 
-    def _check_fixed_gravity(self, found: Tensor) -> None:
+    def _check_fixed_gravity(self, values: Tensor) -> None:
         if self.scene.gravity is None:
             raise DataError("gravity: it is not known for this model's scenes, so none can be set; leave it out.")
-        fixed = found.new_tensor(self.scene.gravity)
+        fixed = values.new_tensor(self.scene.gravity)
         largest = float(fixed.abs().max())
-        if (found - fixed).abs().max() <= 1e-3 * largest:
+        if (values - fixed).abs().max() <= 1e-3 * largest:
             return
-        per_frame = (found / self.scene.dt**2 - fixed).abs().max() <= 1e-2 * largest
+        per_frame = (values / self.scene.dt**2 - fixed).abs().max() <= 1e-2 * largest
         hint = " It seems to be per frame squared: divide it by dt²." if per_frame and largest else ""
         raise DataError(
-            f"gravity = {found[0].tolist()} length/s², but the model knows only {list(self.scene.gravity)}, with which"
+            f"gravity = {values[0].tolist()} length/s², but the model knows only {list(self.scene.gravity)}, with which"
             f" it was trained; leave it out.{hint}"
         )
 
-    def _check_gravity_range(self, found: Tensor) -> None:
+    def _check_gravity_range(self, values: Tensor) -> None:
         low, high = gravity_range(self.emulator)
-        outside = (found < low - 0.01 * low.abs()) | (found > high + 0.01 * high.abs())
+        outside = (values < low - 0.01 * low.abs()) | (values > high + 0.01 * high.abs())
         if outside.any():
             scene = int(outside.any(-1).nonzero()[0])
             raise DataError(
-                f"Scene {scene}: gravity = {found[scene].tolist()} length/s² is outside of the range that the model"
+                f"Scene {scene}: gravity = {values[scene].tolist()} length/s² is outside of the range that the model"
                 f" was calibrated for, {_format(low)} … {_format(high)}."
             )
 
@@ -243,9 +243,9 @@ class StateBuilder:
         if not state.obstacle.shape[1]:
             return
         with torch.no_grad():
-            own = state.to(self.emulator.device)
-            share = obstacle_share(self.emulator.solid(own), self.emulator.walls)
-            inside = Contact(share, self.emulator.grid).inside(self.emulator.in_cells(own)[0]).cpu()
+            state = state.to(self.emulator.device)
+            share = obstacle_share(self.emulator.solid(state), self.emulator.walls)
+            inside = Contact(share, self.emulator.grid).inside(self.emulator.in_cells(state)[0]).cpu()
         if inside.any():
             scene, particle = map(int, inside.nonzero()[0])
             warnings.warn(
@@ -256,13 +256,13 @@ class StateBuilder:
             )
 
     def _expand(self, name: str, given: Any, allowed: list[tuple[int, ...]], shape: tuple[int, ...]) -> Tensor:
-        found = _numbers(name, given)
-        if tuple(found.shape) not in allowed:
+        tensor = _numbers(name, given)
+        if tuple(tensor.shape) not in allowed:
             raise DataError(
-                f"{name} has the shape {tuple(found.shape)}; with positions {tuple(self.position.shape)} it must be"
+                f"{name} has the shape {tuple(tensor.shape)}; with positions {tuple(self.position.shape)} it must be"
                 f" {' or '.join(map(str, allowed))}."
             )
-        return found.expand(shape)
+        return tensor.expand(shape)
 
 
 def _numbers(name: str, values: Any) -> Tensor:
@@ -274,12 +274,12 @@ def _numbers(name: str, values: Any) -> Tensor:
     try:
         if not isinstance(values, Tensor) and (array := np.asarray(values)).dtype.kind in "iuf":
             values = array.astype(np.float64)  # torch takes neither all strides nor other byte orders
-        found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
+        tensor = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
     except (TypeError, ValueError, RuntimeError) as error:
         raise DataError(f"{name} cannot be read as an array of numbers: {one_line(error)}.") from error
-    if found.is_complex() or found.dtype is torch.bool:
-        raise DataError(f"{name} holds {str(found.dtype).removeprefix('torch.')} values; real numbers are needed.")
-    return found.to("cpu", torch.float64, copy=True)
+    if tensor.is_complex() or tensor.dtype is torch.bool:
+        raise DataError(f"{name} holds {str(tensor.dtype).removeprefix('torch.')} values; real numbers are needed.")
+    return tensor.to("cpu", torch.float64, copy=True)
 
 
 def _format(values: Tensor) -> str:
