@@ -37,21 +37,7 @@ _MODULE_OF = {
     "write_trajectories": "nmpm.data.arrays",
 }
 
-__all__ = [
-    "Emulator",
-    "EmulatorModule",
-    "EmulatorRecipe",
-    "Particles",
-    "Scene",
-    "Trajectory",
-    "TrajectoryDataModule",
-    "Zoo",
-    "__version__",
-    "differentiable_rollout",
-    "rollout",
-    "view",
-    "write_trajectories",
-]
+__all__ = [*_MODULE_OF, "__version__"]
 
 
 def __getattr__(name: str) -> Any:

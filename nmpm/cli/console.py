@@ -103,23 +103,23 @@ def explain(message: str, names: Iterable[str]) -> str:
         message: May have many lines.
         names: Options of the parser, such as "model.cells".
     """
-    if found := re.match(r"unrecognized arguments: --([\w.]+)", message):
-        return f"there is no option --{found[1]}{_hint(found[1], names, '--')}"
-    if found := re.match(r"Subcommand '\w+' does not accept option '([\w.]+)'", message):
-        return f"the configuration has an unknown key {found[1]}{_hint(found[1], names, '')}"
-    if found := re.match(r"Option '([\w.]+)' is not accepted", message):
-        return f"the argument {found[1]} is unknown{_hint(found[1], names, '')}"
+    if match := re.match(r"unrecognized arguments: --([\w.]+)", message):
+        return f"there is no option --{match[1]}{_hint(match[1], names, '--')}"
+    if match := re.match(r"Subcommand '\w+' does not accept option '([\w.]+)'", message):
+        return f"the configuration has an unknown key {match[1]}{_hint(match[1], names, '')}"
+    if match := re.match(r"Option '([\w.]+)' is not accepted", message):
+        return f"the argument {match[1]} is unknown{_hint(match[1], names, '')}"
     key = re.match(r'Parser key "([\w.]+)":', message)
     option = f"--{key[1]}: " if key else ""
-    if found := re.search(r"module '([\w.]+)' has no attribute '(\w+)'", message):
-        public = [name for name in vars(sys.modules.get(found[1], object())) if not name.startswith("_")]
-        return f"{option}there is no {found[1]}.{found[2]}{_question(found[2], public, f'{found[1]}.')}"
-    if found := re.search(r"Expected a <class '(\w+)'>\.? Got value: (.*)", message):
-        return f"{option}{found[2]} is not of type {found[1]}."
-    if found := re.search(r"Expected a typing\.Literal\[(.*?)\]\.? Got value: (\S+)", message):
-        return f"{option}{found[2]} is not one of {found[1]}."
-    if found := re.search(r"Problem with given class_path '([\w.]+)':\s+(.+)", message):
-        return f"{found[1]}: {found[2]}"
+    if match := re.search(r"module '([\w.]+)' has no attribute '(\w+)'", message):
+        public = [name for name in vars(sys.modules.get(match[1], object())) if not name.startswith("_")]
+        return f"{option}there is no {match[1]}.{match[2]}{_question(match[2], public, f'{match[1]}.')}"
+    if match := re.search(r"Expected a <class '(\w+)'>\.? Got value: (.*)", message):
+        return f"{option}{match[2]} is not of type {match[1]}."
+    if match := re.search(r"Expected a typing\.Literal\[(.*?)\]\.? Got value: (\S+)", message):
+        return f"{option}{match[2]} is not one of {match[1]}."
+    if match := re.search(r"Problem with given class_path '([\w.]+)':\s+(.+)", message):
+        return f"{match[1]}: {match[2]}"
     rest = re.sub(r"- Expected a path but \S+ either not accessible or invalid", "", message[key.end() if key else 0 :])
     line = " ".join(rest.split()).removeprefix("- ")
     return option + (line if len(line) <= LONGEST else f"{line[:LONGEST]} …")

@@ -19,13 +19,11 @@ from nmpm.errors import ConfigError, DataError
 
 NOT_FILES = (None, "last", "best", "null", "???")
 """Values of paths that name no file."""
-
 SIGNATURES = {
     "model": (("training/module.py", "EmulatorModule"), ("emulator/recipe.py", "EmulatorRecipe")),
     "data": (("data/datamodule.py", "TrajectoryDataModule"),),
 }
 """Files and classes whose arguments are the options --model.… and --data.…."""
-
 PARTS = {
     "nmpm.processors": "processors/__init__.py",
     "nmpm.transfer": "transfer/__init__.py",
@@ -113,13 +111,11 @@ def _config_paths(words: Sequence[str]) -> Iterator[str]:
 
 def _check_options(words: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> None:
     for group in SIGNATURES:
-        known = argument_names(group)
-        given = [found[1] for word in words if (found := re.match(rf"--{group}\.(\w+)", word))]
+        names = argument_names(group)
+        given = [match[1] for word in words if (match := re.match(rf"--{group}\.(\w+)", word))]
         sections = [section for config in configs if isinstance(section := config.get(group), Mapping)]
-        stated = [str(key) for section in sections for key in section]
-        for name in [*given, *stated]:
-            near = [] if name in known else get_close_matches(name, known, n=1, cutoff=0.8)
-            if near:
+        for name in [*given, *(str(key) for section in sections for key in section)]:
+            if name not in names and (near := get_close_matches(name, names, n=1, cutoff=0.8)):
                 option = name in given
                 what = f"there is no option --{group}." if option else f"the configuration has an unknown key {group}."
                 raise UsageError(f"{what}{name}; did you mean {'--' if option else ''}{group}.{near[0]}?")
@@ -129,14 +125,13 @@ def _check_classes(words: Sequence[str]) -> None:
     for option, word in pairwise(words):
         name, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
         module, _, kind = value.rpartition(".")
-        if module not in PARTS or kind in (known := class_names(module)):
-            continue
-        if near := get_close_matches(kind, known, n=1):
+        names = class_names(module) if module in PARTS else set()
+        if kind not in names and (near := get_close_matches(kind, names, n=1)):
             raise UsageError(f"{name}: there is no {value}; did you mean {module}.{near[0]}?")
 
 
 def _value(options: Mapping[str, str], configs: Sequence[Mapping[str, Any]], key: str) -> Any:
-    """What an option or else the last configuration that has the key says; None if none does."""
+    """The value of an option, or else of the last configuration that has the key; None if none does."""
     if f"--{key}" in options:
         return options[f"--{key}"]
     section, _, name = key.rpartition(".")

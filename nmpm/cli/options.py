@@ -81,11 +81,7 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
 
 
 def check_device(name: str) -> None:
-    """Check a `--device` that a rollout can run on.
-
-    Raises:
-        ConfigError: if it is another, such as torch's "meta", or this machine does not have it.
-    """
+    """Raise ConfigError if a `--device` cannot run rollouts, as torch's "meta", or this machine does not have it."""
     from nmpm._support.devices import DEVICES, find_device
 
     if name.partition(":")[0] not in DEVICES:
@@ -94,41 +90,25 @@ def check_device(name: str) -> None:
 
 
 def check_at_least(option: str, value: int | None, least: int) -> None:
-    """Check an integer option; None is one that was left out.
-
-    Raises:
-        ConfigError: if the value is too small.
-    """
+    """Raise ConfigError if an integer option was given, but is too small."""
     if value is not None and value < least:
         raise ConfigError(f"{option} {value}: it must be at least {least}.")
 
 
 def check_output(option: str, path: Path) -> None:
-    """Check, before the work, that a file can be written.
-
-    Raises:
-        ConfigError: if the path is a folder, or its folder does not exist or is not writable.
-    """
+    """Raise ConfigError, before the work, if a file cannot be written."""
     _refuse(option, path, file_obstacle(path))
 
 
 def check_picture(option: str, path: Path) -> None:
-    """Check, before the work, that a PNG can be written.
-
-    Raises:
-        ConfigError: as `check_output`, or if the name does not end in .png.
-    """
+    """Raise ConfigError, before the work, if a file cannot be written, or its name does not end in .png."""
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{option} {path}: pictures are PNG; end the name in .png.")
     check_output(option, path)
 
 
 def check_folder(option: str, path: Path) -> None:
-    """Check, before the work, that a folder can be written, or made.
-
-    Raises:
-        ConfigError: if the path is a file, or the nearest folder that exists is not writable.
-    """
+    """Raise ConfigError, before the work, if a folder cannot be written or made."""
     _refuse(option, path, name_obstacle(path))
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{option} {path}: it is a file; name a folder.")
@@ -139,11 +119,7 @@ def check_folder(option: str, path: Path) -> None:
 
 
 def check_input(option: str, path: Path) -> None:
-    """Check that a file exists.
-
-    Raises:
-        ConfigError: if it does not, or is a folder.
-    """
+    """Raise ConfigError if a file does not exist, or is a folder."""
     _refuse(option, path, name_obstacle(path))
     if path.is_dir():
         raise ConfigError(f"{option} {path}: it is a folder; name a file in it, such as {path / 'test.h5'}.")
@@ -164,45 +140,33 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--fields", metavar="NAME,...", help="fields that are inputs of models, e.g. temperature")
 
 
-def data_options(chosen: argparse.Namespace) -> Options:
-    """The values of the options of `add_data_options`.
-
-    Raises:
-        ConfigError: naming the option that cannot be read.
-    """
+def data_options(options: argparse.Namespace) -> Options:
+    """The values of the options of `add_data_options`; raises ConfigError, naming the option that cannot be read."""
     from nmpm.data.convert import Options
     from nmpm.data.families import find_family
 
-    if chosen.family is not None:
-        find_family(chosen.family)
+    if options.family is not None:
+        find_family(options.family)
     return Options(
-        family=chosen.family,
-        types=_parse("--types", chosen.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
-        static=_parse("--static", chosen.static, _ids, 'type ids, e.g. 1,3, or "none"'),
-        bounds=_parse("--bounds", chosen.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
-        dt=chosen.dt,
-        gravity=gravity_option(chosen.gravity),
-        periodic=_parse("--boundary", chosen.boundary, _kinds, '"wall" or "periodic" for each axis'),
-        fields=_parse("--fields", chosen.fields, _field_names, "names, e.g. temperature,stiffness"),
+        family=options.family,
+        types=_parse("--types", options.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
+        static=_parse("--static", options.static, _ids, 'type ids, e.g. 1,3, or "none"'),
+        bounds=_parse("--bounds", options.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
+        dt=options.dt,
+        gravity=gravity_option(options.gravity),
+        periodic=_parse("--boundary", options.boundary, _kinds, '"wall" or "periodic" for each axis'),
+        fields=_parse("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
     )
 
 
 def gravity_option(text: str | None) -> tuple[float, ...] | None:
-    """The numbers of `--gravity`.
-
-    Raises:
-        ConfigError: if they cannot be read.
-    """
+    """The numbers of `--gravity`; raises ConfigError if they cannot be read."""
     numbers: tuple[float, ...] | None = _parse("--gravity", text, _numbers, "a number for each axis, e.g. 0,-9.81")
     return numbers
 
 
 def new_ids(text: str | None) -> dict[int, int] | None:
-    """The pairs of `--ids`.
-
-    Raises:
-        ConfigError: if they cannot be read.
-    """
+    """The pairs of `--ids`; raises ConfigError if they cannot be read."""
     pairs: dict[int, int] | None = _parse("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
     return pairs
 

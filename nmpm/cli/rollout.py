@@ -41,22 +41,22 @@ examples:
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
-    chosen = _parser().parse_args(words[1:])
-    _check(chosen)
+    options = _parser().parse_args(words[1:])
+    _check(options)
     from nmpm.emulator.input_checks import warn_of_start_outside
     from nmpm.zoo.registry import load_model
 
-    model = load_model(chosen.model, chosen.device, chosen.root).optimized(chosen.runtime, chosen.precision)
-    choose_threads(model, chosen.threads)
-    window = None if chosen.data is None else _recorded(model, chosen.data, chosen.trajectory)
+    model = load_model(options.model, options.device, options.root).optimized(options.runtime, options.precision)
+    choose_threads(model, options.threads)
+    window = None if options.data is None else _recorded(model, options.data, options.trajectory)
     recorded = 0 if window is None else window.target.shape[1]
-    state = _thrown_state(model, chosen) if window is None else window.initial
+    state = _thrown_state(model, options) if window is None else window.initial
     warn_of_start_outside(model.emulator, state.to(model.emulator.device))
-    rollout = _predict(model, state, chosen.frames or recorded or FRAMES, chosen)
-    _write(model, state, rollout, window if recorded else None, chosen)
+    rollout = _predict(model, state, options.frames or recorded or FRAMES, options)
+    _write(model, state, rollout, window if recorded else None, options)
     if window is not None and recorded:
-        _print_errors(model, window, rollout, chosen)
-    sys.stdout.write(f"to look at them: nmpm view {chosen.out}\n")
+        _print_errors(model, window, rollout, options)
+    sys.stdout.write(f"to look at them: nmpm view {options.out}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -100,25 +100,25 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check(chosen: argparse.Namespace) -> None:
+def _check(options: argparse.Namespace) -> None:
     """Check the numbers and paths before anything is loaded."""
     for name, least in (("frames", 1), ("threads", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
-        check_at_least(f"--{name}", getattr(chosen, name), least)
-    if chosen.data is not None:
-        check_input("--data", chosen.data)
-        if chosen.gravity is not None:
+        check_at_least(f"--{name}", getattr(options, name), least)
+    if options.data is not None:
+        check_input("--data", options.data)
+        if options.gravity is not None:
             raise ConfigError("--gravity is of thrown blocks: leave it out beside --data, which has its own.")
-    check_output("--out", chosen.out)
-    check_device(chosen.device)
+    check_output("--out", options.out)
+    check_device(options.device)
 
 
-def _thrown_state(model: Pretrained, chosen: argparse.Namespace) -> Particles:
-    gravity = gravity_option(chosen.gravity)
+def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
+    gravity = gravity_option(options.gravity)
     try:
-        return model.example(chosen.seed, chosen.particles, chosen.blocks, gravity)
+        return model.example(options.seed, options.particles, options.blocks, gravity)
     except ConfigError as error:
-        blocks = "" if chosen.blocks is None else f" --blocks {chosen.blocks}"
-        raise ConfigError(f"--particles {chosen.particles}{blocks}: {error}") from error
+        blocks = "" if options.blocks is None else f" --blocks {options.blocks}"
+        raise ConfigError(f"--particles {options.particles}{blocks}: {error}") from error
 
 
 def _recorded(model: Pretrained, path: Path, index: int) -> Window:
@@ -141,16 +141,15 @@ def _recorded(model: Pretrained, path: Path, index: int) -> Window:
 def _family(model: Pretrained) -> str | None:
     from nmpm.data.families import FAMILIES
 
-    known = set(FAMILIES["deepmind"].types.values())
-    return "deepmind" if set(model.scene.materials) <= known else None
+    return "deepmind" if set(model.scene.materials) <= set(FAMILIES["deepmind"].types.values()) else None
 
 
-def _predict(model: Pretrained, state: Particles, frames: int, chosen: argparse.Namespace) -> Rollout:
+def _predict(model: Pretrained, state: Particles, frames: int, options: argparse.Namespace) -> Rollout:
     from nmpm._support.progress import progress_bar
     from nmpm.emulator import Rollout, stream_rollout
     from nmpm.emulator.monitor import Monitor, Policy
 
-    monitor, parts = Monitor(Policy(chosen.watch)), []
+    monitor, parts = Monitor(Policy(options.watch)), []
     with progress_bar("rollout", -(-frames // model.emulator.frames)) as step:
         for bundle in stream_rollout(model.emulator, state.to(model.emulator.device), frames, monitor):
             parts.append(bundle.cpu())  # as a device may have less memory than a long rollout needs
@@ -160,22 +159,22 @@ def _predict(model: Pretrained, state: Particles, frames: int, chosen: argparse.
 
 
 def _write(
-    model: Pretrained, state: Particles, rollout: Rollout, window: Window | None, chosen: argparse.Namespace
+    model: Pretrained, state: Particles, rollout: Rollout, window: Window | None, options: argparse.Namespace
 ) -> None:
     """Write the start and the prediction, beside what was recorded, with what is needed to draw them."""
     from nmpm.data.format import write_split
     from nmpm.data.predictions import predicted_trajectory
 
-    origin = f"the zoo model {chosen.model}" if "sha256" in model.card else f"the model {chosen.model}"
+    origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
     truth = None if window is None else window.frames[:, : rollout.position.shape[1] + 2]
     start = state.to("cpu")
     predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields, truth=truth)
-    write_split(chosen.out, [predicted])
+    write_split(options.out, [predicted])
     frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
-    sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {chosen.out}\n")
+    sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {options.out}\n")
 
 
-def _print_errors(model: Pretrained, window: Window, rollout: Rollout, chosen: argparse.Namespace) -> None:
+def _print_errors(model: Pretrained, window: Window, rollout: Rollout, options: argparse.Namespace) -> None:
     """Print the errors against a recording beside those of the trivial predictors, over the frames that both have."""
     from rich.console import Console
 
@@ -188,5 +187,5 @@ def _print_errors(model: Pretrained, window: Window, rollout: Rollout, chosen: a
     fields = {name: values[:, :frames] for name, values in rollout.fields.items()}
     comparison.update(window.first(frames + 2), rollout.position[:, :frames], fields)
     figures = {name: float(value) for name, value in comparison.compute().items()}
-    what = f"{chosen.data}, trajectory {chosen.trajectory}, {frames} frames:"
+    what = f"{options.data}, trajectory {options.trajectory}, {frames} frames:"
     Console().print(error_table(what, figures))

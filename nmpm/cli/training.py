@@ -1,8 +1,15 @@
-"""`nmpm fit | validate | test | predict`: names and paths are checked before torch and Lightning are imported."""
+"""`nmpm fit | validate | test | predict`: help, runs' folders, and checks before torch and Lightning are imported.
+
+The help is read from the source. `--help_all` lists every option with type and default, also those of Lightning's
+Trainer, and takes the seconds that importing Lightning takes.
+"""
 
 from __future__ import annotations
 
+import ast
+import re
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +19,7 @@ import yaml
 
 from nmpm._support.shipped import find_config
 from nmpm.cli import COMMANDS
-from nmpm.cli.early_checks import UsageError, check_command, read_config
+from nmpm.cli.early_checks import SIGNATURES, UsageError, argument_names, check_command, class_definition, read_config
 from nmpm.errors import ConfigError
 
 CONFIG = "config.yaml"
@@ -30,8 +37,6 @@ def run(words: list[str]) -> int:
         ConfigError: if a file or run that is named does not exist.
     """
     if "--help" in words or "-h" in words:
-        from nmpm.cli.training_help import training_help
-
         sys.stdout.write(training_help(words[0], COMMANDS[words[0]][1]))
         return 0
     try:
@@ -153,3 +158,111 @@ def _value(config: Mapping[str, Any], key: str) -> Any:
             value = value.get("init_args")
         value = value.get(part) if isinstance(value, Mapping) else None
     return value
+
+
+LINKED = {"model": {"scene", "recipe"}, "data": {"horizon"}}
+"""Arguments that the command line takes from elsewhere."""
+INDENT, WIDTH = 30, 100
+
+HELP = """\
+usage: nmpm {command} --config FILE [--SECTION.KEY VALUE ...]
+       nmpm {command} {run} [--SECTION.KEY VALUE ...]
+
+{summary}
+RUN is the folder of a run, which holds its configuration; it may have been moved or copied.
+Options replace what the configuration says, and later --config files what earlier ones say. What
+none of them says has the default that --help_all shows.
+
+examples:
+{examples}
+
+options:
+{options}
+
+--model.KEY:
+{model}
+
+--data.KEY:
+{data}
+
+--trainer.KEY, of Lightning's Trainer, such as:
+{trainer}
+
+--checkpoint.KEY and --resume.KEY are of Lightning's ModelCheckpoint: which checkpoint is the best,
+and how often the one to resume from is written.
+
+more:
+  nmpm {command} --help_all                  every option with type and default; takes seconds
+  nmpm {command} --config goop.yaml --print_config
+      the whole configuration
+  nmpm {command} --model.processor.help nmpm.processors.UNet
+      options of a part
+"""
+EXAMPLES = {
+    "fit": """\
+  nmpm fit --config goop.yaml                           simulate data, train, test, draw
+  nmpm fit --resume runs/goop                           go on after an interruption
+  nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
+  nmpm fit --config waterdrop.yaml --data.path FOLDER   train on recorded data""",
+    "validate": """\
+  nmpm validate runs/goop                               its best weights""",
+    "test": """\
+  nmpm test runs/goop                                   its best weights
+  nmpm test runs/goop --ckpt_path last                  its last ones
+  nmpm test runs/goop --data.path FOLDER                on other scenes""",
+    "predict": """\
+  nmpm predict runs/goop                                its best weights""",
+}
+OPTIONS = {
+    "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
+    "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, the other commands run it",
+    "--start_from MODEL": "fit only: start with the weights of a zoo model, a run or a checkpoint of the same parts",
+    "--seed_everything N": "seed of all random numbers (default: 0)",
+    "--print_config": "print the configuration that results, and stop",
+}
+TRAINER = {
+    "default_root_dir": "folder of the run's files",
+    "max_steps, max_time": "end of the training: steps, or DD:HH:MM:SS, whichever is first",
+    "accelerator, devices": "where to compute: auto, cpu, gpu; how many devices, see docs/scaling.md",
+    "precision": "of the network: bf16-mixed, or 32-true, which CPUs without bfloat16 take in its place",
+    "val_check_interval": "steps from validation to validation",
+    "enable_progress_bar": "false for none",
+}
+
+
+def training_help(command: str, summary: str) -> str:
+    """The help of a training command.
+
+    Args:
+        command: fit, validate, test or predict.
+        summary: What it does, in one sentence.
+    """
+    sections = {group: "\n".join(_entries(dict(_described(group)))) for group in SIGNATURES}
+    shared = {"options": "\n".join(_entries(OPTIONS)), "trainer": "\n".join(_entries(TRAINER))}
+    run = "--resume RUN" if command == "fit" else "RUN"
+    return HELP.format(command=command, run=run, summary=summary, examples=EXAMPLES[command], **shared, **sections)
+
+
+def _described(group: str) -> Iterator[tuple[str, str]]:
+    """Arguments of --model.… or --data.…, in their order, and the first sentence about each."""
+    names = argument_names(group) - LINKED[group]
+    for file, name in SIGNATURES[group]:
+        for key, text in _argument_texts(ast.get_docstring(class_definition(file, name)) or ""):
+            if key in names:
+                yield key, re.split(r"\. (?=[A-Z])|\.$", text)[0]
+
+
+def _argument_texts(docstring: str) -> Iterator[tuple[str, str]]:
+    """Names and texts of the section "Args:" of a docstring."""
+    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", docstring, flags=re.DOTALL | re.MULTILINE)
+    for entry in re.split(r"\n(?=    \w)", section[1].rstrip() if section else ""):
+        key, _, text = entry.strip().partition(": ")
+        yield key, " ".join(text.split())
+
+
+def _entries(described: dict[str, str]) -> Iterator[str]:
+    for key, text in described.items():
+        first, *others = textwrap.wrap(text, WIDTH - INDENT)
+        start = f"  {key}".ljust(INDENT)
+        yield start + first if len(start) == INDENT else f"{start}\n{' ' * INDENT}{first}"
+        yield from (" " * INDENT + other for other in others)

@@ -6,12 +6,9 @@ import csv
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import read_yaml
@@ -22,6 +19,10 @@ from nmpm.scene import Scene
 from nmpm.zoo.card import FACTOR, lifecycle, table_row
 from nmpm.zoo.choice import stated_milliseconds
 from nmpm.zoo.entries import CONFIG, read_card, read_recipe
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 CHART = "chart.png"
 PICTURES = {
@@ -201,6 +202,9 @@ def draw_chart(folder: Path, name: str) -> Figure | None:
     drawn = [columns for columns in (errors, training) if columns]
     if not drawn:
         return None
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(4.6 * len(drawn), 3.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = iter(figure.subplots(1, len(drawn), squeeze=False)[0])
