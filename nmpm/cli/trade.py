@@ -95,7 +95,6 @@ def measure_and_report(command: str, chosen: argparse.Namespace, dataset: str) -
 
     from nmpm._support.bounded_files import read_text
     from nmpm._support.devices import find_device
-    from nmpm._support.progress import progress_bar
     from nmpm.evaluation import trade
     from nmpm.evaluation.trade.report import likely_points, report_lines, summary_table, write_report
 
@@ -112,8 +111,7 @@ def measure_and_report(command: str, chosen: argparse.Namespace, dataset: str) -
     choices = trade.make_choices(sweep, scenes, models, find_device(chosen.device), chosen.predictors)
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
-    with progress_bar(command, trade.count_steps(choices, scenes, sweep)) as step:
-        points = trade.measure(choices, scenes, sweep, trade.Store(out), step)
+    points = trade.measure(choices, scenes, sweep, trade.Store(out), command)
     console = Console()
     shown = likely_points(points) if command == "trade" else points
     console.print(summary_table(shown, points, scenes))

@@ -1,7 +1,7 @@
 """The trade between speed and accuracy: models, the simulator and trivial predictors, measured on the same scenes."""
 
 from nmpm.evaluation.trade.choices import Kind, Predictor
-from nmpm.evaluation.trade.measurement import Store, count_steps, measure
+from nmpm.evaluation.trade.measurement import Store, measure
 from nmpm.evaluation.trade.ranking import Point
 from nmpm.evaluation.trade.scenes import Scenes, find_scenes, find_wider_scenes, read_scenes
 from nmpm.evaluation.trade.sweep import Sweep, make_choices, read_sweep, shipped_sweep_text
@@ -13,7 +13,6 @@ __all__ = [
     "Scenes",
     "Store",
     "Sweep",
-    "count_steps",
     "find_scenes",
     "find_wider_scenes",
     "make_choices",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import one_line
+from nmpm._support.progress import Step, progress_bar
 from nmpm.errors import NmpmError
 from nmpm.evaluation.bootstrap import Floats
 from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, peak_bytes
@@ -30,9 +31,6 @@ from nmpm.evaluation.trade.choices import Choice, digest
 from nmpm.evaluation.trade.ranking import Point, Times
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.sweep import Sweep, Timing
-
-Progress = Callable[[str], object]
-"""Called after each scene of a choice and each timed rollout, with what was done."""
 
 _WARM_UP = 16  # frames: kernels are chosen and code is compiled in them
 
@@ -65,12 +63,7 @@ class Store:
         return self.folder / "points" / f"{kind}-{digest(key)}.json"
 
 
-def count_steps(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep) -> int:
-    """How often `measure` calls its progress."""
-    return len(choices) * (len(scenes) + sweep.timing.rounds)
-
-
-def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store, progress: Progress) -> list[Point]:
+def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store, title: str = "trade") -> list[Point]:
     """The points of all choices; what the store has is not measured again.
 
     Args:
@@ -78,19 +71,17 @@ def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Stor
         scenes: What is predicted.
         sweep: Measures and timing.
         store: Keeps everything as soon as it is measured.
-        progress: Told what was done.
+        title: Of the progress.
     """
-    for choice in choices:
-        for _ in measure_accuracy(choice, scenes, sweep.measures, store):
-            progress(f"errors: {choice.name}")
-    for _ in measure_times(choices, scenes, sweep.timing, store):
-        progress("times, all choices in turn")
-    return [_point(choice, scenes, sweep, store) for choice in choices]
+    with progress_bar(title, len(choices) * (len(scenes) + sweep.timing.rounds)) as step:
+        rows = [measure_accuracy(choice, scenes, sweep.measures, store, step) for choice in choices]
+        times = measure_times(choices, scenes, sweep.timing, store, step)
+    return [_point(*measured, scenes) for measured in zip(choices, rows, times, strict=True)]
 
 
-def _point(choice: Choice, scenes: Scenes, sweep: Sweep, store: Store) -> Point:
-    rows = _stored_errors(choice, scenes, sweep.measures, store)
+def _point(choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times, scenes: Scenes) -> Point:
     length = min(scenes.frames(index) for index in range(len(scenes)))
+    names = dict.fromkeys(name for row in rows for name in row.get("errors", {}))
     return Point(
         kind=choice.kind,
         name=choice.name,
@@ -98,51 +89,26 @@ def _point(choice: Choice, scenes: Scenes, sweep: Sweep, store: Store) -> Point:
         batch=choice.batch,
         threads=choice.threads,
         device=choice.device.type,
-        times=_stored_times(choice, scenes, sweep.timing, store),
-        errors=_columns([row.get("errors", {}) for row in rows]),
+        times=times,
+        errors={name: np.array([row.get("errors", {}).get(name, np.nan) for row in rows]) for name in names},
         failures={index: row["failed"] for index, row in enumerate(rows) if "failed" in row},
         curves=np.array([row.get("curve", [np.nan] * length)[:length] for row in rows]),
         frames=_unpack(rows[0].get("frames"), scenes),
     )
 
 
-def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Floats]:
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-
-
-def _pack(frames: Tensor) -> str:
-    """Positions (F, N, D) as base64 of little-endian float32."""
-    return base64.b64encode(frames.contiguous().numpy().astype("<f4").tobytes()).decode("ascii")
-
-
-def _unpack(text: str | None, scenes: Scenes) -> Floats | None:
-    if text is None:
-        return None
-    particles, dim = scenes.recordings[0].frames.shape[1:]
-    flat = np.frombuffer(base64.b64decode(text), "<f4").astype(np.float64)
-    return flat.reshape(-1, particles, dim)
-
-
-def measure_accuracy(choice: Choice, scenes: Scenes, measures: Measures, store: Store) -> Iterator[None]:
-    """Measure the errors of each scene that the store lacks; yields after every scene."""
-    key = _errors_key(choice, measures)
+def measure_accuracy(
+    choice: Choice, scenes: Scenes, measures: Measures, store: Store, step: Step
+) -> list[dict[str, Any]]:
+    """What `_measure_scene` gives of each scene, measured where the store lacks it; calls `step` after every scene."""
+    key = {"choice": dict(choice.identity), "measures": measures.to_dict()}
     stored = store.read("errors", key)
     for index, scene in enumerate(scenes.digests):
         if scene not in stored:
             stored[scene] = _measure_scene(choice, scenes, index, measures)
             store.write("errors", key, stored)
-        yield
-
-
-def _stored_errors(choice: Choice, scenes: Scenes, measures: Measures, store: Store) -> list[dict[str, Any]]:
-    """What the store has of each scene, see `_measure_scene`; empty where it was not measured."""
-    stored = store.read("errors", _errors_key(choice, measures))
-    return [stored.get(scene, {}) for scene in scenes.digests]
-
-
-def _errors_key(choice: Choice, measures: Measures) -> dict[str, Any]:
-    return {"choice": dict(choice.identity), "measures": measures.to_dict()}
+        step(f"errors: {choice.name}")
+    return [stored[scene] for scene in scenes.digests]
 
 
 def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measures) -> dict[str, Any]:
@@ -169,64 +135,83 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
     return row
 
 
+def _pack(frames: Tensor) -> str:
+    """Positions (F, N, D) as base64 of little-endian float32."""
+    return base64.b64encode(frames.contiguous().numpy().astype("<f4").tobytes()).decode("ascii")
+
+
+def _unpack(text: str | None, scenes: Scenes) -> Floats | None:
+    if text is None:
+        return None
+    particles, dim = scenes.recordings[0].frames.shape[1:]
+    flat = np.frombuffer(base64.b64decode(text), "<f4").astype(np.float64)
+    return flat.reshape(-1, particles, dim)
+
+
 @dataclass
 class _Runner:
-    """A choice, its key in the store and what is stored: rounds by number, and the memory."""
+    """A choice that is timed.
+
+    Args:
+        choice: What is timed.
+        key: Of its times in the store.
+        stored: Milliseconds by round, beside those of the reference; the memory; why it failed.
+        warm: Whether it has run before.
+    """
 
     choice: Choice
     key: dict[str, Any]
-    stored: dict[str, Any] = field(default_factory=dict)
+    stored: dict[str, Any]
+    warm: bool = False
 
     def lacks(self, turn: int) -> bool:
         return str(turn) not in self.stored and "failed" not in self.stored
 
 
-def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store) -> Iterator[None]:
-    """Time all choices that lack a round, in an order that turns; yields after each run.
+def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store, step: Step) -> list[Times]:
+    """The times of all choices; those that lack a round take turns in it, in an order that changes.
 
     Args:
         choices: What to time; ratios of times are over the first, which is timed in each of these rounds.
         scenes: What is predicted: round r predicts scene r, and the next ones where a choice takes several at once.
         timing: Rounds and frames.
         store: Keeps each round's times as soon as the round is complete.
+        step: Called after each run.
     """
-    runners = _make_runners(choices, scenes, timing, store)
-    warm: set[int] = set()
+    keys = [_times_key(choice, scenes, timing) for choice in choices]
+    runners: dict[str, _Runner] = {}  # one for choices that are the same, such as the twin and that many substeps
+    for choice, key in zip(choices, keys, strict=True):
+        runners.setdefault(digest(key), _Runner(choice, key, store.read("times", key)))
     for turn in range(timing.rounds):
-        missing = [runner for runner in runners if runner.lacks(turn)]
-        needed = [runner for runner in runners if runner in missing or (missing and runner.choice is choices[0])]
-        yield from (None for _ in range(len(choices) - len(needed)))
-        spent: dict[int, float | None] = {}
-        shift = turn % max(1, len(needed))
-        for runner in needed[shift:] + needed[:shift]:
-            spent[id(runner)] = _time_round(runner, scenes, turn, timing, id(runner) not in warm)
-            warm.add(id(runner))
-            yield
-        reference = next((spent[id(runner)] for runner in needed if runner.choice is choices[0]), None)
-        for runner in missing:
-            milliseconds = spent[id(runner)]
-            if milliseconds is not None:
-                runner.stored[str(turn)] = [milliseconds, reference]
-            store.write("times", runner.key, runner.stored)
+        timed = _time_all(list(runners.values()), scenes, turn, timing, store, step)
+        step("times, all choices in turn", len(choices) - timed)
+    return [_times(runners[digest(key)], timing) for key in keys]
 
 
-def _make_runners(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store) -> list[_Runner]:
-    """One for each choice; one for choices that are the same, such as the twin and that number of substeps."""
-    keys = {digest(key): (choice, key) for choice in reversed(choices) for key in [_times_key(choice, scenes, timing)]}
-    return [_Runner(choice, key, store.read("times", key)) for choice, key in reversed(keys.values())]
+def _time_all(runners: Sequence[_Runner], scenes: Scenes, turn: int, timing: Timing, store: Store, step: Step) -> int:
+    """Time the runners that lack a round, and the first for the ratio; returns how many were timed."""
+    missing = [runner for runner in runners if runner.lacks(turn)]
+    needed = [runner for runner in runners if runner in missing or (missing and runner is runners[0])]
+    shift = turn % max(1, len(needed))
+    spent: dict[int, float | None] = {}
+    for runner in needed[shift:] + needed[:shift]:
+        spent[id(runner)] = _time_one(runner, scenes, turn, timing)
+        step("times, all choices in turn")
+    for runner in missing:
+        if spent[id(runner)] is not None:
+            runner.stored[str(turn)] = [spent[id(runner)], spent[id(runners[0])]]
+        store.write("times", runner.key, runner.stored)
+    return len(needed)
 
 
-def _stored_times(choice: Choice, scenes: Scenes, timing: Timing, store: Store) -> Times:
-    """The times of a choice that the store has."""
-    key = _times_key(choice, scenes, timing)
-    stored = store.read("times", key)
-    rounds = [stored[str(turn)] for turn in range(timing.rounds) if str(turn) in stored]
+def _times(runner: _Runner, timing: Timing) -> Times:
+    rounds = [runner.stored[str(turn)] for turn in range(timing.rounds) if str(turn) in runner.stored]
     return Times(
         milliseconds=tuple(spent for spent, _ in rounds),
         ratios=tuple(spent / reference for spent, reference in rounds if reference),
-        memory=stored.get("memory"),
-        clock=key["clock"],
-        hardware=key["hardware"],
+        memory=runner.stored.get("memory"),
+        clock=runner.key["clock"],
+        hardware=runner.key["hardware"],
     )
 
 
@@ -244,7 +229,7 @@ def _times_key(choice: Choice, scenes: Scenes, timing: Timing) -> dict[str, Any]
     }
 
 
-def _time_round(runner: _Runner, scenes: Scenes, turn: int, timing: Timing, warm_up: bool) -> float | None:
+def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> float | None:
     """Milliseconds per computed frame and scene; None where the choice fails, which is stored.
 
     Where the machine fails the error is raised, so that the round is repeated the next time.
@@ -256,8 +241,9 @@ def _time_round(runner: _Runner, scenes: Scenes, turn: int, timing: Timing, warm
     torch.set_num_threads(choice.threads)
     try:
         run = choice.prepare(scenes, indices)
-        if warm_up:
+        if not runner.warm:
             run(min(frames, _WARM_UP))
+            runner.warm = True
         if "memory" not in runner.stored:
             memory = peak_bytes(lambda: run(frames), choice.device)
             runner.stored["memory"] = memory if memory == memory else None  # (NaN is no JSON)

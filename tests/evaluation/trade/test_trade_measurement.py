@@ -18,7 +18,7 @@ from nmpm.evaluation.prediction_errors import (
     measure_errors,
     recorded_energy_gain,
 )
-from nmpm.evaluation.trade import Kind, Scenes, Store, count_steps, measure
+from nmpm.evaluation.trade import Kind, Scenes, Store, measure
 from nmpm.evaluation.trade.choices import PredictorChoice, SimulatorChoice, trivial_choice
 from nmpm.evaluation.trade.measurement import measure_accuracy, measure_times
 from nmpm.evaluation.trade.report import csv_text
@@ -34,7 +34,7 @@ def named(choices, name):
 
 
 def run(choices, scenes, folder):
-    return measure(choices, scenes, tiny_sweep(), Store(folder), lambda _: None)
+    return measure(choices, scenes, tiny_sweep(), Store(folder))
 
 
 def made(name, scenes, make):
@@ -47,10 +47,12 @@ def made(name, scenes, make):
     return PredictorChoice(kind=Kind.OTHER, name=name, predictor=predict)
 
 
+def ignore(*_):
+    """No progress."""
+
+
 def test_measuring_again_measures_nothing_and_gives_the_same_points(scenes, choices, tmp_path, monkeypatch):
-    sweep, steps = tiny_sweep(), []
-    first = measure(choices, scenes, sweep, Store(tmp_path), steps.append)
-    assert len(steps) == count_steps(choices, scenes, sweep)
+    first = run(choices, scenes, tmp_path)
     for choice in choices:
         monkeypatch.setattr(type(choice), "prepare", lambda *_: pytest.fail("measured again"))
     assert csv_text(run(choices, scenes, tmp_path), scenes) == csv_text(first, scenes)
@@ -58,13 +60,17 @@ def test_measuring_again_measures_nothing_and_gives_the_same_points(scenes, choi
 
 def test_an_interrupted_measurement_goes_on_to_the_same_errors(scenes, choices, tmp_path):
     measures, choice = tiny_sweep().measures, named(choices, "carried")
-    list(measure_accuracy(choice, scenes, measures, Store(tmp_path / "whole")))
+    whole = measure_accuracy(choice, scenes, measures, Store(tmp_path / "whole"), ignore)
     cut = Store(tmp_path / "cut")
-    next(measure_accuracy(choice, scenes, measures, cut))  # killed after the first scene
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # after the first scene
+        measure_accuracy(choice, scenes, measures, cut, kill)
     (path,) = (tmp_path / "cut" / "points").iterdir()
     assert len(json.loads(path.read_text())["values"]) == 1
-    list(measure_accuracy(choice, scenes, measures, cut))
-    assert path.read_bytes() == next((tmp_path / "whole" / "points").iterdir()).read_bytes()
+    assert measure_accuracy(choice, scenes, measures, cut, ignore) == whole
 
 
 @pytest.mark.parametrize("facts", [{"bounds": ((0.0, 1.0), (0.05, 1.0))}, {"particle_volume": 2e-3}, {"dt": 0.02}])
@@ -73,7 +79,7 @@ def test_errors_are_measured_anew_where_a_fact_of_the_scene_is_another(facts, tm
     other = dataclasses.replace(scenes, scene=dataclasses.replace(scenes.scene, **facts))
     choice = trivial_choice("nothing moves", scenes.scene)
     for measured in (scenes, other):
-        list(measure_accuracy(choice, measured, measures, store))
+        measure_accuracy(choice, measured, measures, store, ignore)
     (path,) = (tmp_path / "points").iterdir()
     assert len(json.loads(path.read_text())["values"]) == 2
 
@@ -189,22 +195,30 @@ def test_times_are_per_frame_that_is_computed(scenes, choices, monkeypatch, tmp_
     ticks = itertools.count()  # each rollout takes a second
     monkeypatch.setattr("nmpm.evaluation.trade.measurement.clock_for", lambda *_: ("a clock", lambda: next(ticks)))
     sweep = dataclasses.replace(tiny_sweep(), timing=Timing(rounds=1, frames=3))
-    points = measure(timed, scenes, sweep, Store(tmp_path), lambda _: None)
+    points = measure(timed, scenes, sweep, Store(tmp_path))
     frames = [1e3 / point.milliseconds for point in points]
     assert frames == pytest.approx([4, 4, 8, 3])  # one more; a bundle of 2 more, of one and of two scenes; as asked
 
 
-def test_another_choice_is_timed_beside_the_reference_alone(scenes, choices, tmp_path):
-    store, timing = Store(tmp_path), Timing(rounds=1, frames=3)
-    list(measure_times(choices[:2], scenes, timing, store))
-    timed = []
-    more = PredictorChoice(
-        kind=Kind.OTHER, name="more", predictor=lambda *given: timed.append(1) or Shifted(None)(*given)
-    )
-    list(measure_times([*choices[:2], more], scenes, timing, store))
-    assert timed
-    ratios = [len(store.read("times", json.loads(path.read_text())["key"])) for path in tmp_path.glob("points/times-*")]
-    assert len(ratios) == 3
+def test_another_choice_is_timed_beside_the_reference_alone(scenes, choices, tmp_path, monkeypatch):
+    store, timing, prepared = Store(tmp_path), Timing(rounds=1, frames=3), []
+    reference, other = choices[0], trivial_choice("free fall", scenes.scene)
+    new = PredictorChoice(kind=Kind.OTHER, name="new", predictor=Shifted(scenes.scene))
+    first = measure_times([reference, other], scenes, timing, store, ignore)
+    for kind in (SimulatorChoice, PredictorChoice):
+        monkeypatch.setattr(kind, "prepare", recorded(kind.prepare, prepared))
+    again = measure_times([reference, other, new], scenes, timing, store, ignore)
+    assert prepared == [reference.name, "new"]
+    assert again[:2] == first
+    assert len(again[2].ratios) == 1
+
+
+def recorded(prepare, names):
+    def prepare_and_record(self, scenes, indices):
+        names.append(self.name)
+        return prepare(self, scenes, indices)
+
+    return prepare_and_record
 
 
 def drops(preset, start):

@@ -20,7 +20,7 @@ from tests.evaluation.trade.made_up import point, tiny_emulator, tiny_sweep
 
 @pytest.fixture(scope="module")
 def points(scenes, choices, tmp_path_factory):
-    return measure(choices, scenes, tiny_sweep(), Store(tmp_path_factory.mktemp("store")), lambda _: None)
+    return measure(choices, scenes, tiny_sweep(), Store(tmp_path_factory.mktemp("store")))
 
 
 def test_the_table_is_tidy(points, scenes):
