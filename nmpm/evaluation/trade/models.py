@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -28,7 +27,6 @@ class ModelSettings:
     Args:
         precision: Precisions of the network.
         constraints: "held", with the model's constraints, and "free", without them.
-        cells: Factors on the number of grid cells along each axis, relative to training.
         runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
         batch: Batch sizes, in scenes.
         threads: Numbers of torch's threads.
@@ -36,7 +34,6 @@ class ModelSettings:
 
     precision: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     constraints: tuple[Literal["held", "free"], ...] = ("held", "free")
-    cells: tuple[float, ...] = (1.0,)
     runtime: tuple[str, ...] = ("eager",)
     batch: tuple[int, ...] = (1, 8)
     threads: tuple[int, ...] = (1,)
@@ -93,16 +90,14 @@ def model_choices(
             emulator = emulator.over(scenes.scene)
         except ConfigError as error:
             raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
-    forms = product(settings.precision, settings.constraints, settings.cells, settings.runtime)
-    for precision, constraints, cells, runtime in forms:
+    for precision, constraints, runtime in product(settings.precision, settings.constraints, settings.runtime):
         form = emulator.with_network(NETWORK_PRECISIONS[precision])
         form = form if constraints == "held" else form.unconstrained()
-        form = _with_cells(form, cells).to(device).with_runtime(runtime)
+        form = form.to(device).with_runtime(runtime)
         for batch, threads in product(settings.batch, settings.threads):
             parts = {
                 precision: precision != settings.precision[0],
                 constraints: constraints != settings.constraints[0],
-                f"{cells:g} × cells": cells != 1,
                 runtime: runtime != settings.runtime[0],
                 f"batch {batch}": batch != 1,
                 counted(threads, "thread"): threads != settings.threads[0],
@@ -121,11 +116,3 @@ def model_choices(
                 threads=threads,
                 device=device,
             )
-
-
-def _with_cells(emulator: Emulator, factor: float) -> Emulator:
-    """The same weights on a grid of `factor` times as many cells along each axis."""
-    cells = tuple(max(1, round(factor * n)) for n in emulator.grid.shape)
-    if cells == emulator.grid.shape:
-        return emulator
-    return emulator.rebuilt(dataclasses.replace(emulator.recipe, cells=cells))

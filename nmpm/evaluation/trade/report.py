@@ -121,7 +121,6 @@ def describe(points: Sequence[Point], scenes: Scenes) -> dict[str, Any]:
     """All figures as plain data; lengths in domain length, times in milliseconds; None where there is none."""
     return {
         "dataset": scenes.name,
-        "scenes": len(scenes),
         "particles": [recording.frames.shape[1] for recording in scenes.recordings],
         "frames": [scenes.frames(index) for index in range(len(scenes))],
         "shown_frames": [index + 2 for index in scenes.shown_frames()],
@@ -141,7 +140,7 @@ def _describe_point(point: Point) -> dict[str, Any]:
         "errors": {
             name: {
                 "mean": _figure(point.mean(name)),
-                "interval": [_figure(value) for value in _interval(point, name)],
+                "interval": [_figure(value) for value in interval(values.tolist())],
                 "scenes": [_figure(value) for value in values.tolist()],
             }
             for name, values in point.errors.items()
@@ -155,11 +154,6 @@ def _describe_point(point: Point) -> dict[str, Any]:
 
 def _figure(value: float) -> float | None:
     return float(f"{value:.5g}") if math.isfinite(value) else None
-
-
-def _interval(point: Point, name: str) -> tuple[float, float]:
-    """Bootstrap interval of 95% of an error's mean over scenes; NaN where one of them has no error."""
-    return interval(point.errors[name].tolist()) if math.isfinite(point.mean(name)) else (math.nan, math.nan)
 
 
 def likely_points(points: Sequence[Point], measure: str = "mse") -> list[Point]:

@@ -95,7 +95,6 @@ class Sweep:
             "measures.horizons": self.measures.horizons,
             "timing.rounds": (self.timing.rounds,),
             "timing.frames": (self.timing.frames,),
-            "models.cells": self.models.cells,
             "models.batch": self.models.batch,
             "models.threads": self.models.threads,
             "simulator.coarser": self.simulator.coarser,
