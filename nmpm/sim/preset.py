@@ -159,18 +159,6 @@ class Preset(abc.ABC):
         """
         return dataclasses.replace(self, frames=frames)
 
-    def with_substeps(self, substeps: int) -> Self:
-        """The same with another number of substeps.
-
-        Raises:
-            ConfigError: if there are fewer than `stable_substeps`.
-        """
-        check(
-            substeps >= self.stable_substeps,
-            f"{substeps} substeps are unstable for preset {self.name}; take at least {self.stable_substeps}.",
-        )
-        return dataclasses.replace(self, substeps=substeps)
-
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

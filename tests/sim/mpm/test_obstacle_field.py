@@ -9,7 +9,7 @@ from nmpm.errors import DataError
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.mpm.solids import Goop, Sand
-from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, Walls
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles
 from nmpm.sim.mpm.water import Water
 
 SIZE, CELLS, DT = 0.0125, 48, 2e-4
@@ -31,10 +31,9 @@ def strip(centre, angle, length, thickness):
     return distance
 
 
-def stepper(distance, friction=0.3, gravity=(0.0, -9.81), walls=Walls.SEPARATE, dt=DT):
-    bare = MpmGrid(np.zeros(2), SIZE, (CELLS, CELLS), friction, np.array(gravity), walls)
-    field = ObstacleField.sample(distance, bare.low, SIZE, bare.shape, friction)
-    return Stepper2d(MpmGrid(bare.low, SIZE, bare.shape, friction, bare.gravity, walls, field), dt)
+def stepper(distance, friction=0.3, gravity=(0.0, -9.81)):
+    field = ObstacleField.sample(distance, np.zeros(2), SIZE, (CELLS, CELLS), friction)
+    return Stepper2d(MpmGrid(np.zeros(2), SIZE, (CELLS, CELLS), friction, np.array(gravity), obstacles=field), DT)
 
 
 def block(columns, rows, low):
@@ -46,14 +45,16 @@ def state(position, velocity, material=WATER):
 
 
 angles = st.floats(-math.pi / 2, math.pi / 2)
-places = st.tuples(st.floats(0.1, 0.5), st.floats(0.0, 0.35))
+
+
+centres = st.tuples(st.floats(0.1, 0.5), st.floats(0.0, 0.35))
 
 
 materials = st.sampled_from([WATER, SAND, GOOP])
 
 
-@settings(max_examples=15, deadline=None)
-@given(places, angles, st.floats(0.1, 0.5), st.floats(0.25, 6), st.floats(0, 6), st.floats(0, 1), materials)
+@settings(max_examples=10, deadline=None)
+@given(centres, angles, st.floats(0.1, 0.5), st.floats(0.25, 6), st.floats(0, 6), st.floats(0, 1), materials)
 def test_no_particle_is_ever_inside_an_obstacle_or_outside_of_the_box(
     centre, angle, length, cells, speed, friction, material
 ):
@@ -71,8 +72,8 @@ def test_no_particle_is_ever_inside_an_obstacle_or_outside_of_the_box(
     assert run.held_back == 0
 
 
-@pytest.mark.parametrize("cells", [0.25, 1.0, 2.0])
-@pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4])
+@pytest.mark.parametrize("cells", [0.25, 2.0])
+@pytest.mark.parametrize("angle", [0.0, 0.3])
 def test_obstacles_thinner_than_cells_let_no_jet_through(angle, cells):
     distance = strip((0.3, 0.3), angle, 2.0, cells * SIZE)
     run = stepper(distance)
@@ -118,17 +119,12 @@ def test_material_leaves_an_obstacle_freely():
     np.testing.assert_allclose(moving.velocity, np.tile([0.0, 2.0], (len(position), 1)), atol=1e-9)
 
 
-def test_enclose_pushes_particles_out_of_obstacles():
+def test_enclose_pushes_particles_out_of_obstacles_or_names_them():
     distance = strip((0.3, 0.3), 0.4, 0.2, 0.1)
-    run = stepper(distance)
     position = block(20, 20, (0.25, 0.25))
     assert distance(position).min() < 0
-    begun = state(position, np.zeros_like(position))
-    run.enclose(begun)
-    assert distance(begun.position).min() >= 0
-
-
-def test_a_particle_without_a_way_out_is_refused():
-    run = stepper(lambda points: np.full(len(points), -1.0))
+    particles = state(position, np.zeros_like(position))
+    stepper(distance).enclose(particles)
+    assert distance(particles.position).min() >= 0
     with pytest.raises(DataError, match=r"Particle 0 at .* inside an obstacle"):
-        run.enclose(state(block(1, 1, (0.3, 0.3)), np.zeros((1, 2))))
+        stepper(lambda points: np.full(len(points), -1.0)).enclose(state(block(1, 1, (0.3, 0.3)), np.zeros((1, 2))))

@@ -1,15 +1,18 @@
-"""The simulator started from frames of others' simulators, and how far it then goes from them."""
+"""Trajectories of the material point method: beside others' recordings, at rest, and on coarser grids."""
 
 import dataclasses
 
 import h5py
 import numpy as np
 import pytest
+from columns import lattice
 
-from nmpm.errors import ConfigError
-from nmpm.sim import InitialState, load_preset, preset_from_dict
+from nmpm.sim import InitialState, load_preset
 from nmpm.sim.mpm.solids import Sand
 from nmpm.sim.mpm.water import Water
+
+GOOP = load_preset("goop")
+
 
 # What DeepMind's water was made with, as far as its recordings tell.
 WATERDROP = dataclasses.replace(
@@ -21,6 +24,8 @@ WATERDROP = dataclasses.replace(
     walls="slip, open corners",
     materials=(Water(density=1000.0, bulk_modulus=7e4),),
 )
+
+
 ELEMENTS = dataclasses.replace(
     WATERDROP, box=((0.09375, 0.90625),) * 2, cells=52, substeps=9, walls="slip", wall_friction=0.3
 )
@@ -28,7 +33,7 @@ ELEMENTS = dataclasses.replace(
 
 def errors(preset, path, frames):
     """Mean squared distance over the frames after the second, for each trajectory of a file; and of nothing moving."""
-    found = []
+    pairs = []
     with h5py.File(path) as file:
         for group in file.values():
             position = group["position"][: frames + 2].astype(np.float64)
@@ -36,22 +41,20 @@ def errors(preset, path, frames):
             velocity = (position[1] - position[0]) / preset.frame_dt + half_a_kick
             made = preset.simulate_from(InitialState(position[1], velocity), frames)
             assert made.attributes["held_back"] == 0
-            found.append([np.mean((made.position[1:] - position[2:]) ** 2), np.mean((position[1] - position[2:]) ** 2)])
-    return np.array(found).T
+            pairs.append([np.mean((made.position[1:] - position[2:]) ** 2), np.mean((position[1] - position[2:]) ** 2)])
+    return np.array(pairs).T
 
 
-def test_water_follows_deepminds(recorded):
+@pytest.mark.slow
+def test_water_follows_deepminds_with_open_corners(recorded):
     ours, still = errors(WATERDROP, recorded / "deepmind-waterdrop" / "test.h5", 300)
     assert np.all(still > 30e-3)
     assert np.all(ours < 0.05e-3)
-
-
-def test_closed_corners_follow_deepminds_water_less_well(recorded):
     closed = dataclasses.replace(WATERDROP, walls="slip")
-    path = recorded / "deepmind-waterdrop" / "valid.h5"
-    assert errors(closed, path, 300)[0].mean() > 3 * errors(WATERDROP, path, 300)[0].mean()
+    assert errors(closed, recorded / "deepmind-waterdrop" / "valid.h5", 300)[0].mean() > 3 * ours.mean()
 
 
+@pytest.mark.slow
 def test_sand_follows_taichi_elements(recorded):
     """Their friction angle of 40 degrees is that of triaxial tests: in plane strain their cone is one of 39."""
     preset = dataclasses.replace(
@@ -78,7 +81,22 @@ def test_walls_that_hold_let_particles_a_cell_and_a_half_beyond_the_box():
     assert WATERDROP.simulate_from(InitialState(deepest, np.zeros((2, 2))), 5).position.min() > 0.085
 
 
-def test_walls_are_read_from_files_and_checked():
-    assert preset_from_dict(WATERDROP.to_dict()) == WATERDROP
-    with pytest.raises(ConfigError, match="walls = sticky"):
-        dataclasses.replace(WATERDROP, walls="sticky")
+def test_a_heap_at_rest_keeps_its_area():
+    position = lattice((0.1072, 0.1036), (0.8872, 0.2172), GOOP.spacing)
+    made = GOOP.simulate_from(InitialState(position, np.zeros_like(position)), frames=150).position
+    speed = np.linalg.norm(np.diff(made[-2:].astype(float), axis=0), axis=-1) / GOOP.frame_dt
+    assert np.sqrt(np.mean(speed**2)) < 0.02
+    (low, high), (sunk, risen) = (np.percentile(frame[:, 1], [2, 98]) for frame in (made[0], made[-1]))
+    assert abs((risen - high) - (sunk - low)) < 0.04 * (high - low)
+
+
+def test_coarser_grids_converge_to_the_fine_one():
+    position = lattice((0.4, 0.3), (0.784, 0.684), GOOP.spacing)
+    start = InitialState(position, np.tile([1.0, 0.0], (len(position), 1)))
+    fine = GOOP.simulate_from(start, 120).position
+    coarse = [GOOP.coarsened(factor).simulate_from(start, 120) for factor in (2, 4, 8)]
+    errors = [np.mean((made.position - fine) ** 2) for made in coarse]
+    still = np.mean((fine - fine[0]) ** 2)
+    assert errors[0] < errors[1] < errors[2] < still
+    assert errors[0] < 0.05 * still
+    assert all(made.attributes["held_back"] == 0 for made in coarse)
