@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 from nmpm.cli.options import HelpFormatter, check_at_least, check_folder, check_picture
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from nmpm.data.simulation_request import Shard
     from nmpm.sim import Preset
 
 _INTERRUPTED = 130  # as shells report SIGINT
@@ -56,67 +53,56 @@ def run(words: list[str]) -> None:
         "--shard", metavar="I/N", help="simulate the I-th of N parts, from 1 on; N processes share the folder --out"
     )
     parser.add_argument("--out", type=Path, help="folder to write (default: the scene's name)")
-    chosen = parser.parse_args(words[1:])
-    if chosen.list:
+    options = parser.parse_args(words[1:])
+    if options.list:
         _list()
         return
-    if chosen.name is None:
+    if options.name is None:
         parser.error("name a scene, or use --list")
-    if chosen.show:
-        _show(chosen.name)
+    if options.show:
+        from nmpm.sim.loading import preset_text
+
+        sys.stdout.write(preset_text(options.name))
         return
     try:
-        _simulate(chosen)
+        _simulate(options)
     except KeyboardInterrupt:
-        mend = "nothing was written" if chosen.preview else "the same command continues after the finished trajectories"
+        mend = (
+            "nothing was written" if options.preview else "the same command continues after the finished trajectories"
+        )
         sys.stderr.write(f"nmpm simulate: interrupted; {mend}.\n")
         raise SystemExit(_INTERRUPTED) from None
 
 
-def _simulate(chosen: argparse.Namespace) -> None:
+def _simulate(options: argparse.Namespace) -> None:
     for name, least in (("workers", 1), ("frames", 1), ("seed", 0), ("train", 0), ("valid", 0), ("test", 0)):
-        check_at_least(f"--{name}", getattr(chosen, name), least)
-    if chosen.preview is not None:
-        check_picture("--preview", chosen.preview)
-    elif chosen.out is not None:
-        check_folder("--out", chosen.out)
+        check_at_least(f"--{name}", getattr(options, name), least)
+    if options.preview is not None:
+        check_picture("--preview", options.preview)
+    elif options.out is not None:
+        check_folder("--out", options.out)
+    from nmpm.data import catalog
+    from nmpm.data.generate import generate, generate_shard
     from nmpm.data.simulation_request import Shard
     from nmpm.sim import load_preset
 
-    shard = None if chosen.shard is None else Shard.parse(chosen.shard)
-    preset = load_preset(chosen.name)
-    preset = preset if chosen.frames is None else preset.with_frames(chosen.frames)
-    if chosen.preview is not None:
-        _preview(preset, chosen.seed, chosen.preview)
+    shard = None if options.shard is None else Shard.parse(options.shard)
+    preset = load_preset(options.name)
+    preset = preset if options.frames is None else preset.with_frames(options.frames)
+    if options.preview is not None:
+        _preview(preset, options.seed, options.preview)
         return
-    counts = dict(_paper_counts(chosen.name))
-    counts |= {name: getattr(chosen, name) for name in counts if getattr(chosen, name) is not None}
-    out = chosen.out or Path(preset.name)
+    counts = dict(catalog.describe(options.name if options.name in catalog.catalog() else "goop").paper)
+    counts |= {name: getattr(options, name) for name in counts if getattr(options, name) is not None}
+    out = options.out or Path(preset.name)
     check_folder("--out", out)
-    if _generate(preset, out, counts, shard, chosen):
-        sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
-        sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
-
-
-def _generate(
-    preset: Preset, out: Path, counts: Mapping[str, int], shard: Shard | None, chosen: argparse.Namespace
-) -> bool:
-    """Simulate all, or a shard; returns whether the dataset is complete."""
-    from nmpm.data.generate import generate, generate_shard
-
     if shard is None:
-        generate(preset, out, counts, chosen.seed, chosen.workers)
-        return True
-    missing = generate_shard(preset, out, counts, shard, chosen.seed, chosen.workers)
-    if missing:
+        generate(preset, out, counts, options.seed, options.workers)
+    elif missing := generate_shard(preset, out, counts, shard, options.seed, options.workers):
         sys.stdout.write(f"shard {shard} is in {out}; trajectories of other shards that are not there yet: {missing}\n")
-    return missing == 0
-
-
-def _paper_counts(name: str) -> Mapping[str, int]:
-    from nmpm.data import catalog
-
-    return catalog.describe(name if name in catalog.catalog() else "goop").paper
+        return
+    sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
+    sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
 
 
 def _list() -> None:
@@ -126,25 +112,14 @@ def _list() -> None:
     sys.stdout.write(f"{'scene':<17}{'method':<9}{'axes':<6}{'particles':<11}{'frames':<8}{'splits':<15}materials\n")
     for name in catalog.catalog():
         preset, paper = load_preset(name), catalog.describe(name).paper
-        materials = ", ".join(preset.scene.materials)
-        splits = "/".join(map(str, paper.values()))
+        scene, splits = preset.scene, "/".join(map(str, paper.values()))
+        facts = {"obstacles": scene.obstacles, "gravity varies": scene.gravity_varies}
+        varying = ", ".join(name for name, holds in facts.items() if holds)
+        materials = ", ".join(scene.materials) + (f"; {varying}" if varying else "")
         sys.stdout.write(
-            f"{name:<17}{preset.generator:<9}{preset.scene.dim:<6}{f'≤ {preset.max_particles}':<11}"
-            f"{preset.frames:<8}{splits:<15}{materials}{_varying(preset)}\n"
+            f"{name:<17}{preset.generator:<9}{scene.dim:<6}{f'≤ {preset.max_particles}':<11}"
+            f"{preset.frames:<8}{splits:<15}{materials}\n"
         )
-
-
-def _varying(preset: Preset) -> str:
-    scene = preset.scene
-    facts = {"obstacles": scene.obstacles, "gravity varies": scene.gravity_varies}
-    present = [name for name, holds in facts.items() if holds]
-    return f"; {', '.join(present)}" if present else ""
-
-
-def _show(name: str) -> None:
-    from nmpm.sim.loading import preset_text
-
-    sys.stdout.write(preset_text(name))
 
 
 def _preview(preset: Preset, seed: int, path: Path) -> None:

@@ -24,51 +24,40 @@ from nmpm.sim import load_preset, preset_names
 
 @dataclass(frozen=True)
 class CatalogEntry:
-    """An embedded dataset.
+    """An embedded dataset, of the shipped preset of the same name.
 
     Args:
-        name: Its name.
-        preset: Name of the simulator's preset.
         counts: Trajectories in each of the splits train, valid and test.
-        seed: The seeds of all trajectories are derived from it.
         paper: Trajectories per split in the paper's dataset of the same name, for `nmpm simulate`.
     """
 
-    name: str
-    preset: str
     counts: Mapping[str, int]
     paper: Mapping[str, int]
-    seed: int = 0
 
 
 def _splits(train: int, valid: int, test: int) -> Mapping[str, int]:
     return MappingProxyType({"train": train, "valid": valid, "test": test})
 
 
-_USUAL = (_splits(200, 10, 30), _splits(1000, 100, 100))
-"""A number that is simulated within minutes; the number in the paper (arXiv 2408.15753)."""
+_USUAL = CatalogEntry(counts=_splits(200, 10, 30), paper=_splits(1000, 100, 100))
+"""What is simulated within minutes; what the paper has (arXiv 2408.15753)."""
 
-_COUNTS = {
-    "goop": (_USUAL[0], _splits(1000, 30, 30)),
-    "dambreak2d": (_splits(50, 25, 25),) * 2,
-    "wbcsph": (_splits(30, 9, 9),) * 2,
+_OTHERS = {
+    "goop": CatalogEntry(_USUAL.counts, _splits(1000, 30, 30)),
+    "dambreak2d": CatalogEntry(_splits(50, 25, 25), _splits(50, 25, 25)),
+    "wbcsph": CatalogEntry(_splits(30, 9, 9), _splits(30, 9, 9)),
 }
 
 
 @cache
-def _entries() -> Mapping[str, CatalogEntry]:
-    """One dataset for each shipped preset."""
-    return MappingProxyType({name: CatalogEntry(name, name, *_COUNTS.get(name, _USUAL)) for name in preset_names()})
+def catalog() -> tuple[str, ...]:
+    """Names of the embedded datasets."""
+    return preset_names()
 
 
 def dataset_home() -> Path:
     """The cache folder of datasets."""
     return user_home()
-
-
-def catalog() -> tuple[str, ...]:
-    """Names of the embedded datasets."""
-    return tuple(_entries())
 
 
 def describe(name: str) -> CatalogEntry:
@@ -77,12 +66,12 @@ def describe(name: str) -> CatalogEntry:
     Raises:
         DataError: if there is no dataset of that name.
     """
-    if name not in _entries():
+    if name not in catalog():
         raise DataError(
-            f"No embedded dataset is called {name!r}; known: {', '.join(_entries())}. For your own data, give"
+            f"No embedded dataset is called {name!r}; known: {', '.join(catalog())}. For your own data, give"
             " the path of their folder."
         )
-    return _entries()[name]
+    return _OTHERS.get(name, _USUAL)
 
 
 def scene(name: str) -> Scene:
@@ -91,7 +80,8 @@ def scene(name: str) -> Scene:
     Raises:
         DataError: if there is no dataset of that name.
     """
-    return load_preset(describe(name).preset).scene
+    describe(name)
+    return load_preset(name).scene
 
 
 def simulation_request(
@@ -103,10 +93,9 @@ def simulation_request(
         DataError: if there is no dataset of that name.
         ConfigError: if counts or frames are invalid.
     """
-    entry = describe(name)
-    preset = load_preset(entry.preset)
+    entry, preset = describe(name), load_preset(name)
     preset = preset if frames is None else preset.with_frames(frames)
-    return SimulationRequest(preset, entry.counts if counts is None else counts, entry.seed if seed is None else seed)
+    return SimulationRequest(preset, entry.counts if counts is None else counts, seed or 0)
 
 
 def dataset_folder(name: str, request: SimulationRequest) -> Path:
@@ -118,13 +107,11 @@ def dataset_folder(name: str, request: SimulationRequest) -> Path:
 def find_simulated(name: str, test: int) -> Path | None:
     """A complete folder of an embedded dataset with at least `test` test trajectories, for whatever it was simulated.
 
-    Trajectories do not depend on how many there are, so that those of a training's data serve as well.
-
     Raises:
         DataError: if there is no dataset of that name.
     """
-    found = _complete_folders(name, simulation_request(name))
-    return next((folder for folder, counts in found if counts.get("test", 0) >= test), None)
+    folders = _complete_folders(name, simulation_request(name))
+    return next((folder for folder, counts in folders if counts.get("test", 0) >= test), None)
 
 
 def _complete_folders(name: str, request: SimulationRequest) -> Iterator[tuple[Path, Mapping[str, int]]]:
@@ -133,15 +120,9 @@ def _complete_folders(name: str, request: SimulationRequest) -> Iterator[tuple[P
     for folder in sorted((dataset_home() / "datasets").glob(f"{name}-*")):
         if not (folder / METADATA_FILE).is_file():
             continue
-        found = read_metadata(folder).extra.get("simulation", {})
-        if same_trajectories(found, wanted):
-            yield folder, found.get("counts", {})
-
-
-def _largest_folder(name: str, request: SimulationRequest) -> Path | None:
-    """The complete folder with the most trajectories of the request's kind."""
-    counts = dict(_complete_folders(name, request))
-    return max(counts, key=lambda folder: sum(counts[folder].values()), default=None)
+        stored = read_metadata(folder).extra.get("simulation", {})
+        if same_trajectories(stored, wanted):
+            yield folder, stored.get("counts", {})
 
 
 def ensure(
@@ -153,13 +134,13 @@ def ensure(
 ) -> Path:
     """The folder of an embedded dataset, which is simulated now if it is missing.
 
-    Trajectories that another folder of it has, of fewer or more in all, are copied.
+    Trajectories do not depend on how many there are: those that another folder of it has are copied.
 
     Args:
         name: One of `catalog()`.
         counts: Trajectories in each of the splits train, valid and test; the dataset's own when left out.
         frames: Simulated frames of a trajectory; the preset's own when left out.
-        seed: The seeds of all trajectories are derived from it; the dataset's own when left out.
+        seed: The seeds of all trajectories are derived from it; 0 when left out.
         workers: Trajectories simulated at a time; one per processor core when left out.
 
     Raises:
@@ -167,7 +148,9 @@ def ensure(
         ConfigError: if counts or frames are invalid.
     """
     request = simulation_request(name, counts, frames, seed)
-    folder = dataset_folder(name, request)
-    known = None if (folder / METADATA_FILE).is_file() else _largest_folder(name, request)
-    generate(request.preset, folder, request.counts, request.seed, workers, known)
+    folder, largest = dataset_folder(name, request), None
+    if not (folder / METADATA_FILE).is_file():
+        others = dict(_complete_folders(name, request))
+        largest = max(others, key=lambda other: sum(others[other].values()), default=None)
+    generate(request.preset, folder, request.counts, request.seed, workers, largest)
     return folder

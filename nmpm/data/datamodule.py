@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -15,15 +14,12 @@ from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import pin_for
-from nmpm.data.loading.sources import DataSource, FolderSource, HubSource, StatedFacts
+from nmpm.data.loading.sources import SourceName, StatedFacts, make_source
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
 
-SourceName = Literal["disk", "simulate", "hub"]
-
-_OPEN = "???"  # what OmegaConf calls a value that is still to be given
 _GPU_SHARE = 0.25  # of the free GPU memory that the buffer may use; the rest is for the model
 
 
@@ -103,13 +99,11 @@ class TrajectoryDataModule(LightningDataModule):
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        path = None if path == _OPEN and name is not None else path
-        stated = {"family": family, "gravity": gravity, "boundary": boundary, "bounds": bounds, "fields": fields}
-        _check_source(path, name, source, stated, generate)
+        stated = StatedFacts(family, gravity, boundary, bounds, fields)
+        self.data_source = make_source(path, name, source, stated, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
-        self.data_source = _make_source(path, name, source, StatedFacts(**stated), dict(generate or {}))  # type: ignore[arg-type]  # (a dict of mixed types)
         self.horizon, self.batch_size, self.seed = horizon, batch_size, seed
         self.buffer_size, self.passes = buffer_size, passes
         self.emphasis, self.openings, self.bucket_batches = emphasis, openings, bucket_batches
@@ -181,7 +175,7 @@ class TrajectoryDataModule(LightningDataModule):
         """Restores start and size of the batches from a checkpoint, and for a training what it validates on."""
         self._history = _BatchHistory(PlanStart(**state["start"]), state["batch_size"], state["world"])
         if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING:
-            self.validated = state.get("validated")
+            self.validated = state["validated"]
 
     def train_dataloader(self) -> TrainingLoader:
         """Endless batches of training windows; after a resumed checkpoint, those that come next."""
@@ -290,46 +284,4 @@ class TrainingLoader:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores nothing."""
-
-
-def _make_source(
-    path: str | None, name: str | None, source: str, stated: StatedFacts, generate: dict[str, Any]
-) -> DataSource:
-    if path is not None:
-        return FolderSource(Path(path), stated)
-    if source == "hub":
-        return HubSource(Path(str(name)), stated)
-    from nmpm.data.loading.simulated import EmbeddedSource, SimulatedSource
-
-    sources: dict[str, Callable[[str], DataSource]] = {
-        "disk": lambda known: EmbeddedSource(known, generate),
-        "simulate": lambda known: SimulatedSource(known, generate),
-    }
-    return sources[source](str(name))
-
-
-def _check_source(
-    path: str | None, name: str | None, source: str, stated: Mapping[str, Any], generate: Mapping[str, Any] | None
-) -> None:
-    if path == _OPEN:
-        raise ConfigError("data.path is not set, the configuration leaves it open (???): give --data.path FOLDER.")
-    if path is None and name is None:
-        raise ConfigError(
-            "Neither data.path nor data.name is set: give --data.path FOLDER, or --data.name and an embedded dataset"
-            " (nmpm simulate --list)."
-        )
-    if source not in get_args(SourceName):
-        raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")
-    if path is not None and source != "disk":
-        raise ConfigError(
-            f"source = {source} needs the `name` of a dataset, not the path {path}; for the path, --data.source disk."
-        )
-    if path is not None:
-        return
-    given = {"generate": generate} if source == "hub" else stated
-    wrong = [key for key, value in given.items() if value is not None]
-    if wrong:
-        kind = f"the published dataset {name}" if source == "hub" else f"the simulated dataset {name}"
-        mend = " ".join(f"--data.{key} null" for key in wrong)
-        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {kind}; leave it out: {mend}.")
+        """Nothing to restore."""

@@ -11,10 +11,12 @@ import os
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import TypeVar
 
 import numpy as np
@@ -105,11 +107,15 @@ def simulate_all(
 def _simulate_in_processes(
     preset: Preset, entropies: Sequence[tuple[int, ...]], processes: int, check: Callable[[], object]
 ) -> Generator[tuple[int, SimulatedTrajectory], None, None]:
-    with _blocked_interrupts():
-        executor = ProcessPoolExecutor(processes, initializer=_end_with, initargs=(os.getpid(),), env=_ENVIRONMENT)
-        waiting = {executor.submit(_simulate, preset, entropy): index for index, entropy in enumerate(entropies)}
+    resource_tracker.ensure_running()  # its start would end `_blocked_interrupts`
+    executor = ProcessPoolExecutor(processes, initializer=_end_with, initargs=(os.getpid(),), env=_ENVIRONMENT)
+    left, waiting = deque(enumerate(entropies)), dict[Future[tuple[SimulatedTrajectory, list[str]]], int]()
     try:
-        while waiting:
+        while left or waiting:
+            with _blocked_interrupts():
+                while left and len(waiting) <= processes:  # one more, so that no process waits
+                    index, entropy = left.popleft()
+                    waiting[executor.submit(_simulate, preset, entropy)] = index
             check()
             if process_executor._global_shutdown:  # the program ends, and would wait for all that is submitted
                 raise SystemExit

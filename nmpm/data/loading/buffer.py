@@ -146,26 +146,26 @@ class TrajectoryBuffer:
 
     def _deal(self, bucket: range, contents: _BufferContents, rank: int, world: int) -> list[list[Drawn]]:
         """The windows of each of a bucket's batches, of all ranks that share the buffer."""
-        together = len(self.plan.drawing_ranks(rank, world)) == world
-        own = (0, 1) if together else (rank, world)
+        # Random numbers are drawn for all ranks: for those that share the buffer, as for one large batch.
+        numbers = (0, 1) if self.plan.shared else (rank, world)
         drawn: list[Drawn] = []
         for index in bucket:
             windows = self.plan.draw(index, rank, world)
             if contents.motion is not None:
-                windows = self.plan.emphasise(windows, contents.motion.window_at, index, *own)
+                windows = self.plan.emphasise(windows, contents.motion.window_at, index, *numbers)
             if self.plan.openings:
-                windows = self.plan.move_to_openings(windows, index, *own)
+                windows = self.plan.move_to_openings(windows, index, *numbers)
             drawn += windows
         return self.plan.deal(bucket, drawn, [contents.size(trajectory) for trajectory, _ in drawn])
 
     def _load(self, members: Sequence[int], previous: _BufferContents | None) -> _BufferContents:
         """Loads a buffer's trajectories, reusing those of the previous buffer."""
-        known = previous.recordings if previous is not None else {}
-        if previous is not None and list(members) == list(known):
+        former = previous.recordings if previous is not None else {}
+        if previous is not None and list(members) == list(former):
             return previous
-        missing = [index for index in members if index not in known]
-        found = dict(zip(missing, self.provider.load(missing), strict=True))
-        loaded = [known[index] if index in known else found[index] for index in members]
+        missing = [index for index in members if index not in former]
+        new = dict(zip(missing, self.provider.load(missing), strict=True))
+        loaded = [former[index] if index in former else new[index] for index in members]
         padded = PaddedRecordings.stack(loaded, self.provider.scene)
         # Views of the padded tensor, so that the memory of the loaded recordings is freed.
         recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}

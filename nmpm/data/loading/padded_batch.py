@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,16 +66,8 @@ class PaddedRecordings:
 
     def to(self, device: torch.device) -> PaddedRecordings:
         """Copies the tensors to a device; tensors that are there already are shared."""
-        return PaddedRecordings(
-            frames=self.frames.to(device),
-            material=self.material.to(device),
-            mask=self.mask.to(device),
-            obstacle=self.obstacle.to(device),
-            obstacle_mask=self.obstacle_mask.to(device),
-            gravity=self.gravity.to(device),
-            scene=self.scene,
-            fields={name: values.to(device) for name, values in self.fields.items()},
-        )
+        tensors: dict[str, Any] = {k: value.to(device) for k, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **tensors, fields={name: values.to(device) for name, values in self.fields.items()})
 
     def gather(self, rows: Sequence[int], starts: Sequence[int], length: int, particles: int | None = None) -> Window:
         """Gathers consecutive frames of B recordings.
@@ -137,24 +130,23 @@ def unwrap(frames: Tensor, scene: Scene) -> None:
 
 def displacements(frames: Tensor, scene: Scene) -> Tensor:
     """Displacements (T - 1, N, D) between frames (T, N, D), by minimum image on periodic axes."""
-    found = frames.diff(dim=0)
+    steps = frames.diff(dim=0)
     for axis, (low, high) in enumerate(scene.domain):
         if scene.periodic[axis]:
-            period, along = high - low, found[..., axis]
+            period, along = high - low, steps[..., axis]
             along -= torch.round(along / period) * period
-    return found
+    return steps
 
 
 def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
     """By name (S, T, N), (S, 1, N) or (S, 1, 1); zero in padding."""
     stacked = {}
     for name in dict.fromkeys(name for recording in recordings for name in recording.fields):
-        own = [
-            (recording.fields[name], len(recording.material)) for recording in recordings if name in recording.fields
-        ]
-        parts = [part for part, _ in own]
+        having = [recording for recording in recordings if name in recording.fields]
+        parts = [recording.fields[name] for recording in having]
         constant = {part.shape[0] == 1 for part in parts}
-        single = {part.shape[1] == 1 for part, count in own if count > 1}  # (of one particle, both kinds look the same)
+        # Of one particle, both kinds look the same.
+        single = {part.shape[1] == 1 for part, one in zip(parts, having, strict=True) if len(one.material) > 1}
         if len(parts) < len(recordings) or len(constant) > 1 or len(single) > 1:
             raise DataError(
                 f"The field {name} has another shape in some trajectories than in others, or is missing in some: store"

@@ -105,15 +105,14 @@ class RecordingReader:
         if missing:
             raise DataError(f"{where}: it has no field {', '.join(missing)}, which the metadata or data.fields name.")
         for name, values in fields.items():
-            own = values if values.shape[1] == 1 else values[:, moving]
-            if not np.isfinite(own).all():
-                frame, place = map(int, np.argwhere(~np.isfinite(own))[0])
-                particle = place if values.shape[1] == 1 else int(np.flatnonzero(moving)[place])
+            wrong = ~np.isfinite(values) & (moving if values.shape[1] > 1 else True)
+            if wrong.any():
+                frame, particle = map(int, np.argwhere(wrong)[0])
                 raise DataError(
-                    f"{where}: {name} of particle {particle} in frame {frame} is {own[frame, place]}; fields of moving"
-                    " particles must be finite. Remove the trajectory, or leave the field out of data.fields."
+                    f"{where}: {name} of particle {particle} in frame {frame} is {values[frame, particle]}; fields of"
+                    " moving particles must be finite. Remove the trajectory, or leave the field out of data.fields."
                 )
-            yield name, torch.from_numpy(np.ascontiguousarray(own))
+            yield name, torch.from_numpy(np.ascontiguousarray(values if values.shape[1] == 1 else values[:, moving]))
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)

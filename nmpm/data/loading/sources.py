@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from nmpm.data.convert import Options
 from nmpm.data.convert.cache import native_folder
@@ -17,7 +17,12 @@ from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
+from nmpm.errors import ConfigError
 from nmpm.scene import Boundary, Interval, Scene
+
+SourceName = Literal["disk", "simulate", "hub"]
+
+_OPEN = "???"  # OmegaConf's for a value that is still to be given
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class StatedFacts:
 
 
 class DataSource(abc.ABC):
-    """Abstract source of trajectories, one subclass per kind. Files are read and datasets simulated on first use."""
+    """A source of trajectories. Files are read and datasets simulated on first use."""
 
     @property
     @abc.abstractmethod
@@ -132,5 +137,45 @@ class HubSource(FolderSource):
 
     @cached_property
     def folder(self) -> Path:
-
         return native_folder(hub_folder(str(self.path)), self.stated.options)
+
+
+def make_source(
+    path: str | None, name: str | None, source: SourceName, stated: StatedFacts, generate: Mapping[str, Any] | None
+) -> DataSource:
+    """The source that the arguments of `TrajectoryDataModule` mean.
+
+    Raises:
+        ConfigError: if neither `path` nor `name` is given, or arguments contradict each other.
+    """
+    if path == _OPEN and name is None:
+        raise ConfigError("data.path is not set, the configuration leaves it open (???): give --data.path FOLDER.")
+    if path is None and name is None:
+        raise ConfigError(
+            "Neither data.path nor data.name is set: give --data.path FOLDER, or --data.name and an embedded dataset"
+            " (nmpm simulate --list)."
+        )
+    if source not in get_args(SourceName):
+        raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")
+    if path is not None and path != _OPEN:
+        if source != "disk":
+            raise ConfigError(
+                f"source = {source} needs the `name` of a dataset, not the path {path}; for the path, --data.source"
+                " disk."
+            )
+        return FolderSource(Path(path), stated)
+    if source == "hub":
+        _refuse({"generate": generate}, f"the published dataset {name}")
+        return HubSource(Path(str(name)), stated)
+    _refuse({key.name: getattr(stated, key.name) for key in fields(stated)}, f"the simulated dataset {name}")
+    from nmpm.data.loading.simulated import EmbeddedSource, SimulatedSource
+
+    kind = SimulatedSource if source == "simulate" else EmbeddedSource
+    return kind(str(name), dict(generate or {}))
+
+
+def _refuse(arguments: Mapping[str, Any], data: str) -> None:
+    wrong = [key for key, value in arguments.items() if value is not None]
+    if wrong:
+        mend = " ".join(f"--data.{key} null" for key in wrong)
+        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {data}; leave it out: {mend}.")

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self, TypeVar
+from typing import ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -69,6 +69,9 @@ class WindowPlan:
         ConfigError: if a number is out of its range.
     """
 
+    shared: ClassVar[bool] = True
+    """Whether all ranks have the same buffer."""
+
     frames: tuple[int, ...]
     length: int
     batch_size: int
@@ -101,13 +104,12 @@ class WindowPlan:
         return max(1, round(drawn / (self.batch_size * world)))
 
     def members(self, buffer: int, rank: int = 0, world: int = 1) -> tuple[int, ...]:  # noqa: ARG002
-        """Indices of the trajectories in a rank's buffer, unique and ascending; the same for all ranks."""
+        """Indices of the trajectories in a rank's buffer, unique and ascending."""
         total = len(self.frames)
         if total <= self.buffer_size:
             return tuple(range(total))
-        places = range(buffer * self.buffer_size, (buffer + 1) * self.buffer_size)
-        chosen = {int(_shuffle(total, self.seed, _TRAJECTORIES, p // total)[p % total]) for p in places}
-        return tuple(sorted(chosen))
+        positions = range(buffer * self.buffer_size, (buffer + 1) * self.buffer_size)
+        return tuple(sorted({int(_shuffle(total, self.seed, _TRAJECTORIES, p // total)[p % total]) for p in positions}))
 
     def locate(self, index: int, world: int) -> tuple[int, int]:
         """Index of the buffer that a batch is drawn from, and the number of its windows drawn before."""
@@ -120,25 +122,22 @@ class WindowPlan:
         return self.start.buffer + 1 + buffers, turn * stride
 
     def batch(self, index: int, rank: int, world: int) -> list[Drawn]:
-        """The windows of a batch before buckets are dealt, each as (trajectory index, first frame)."""
-        return self._draw(index, rank, world, self._offset(rank), self.batch_size)
+        """The windows of a rank's batch before buckets are dealt, each as (trajectory index, first frame)."""
+        first = (rank - self.drawing_ranks(rank, world).start) * self.batch_size
+        return self.draw(index, rank, world)[first : first + self.batch_size]
 
     def draw(self, index: int, rank: int, world: int) -> list[Drawn]:
         """As `batch`, of all ranks that share a rank's buffer, one after the other."""
-        ranks = self.drawing_ranks(rank, world)
-        return self._draw(index, rank, world, self._offset(ranks.start), self.batch_size * len(ranks))
-
-    def _draw(self, index: int, rank: int, world: int, offset: int, number: int) -> list[Drawn]:
         buffer, drawn = self.locate(index, world)
         members = self.members(buffer, rank, world)
         ends = np.cumsum([self.windows(trajectory) for trajectory in members])
         total = int(ends[-1])
-        places = range(drawn + offset, drawn + offset + number)
-        chosen = [int(_shuffle(total, self.seed, _WINDOWS, buffer, p // total)[p % total]) for p in places]
-        owners = np.searchsorted(ends, chosen, side="right").tolist()
+        positions = range(drawn, drawn + self._stride(world))
+        numbers = [int(_shuffle(total, self.seed, _WINDOWS, buffer, p // total)[p % total]) for p in positions]
+        owners = np.searchsorted(ends, numbers, side="right").tolist()
         return [
-            (members[owner], window - int(ends[owner]) + self.windows(members[owner]))
-            for owner, window in zip(owners, chosen, strict=True)
+            (members[owner], number - int(ends[owner]) + self.windows(members[owner]))
+            for owner, number in zip(owners, numbers, strict=True)
         ]
 
     def emphasise(
@@ -188,13 +187,13 @@ class WindowPlan:
         share = len(windows) // len(bucket)
         if len(bucket) == 1:
             return [list(windows)]
-        order = np.argsort(sizes, kind="stable").tolist()
-        batches = [[windows[place] for place in order[n : n + share]] for n in range(0, len(windows), share)]
+        by_size = [windows[number] for number in np.argsort(sizes, kind="stable").tolist()]
+        batches = [by_size[first : first + share] for first in range(0, len(windows), share)]
         return [batches[turn] for turn in _shuffle(len(bucket), self.seed, _BUCKETS, bucket.start)]
 
-    def drawing_ranks(self, rank: int, world: int) -> range:  # noqa: ARG002
+    def drawing_ranks(self, rank: int, world: int) -> range:
         """The ranks that share the buffer of a rank, so that their windows are dealt together."""
-        return range(world)
+        return range(world) if self.shared else range(rank, rank + 1)
 
     def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
         """The plan that continues after batches of another size, at the first window that none of them used.
@@ -207,32 +206,27 @@ class WindowPlan:
             earlier: Number of ranks that used them.
             world: Number of ranks from now on.
         """
-        if batch_size * earlier == self.batch_size * world:
-            return self
-        if batches == self.start.batch:
+        if batch_size * earlier == self.batch_size * world or batches == self.start.batch:
             return self
         before = replace(self, batch_size=batch_size)
-        buffer, drawn = before.locate(
-            before.bucket_of(batches - 1, earlier)[-1], earlier
-        )  # the rest of a buffer may be too small for the old batches, but not for the new
+        # The rest of a buffer may be too small for the old batches, but not for the new.
+        buffer, drawn = before.locate(before.bucket_of(batches - 1, earlier)[-1], earlier)
         return replace(self, start=PlanStart(batches, buffer, drawn + before._stride(earlier)))
 
     def _stride(self, world: int) -> int:
-        """Windows of a buffer that one batch of all ranks uses."""
-        return self.batch_size * world
-
-    def _offset(self, rank: int) -> int:
-        """First window of a rank's batch, within the stride."""
-        return rank * self.batch_size
+        """Windows of a buffer that one batch of all ranks that share it uses."""
+        return self.batch_size * (world if self.shared else 1)
 
 
 @dataclass(frozen=True)
 class EndlessWindowPlan(WindowPlan):
-    """A plan for endless trajectories, such as a simulator gives: each buffer of each rank has trajectories of its own.
+    """A plan for endless trajectories, such as a simulator gives: each buffer of each rank has other trajectories.
 
     Args:
         frames: Frames of each trajectory of a buffer, all equal.
     """
+
+    shared: ClassVar[bool] = False
 
     def windows(self, trajectory: int) -> int:  # noqa: ARG002
         return self.frames[0] - self.length + 1
@@ -252,25 +246,9 @@ class EndlessWindowPlan(WindowPlan):
         started = (buffer + (drawn > 0)) * earlier
         return replace(self, start=PlanStart(batches, -(-started // world)))
 
-    def drawing_ranks(self, rank: int, world: int) -> range:  # noqa: ARG002
-        return range(rank, rank + 1)
-
-    def _stride(self, world: int) -> int:  # noqa: ARG002
-        return self.batch_size
-
-    def _offset(self, rank: int) -> int:  # noqa: ARG002
-        return 0
-
 
 def _draw_for_rank(draw: Callable[[int], np.ndarray], count: int, rank: int, world: int) -> np.ndarray:
-    """A rank's slice of random numbers that are drawn for all ranks, as a single process with one large batch would.
-
-    Args:
-        draw: Draws so many numbers.
-        count: Numbers of a rank.
-        rank: The rank.
-        world: Number of ranks.
-    """
+    """A rank's `count` of the random numbers that a single process with one large batch would draw."""
     return draw(count * world)[rank * count : (rank + 1) * count]
 
 

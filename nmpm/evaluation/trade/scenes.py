@@ -111,9 +111,8 @@ def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
         raise ConfigError(
             f"{dataset} cannot be widened: it is not an embedded dataset. There are {', '.join(catalog())}."
         )
-    entry = describe(dataset)
-    preset = load_preset(entry.preset).widened(times)
-    request = SimulationRequest(preset, {"train": 0, "valid": 0, "test": count}, entry.seed)
+    preset = load_preset(dataset).widened(times)
+    request = SimulationRequest(preset, {"train": 0, "valid": 0, "test": count})
     name = f"{dataset}-{times}-times-as-wide"
     folder = dataset_folder(name, request)
     generate(preset, folder, request.counts, request.seed)
