@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from nmpm._support.messages import suggestion
-from nmpm.data.catalog import catalog, dataset_folder, describe, ensure, find_simulated
+from nmpm.data.catalog import catalog, dataset_folder, ensure, find_simulated
 from nmpm.data.format import Split, find_split, read_metadata
 from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
