@@ -14,7 +14,7 @@ from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
 from nmpm.emulator.contact import SURFACE, obstacle_share
 from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
 from nmpm.emulator.fused.parameters import KernelParameters
-from nmpm.emulator.gpu import contact, crowding, flight, grid
+from nmpm.emulator.gpu import constraints, grid, motion
 from nmpm.emulator.prediction import TensorSteps
 from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
 from nmpm.particles import Particles
@@ -54,7 +54,7 @@ class TritonSteps(TensorSteps):
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
         own, (tiles, batch), frames = self.parameters, _programs(start.cells), start.output.shape[1]
         path = start.cells.new_empty(batch, frames + 1, start.cells.shape[1], 2)
-        sums = path.new_empty(batch, frames, tiles, flight.SUMS.value)
+        sums = path.new_empty(batch, frames, tiles, motion.SUMS.value)
         share, weight = self._share(context), self._weight(start)
         self._advance(start, weight, context.budget, path, sums)
         if own.obstacles and own.solids:
@@ -69,13 +69,13 @@ class TritonSteps(TensorSteps):
         path = torch.cat([start.cells.unsqueeze(1), path], dim=1)
         flow = self._flow(path, weight, context.solid)
         spreads, energies = torch.empty_like(path), path.new_empty(batch, frames + 1, tiles, 2)
-        crowding.spread[tiles, batch](
+        constraints.spread[tiles, batch](
             path, weight, start.gravity, self._share(context), flow, spreads, energies, frames, count, tiles,
             *self._limits, float(own.ratio[1]), **self._axes, CONTACT=own.obstacles and own.solids, SURFACE=SURFACE,
             SHIFT=MAX_SHIFT, BLOCK=_BLOCK,
         )  # fmt: skip
         if context.budget is not None:
-            crowding.land[tiles, batch](
+            constraints.land[tiles, batch](
                 path, spreads, energies, context.budget, frames, count, tiles, BLOCK=_BLOCK, TILES=_power(tiles)
             )
         return spreads[:, 1:]
@@ -106,7 +106,7 @@ class TritonSteps(TensorSteps):
         kept, of_grid, fall, keeps = map(float, own.decoder)
         state, carried = start.state.movedim(1, -1).contiguous(), torch.empty_like(start.cells)
         for frame in range(frames + 1):
-            flight.advance[tiles, batch](
+            motion.advance[tiles, batch](
                 start.cells, start.velocity, start.material, weight, start.gravity, state, fields,
                 sums if budget is None else budget, carried, path, sums, frame, frames, path.shape[2], tiles,
                 own.channels, *self._limits, float(own.ratio[1]), *fields.stride(), **self._axes,
@@ -119,8 +119,8 @@ class TritonSteps(TensorSteps):
         free = torch.empty_like(weight, dtype=torch.int32)
         way, lengths = path.new_empty(batch, 2, count, 2), path.new_empty(batch, tiles)
         known: dict[str, Any] = {"SURFACE": SURFACE, "BLOCK": _BLOCK, "STEPS": _power(tiles * frames)} | self._axes
-        contact.touch[tiles, batch](path, weight, share, sums, free, way, lengths, frames, count, tiles, **known)
-        contact.hold[tiles, batch](
+        constraints.touch[tiles, batch](path, weight, share, sums, free, way, lengths, frames, count, tiles, **known)
+        constraints.hold[tiles, batch](
             path, share, sums, free, way, lengths, frames, count, tiles, *self._limits, **known, TILES=_power(tiles)
         )
 
@@ -133,7 +133,7 @@ class TritonSteps(TensorSteps):
             start.filled.contiguous(), share, start.gravity, held, **known, LEFT=left, RIGHT=right, DOWN=down, UP=up,
             REACH=REACH, ENOUGH=ENOUGH, ROWS=_power(longest), COLUMNS=_COLUMNS,
         )  # fmt: skip
-        flight.rest[_programs(start.cells)](
+        motion.rest[_programs(start.cells)](
             path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, own.rest_speed, **known,
             FREE_FALL=FREE_FALL_SHARE, DROP=MAX_DROP, BLOCK=_BLOCK,
         )  # fmt: skip
@@ -143,17 +143,19 @@ class TritonSteps(TensorSteps):
         own, (batch, frames, count, _) = self.parameters, path.shape
         taken, per_scene = (solid, own.size) if own.solid else (self.emulator.walls, 0)
         counts = path.new_zeros(batch, *own.shape)
-        crowding.count_ends[_programs(path[:, 0])](path, weight, counts, count, frames - 1, **self._axes, BLOCK=_BLOCK)
+        constraints.count_ends[_programs(path[:, 0])](
+            path, weight, counts, count, frames - 1, **self._axes, BLOCK=_BLOCK
+        )
         before, after, over_nodes = torch.empty_like(counts), torch.empty_like(counts), (_blocks(own.size), batch)
         factor = 1 / float(own.ratio[1]) ** 2
         for sweep in range(SWEEPS):
             before, after = after, before
-            crowding.relax[over_nodes](
+            constraints.relax[over_nodes](
                 counts, taken, per_scene, before, after, own.particle_volume / own.density_cap, factor, **self._axes,
                 CLOSED=CLOSED, FIRST=sweep == 0, BLOCK=_BLOCK,
             )  # fmt: skip
         flow = path.new_empty(batch, *own.shape, 2)
-        crowding.find_flow[over_nodes](taken, per_scene, after, flow, factor, **self._axes, BLOCK=_BLOCK)
+        constraints.find_flow[over_nodes](taken, per_scene, after, flow, factor, **self._axes, BLOCK=_BLOCK)
         return flow
 
 

@@ -84,7 +84,7 @@ def advance(
     FALL: tl.constexpr, KEEPS: tl.constexpr, LIMITED: tl.constexpr, FIRST: tl.constexpr, LAST: tl.constexpr,
     BLOCK: tl.constexpr, TILES: tl.constexpr,
 ):  # fmt: skip
-    """Hold `frame` of the path to the scene's energy, and propose the next one. FIRST: take off; LAST: propose none.
+    """Shorten `frame` of the path to the scene's energy, and propose the next one; FIRST: start; LAST: propose none.
 
     Args:
         cells, velocity: (B, N, 2); with `material` (B, N), `weight` and `gravity`.
@@ -173,9 +173,9 @@ def _cell(x, extent, WRAPS: tl.constexpr):
 def rest(path, gravity, share, held, frames, count, left, right, down, up, rest_speed, nx, ny, WX: tl.constexpr,
          WY: tl.constexpr, OBSTACLES: tl.constexpr, SURFACE: tl.constexpr, FREE_FALL: tl.constexpr, DROP: tl.constexpr,
          BLOCK: tl.constexpr):  # fmt: skip
-    """Hold those particles of a path that move too little: they stay where `held` (B size,) is 1, and fall elsewhere.
+    """Stop particles that move too little: they stay where `held` (B size,) is 1, and fall elsewhere.
 
-    `share` (B size,) is what of each cell's room is obstacle, into which none falls.
+    None falls into obstacles, of which `share` (B size,) is each cell's.
     """
     scene = tl.program_id(1).to(tl.int64)
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
