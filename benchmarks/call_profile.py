@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from rolling import roll_to_end
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
 from nmpm.emulator import Emulator, RolloutContext
@@ -36,7 +35,9 @@ def late_state(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext
     """A scene of the model's own, `BUNDLES` bundles into its rollout, and what the rollout knows of its start."""
     particles = ModelUnderTest(name, emulator, 32, load_preset(name)).starts(1)
     context = emulator.context(particles)
-    return roll_to_end(lambda state: emulator(state, context), particles, BUNDLES), context
+    for _ in range(BUNDLES):
+        particles = emulator(particles, context).state_after(particles)
+    return particles, context
 
 
 def split_call(emulator: Emulator, particles: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:

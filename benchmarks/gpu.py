@@ -38,18 +38,11 @@ def list_steps(device: str, out: Path) -> dict[str, list[str]]:
         "fit": _python("-m", "nmpm", "fit", "--config", "goop.yaml"),
         "tests": _python("-m", "pytest", "--device", device, *TESTS),
         "training_step": _benchmark("training_step", device, "--batch", "128", "--rounds", "20"),
-        "rollout_call": _benchmark("rollout_call", device, "--batch", "128"),
-        "rollout_call_one_scene": _benchmark("rollout_call", device),
         "scaling": _benchmark("scaling", device, *sizes),
-        "planning": _benchmark("planning", device, "--batch", "16"),
-        "call_costs": _benchmark("call_costs", device),
-        "constraints": _benchmark("constraints", device),
-        "first_frame": _benchmark("first_frame", device),
         "rollouts": _benchmark("gpu_rollouts", device, "--batches", "1", "64"),
         "compare": _python("-m", "nmpm", *compared, "--wider", "2", "--device", device, "--out", str(out / "compare")),
         "streaming": _python("benchmarks/streaming.py"),
         "ablation": _benchmark("ablation", device, *ablation),
-        "zoo_speed": _python("-m", "nmpm", "zoo", "refresh", "--root", "zoo", "--measure", "speed", "--device", device),
         "zoo": _benchmark("zoo_on_device", device),
     }
 

@@ -17,10 +17,8 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
-from rolling import roll_on, roll_to_end
 from timing import make_timing_parser
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.progress import progress_bar
 from nmpm.data.format import Trajectory
@@ -152,13 +150,13 @@ class TrainingStep:
 
     Args:
         setup: What to train.
-        options: `preset`, `particles`, `batch`, `width`, `unroll`, `device`; optionally `cells` and `recompute`.
+        options: `preset`, `particles`, `batch`, `width`, `unroll`, `device`; optionally `cells`.
     """
 
     def __init__(self, setup: Setup, **options: Any) -> None:
         scene, state = make_scenes(options["preset"], options["particles"], options["batch"])
         device = options["device"]
-        self.setup, self.unroll, self.recompute = setup, options["unroll"], options.get("recompute", False)
+        self.setup, self.unroll = setup, options["unroll"]
         steps = torch.arange(2 + FRAMES * self.unroll).sub(1).view(1, -1, 1, 1)
         frames = state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)
         others = {name: value for name, value in vars(state).items() if name not in ("position", "velocity")}
@@ -184,39 +182,13 @@ class TrainingStep:
     def predict(self) -> Tensor:
         """Positions of K bundles of m frames, (B, K m, N, D)."""
         start = self.window.initial
-        predict = self.setup.predictor(self.emulator, self.emulator.context(start), self._call)
-        return torch.cat([bundle.position for bundle, _ in roll_on(predict, start, self.unroll)], dim=1)
-
-    def _call(self, particles: Particles, context: RolloutContext) -> Bundle:
-        if self.recompute:
-            recomputed: Bundle = checkpoint(self.emulator, particles, context, use_reentrant=False)
-            return recomputed
-        bundle: Bundle = self.emulator(particles, context)
-        return bundle
-
-
-class RolloutCalls:
-    """Consecutive calls of a rollout, from the same initial state each time.
-
-    Args:
-        setup: What to roll out.
-        options: `preset`, `particles`, `batch`, `width`, `device`; optionally `calls` per run.
-    """
-
-    def __init__(self, setup: Setup, **options: Any) -> None:
-        scene, state = make_scenes(options["preset"], options["particles"], options["batch"])
-        emulator = build_emulator(setup, scene, options["width"]).eval().requires_grad_(False)
-        if setup.precision != torch.float32:
-            emulator.processor.to(setup.precision)
-        self.setup, self.calls = setup, options.get("calls", 10)
-        self.emulator, self.state = emulator.to(options["device"]), state.to(options["device"])
-        self.context = self.emulator.context(self.state)
-
-    @torch.inference_mode()
-    def __call__(self) -> None:
-        """All calls."""
-        with self.setup.backend():
-            roll_to_end(self.setup.predictor(self.emulator, self.context, self.emulator), self.state, self.calls)
+        predict = self.setup.predictor(self.emulator, self.emulator.context(start), self.emulator)
+        positions = []
+        for _ in range(self.unroll):
+            bundle = predict(start)
+            positions.append(bundle.position)
+            start = bundle.state_after(start)
+        return torch.cat(positions, dim=1)
 
 
 def simulate_windows(preset: Preset, seed: int, scenes: int, workers: int) -> Iterator[Window]:
