@@ -1,7 +1,7 @@
 """Gradients of a training step: discounted from bundle to bundle, and computed in parts of the batch by threads.
 
 The flow of a splash parts neighbours exponentially, and so do gradients grow that go back through it: what a later
-bundle says of an earlier one is mostly noise (`benchmarks/gradient_shares.py`). Discounted, it counts less, and later
+bundle says of an earlier one is mostly noise. Discounted, it counts less, and later
 bundles still train the weights by their own errors in full.
 
 Threads inside of operations as small as those of a 2-D grid gain nothing; threads that compute scenes of their own do.
