@@ -14,7 +14,7 @@ class SOAP(pytorch_optimizer.SOAP):
     """Adam in the eigenbasis of Shampoo's preconditioner, by `pytorch_optimizer`, with defaults for grid networks.
 
     Source: N. Vyas et al., SOAP: Improving and Stabilizing Shampoo using Adam, arXiv 2409.11321. Compared with Adam
-    in `benchmarks/parts.md`.
+    in `docs/recipes.md`.
 
     Args:
         params: Of an emulator.

@@ -53,7 +53,7 @@ def computes_bfloat16(device: torch.device) -> bool:
     """Whether a device has instructions for convolutions in bfloat16, and torch uses them.
 
     An x86 CPU has with AVX512_BF16. With other AVX-512, oneDNN emulates them, and a training step takes 1.7 times as
-    long as in float32; without, torch's own loops take 8 to 10 times as long (`benchmarks/precision_steps.py`).
+    long as in float32; without, torch's own loops take 8 to 10 times as long.
     """
     if device.type != "cpu":
         return True

@@ -8,7 +8,6 @@ body's signed distance d,
 
 The points are interpolated to the grid by the model's own p2g, as particles of obstacles are. So the grid sees what
 lattices of particles of all places and directions give on average; contact and support, which read the grid, follow.
-`benchmarks/bodies.py` measures both against the exact mean.
 """
 
 from __future__ import annotations
