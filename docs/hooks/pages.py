@@ -1,6 +1,6 @@
 """MkDocs hook: pages that are not written in `docs/`, but made of other files of the repository at each build.
 
-Included as they are: README.md as the start page, the other Markdown files of the root, and the Markdown files of `benchmarks/` and `zoo/` with
+Included as they are: the root's Markdown files, README.md as the start page, and those of `benchmarks/` and `zoo/` with
 their pictures. Generated: help of all commands, the explained configuration, and a page for each room of the package.
 """
 
@@ -18,7 +18,7 @@ from mkdocs.structure.files import File, Files
 from nmpm.cli import COMMANDS, main, usage
 
 ROOT = Path(__file__).parents[2]
-INCLUDED = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/**/*.md", "zoo/**/*.md", "notebooks/*.ipynb")
+INCLUDED = ("[A-Z]*.md", "benchmarks/**/*.md", "zoo/**/*.md", "notebooks/*.ipynb")
 ASSETS = ("benchmarks/**/*.png", "benchmarks/**/*.html", "zoo/**/*.png")
 TRAINING = ("fit", "validate", "test", "predict")
 ZOO = ("list", "card", "add", "verify", "refresh", "push", "pull")
