@@ -8,12 +8,12 @@ import torch
 from scenes import box, cloud
 
 from nmpm.emulator import Emulator, EmulatorRecipe, differentiable_rollout
-from nmpm.emulator.bodies import SAMPLES, sample_bodies, solid_share
+from nmpm.emulator.bodies import sample_bodies, solid_share
 from nmpm.emulator.constraints import Constraints
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.obstacles import Body, Box, Disc, Polygon, Ramp, Sphere
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles
 from nmpm.processors import UNet
 from nmpm.scene import Scene
 
@@ -81,37 +81,12 @@ def test_the_cells_hold_the_area_of_a_body(make, parameters):
     assert area == pytest.approx(areas[type(body).__name__], rel=0.02)
 
 
-def test_deep_inside_a_body_cells_are_solid_and_far_from_it_free():
-    model = emulator()
-    field = obstacle_field(model, Ramp((0.5, 0.5), 0.4, 0.4, 0.0))
-    torch.testing.assert_close(field[10:22, 10:22], torch.ones(12, 12, dtype=torch.float64))
-    assert field[:6].abs().max() == 0
-
-
 def test_bodies_that_overlap_are_solid_once():
     model = emulator()
     left, right = Ramp((0.45, 0.5), 0.2, 0.1, 0.0), Ramp((0.5, 0.5), 0.2, 0.1, 0.0)
     torch.testing.assert_close(
         obstacle_field(model, left, right), obstacle_field(model, Ramp((0.475, 0.5), 0.25, 0.1, 0.0))
     )
-
-
-@every_family
-def test_the_field_is_that_of_ever_finer_particles(make, parameters):
-    """Filled with 1600 particles per cell, it is the exact mean: bodies come nearer to it than usual fillings do."""
-    model, body = emulator(), make(*parameters)
-
-    def filled(spacing: float) -> torch.Tensor:
-        obstacle = body.particles(spacing).unsqueeze(0)
-        mask = torch.ones(obstacle.shape[:2], dtype=torch.bool)
-        share = torch.full(obstacle.shape[:2], spacing**2 / SCENE.particle_volume, dtype=torch.float64)
-        own = dataclasses.replace(state(model), obstacle=obstacle, obstacle_mask=mask, obstacle_share=share)
-        return (model.solid(own) - model.walls)[0, 0]
-
-    exact = filled(model.grid.spacing[0] / 40)
-    soft, usual = ((field - exact).abs().max() for field in (obstacle_field(model, body), filled(0.02)))
-    assert soft < 0.03
-    assert soft < usual
 
 
 @every_family
@@ -128,56 +103,6 @@ def test_gradients_of_every_parameter_are_those_of_finite_differences(make, para
     assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-6, rtol=2e-3)
     for slope in torch.autograd.grad(loss(*values), values):
         assert slope.abs() > 1e-4  # far above the tolerance
-
-
-@every_family
-def test_gradients_hold_where_particles_slide_along_a_body(make, parameters):
-    """Particles that fall onto the body and stay in touch: contact reads the same field."""
-    model = emulator()
-    above = torch.tensor([[0.47, 0.52], [0.5, 0.53], [0.53, 0.54]], dtype=torch.float64)
-
-    def end(*given: torch.Tensor) -> torch.Tensor:
-        own = state(model, [make(*given)])
-        fast = torch.tensor([0.004, -0.03], dtype=torch.float64).expand(1, 3, 2)
-        moved = dataclasses.replace(
-            own, position=above.unsqueeze(0), velocity=fast, material=own.material[:, :3], mask=own.mask[:, :3]
-        )
-        return differentiable_rollout(model, moved, FRAMES)[:, -1].sum()
-
-    values = leaves(parameters)
-    slopes = torch.stack(torch.autograd.grad(end(*values), values))
-    assert slopes.isfinite().all()
-    assert slopes.abs().max() > 1e-4
-
-
-def test_scenes_have_their_own_bodies():
-    model = emulator()
-    disc, ramp = Disc((0.4, 0.4), 0.1), Ramp((0.6, 0.6), 0.2, 0.05, 0.2)
-    both = model.solid(state(model, [disc], [ramp]))
-    alone = torch.cat([model.solid(state(model, [disc])), model.solid(state(model, [ramp]))])
-    torch.testing.assert_close(both, alone)
-
-
-def test_shares_move_with_the_state_through_windows_batches_and_precisions():
-    model = emulator()
-    own = state(model, [Disc((0.4, 0.4), 0.1)], [Disc((0.6, 0.4), 0.1)])
-    assert torch.equal(Window.of(own).initial.obstacle_share, own.obstacle_share)
-    assert torch.equal(own.scenes([1]).obstacle_share, own.obstacle_share[1:])
-    assert own.double().obstacle_share.dtype == torch.float64
-    with pytest.raises(ValueError, match="obstacle_share has shape"):
-        dataclasses.replace(own, obstacle_share=own.obstacle_share[:, :3])
-
-
-@pytest.mark.parametrize(
-    ("bodies", "message"),
-    [
-        ([Disc((2.0, 2.0), 0.1)], "Disc: no part of it is within the domain"),
-        ([Disc((0.5, 0.5), -0.1)], "radius = -0.1"),
-    ],
-)
-def test_bodies_that_no_cell_would_see_are_refused(bodies, message):
-    with pytest.raises(ConfigError, match=message):
-        sample_bodies([bodies], SCENE, Grid.of(SCENE, 32))
 
 
 @pytest.mark.parametrize(("dim", "body"), [(3, Disc((0.5, 0.5), 0.1)), (2, Sphere((0.5, 0.5, 0.5), 0.1))])
@@ -212,37 +137,3 @@ def test_the_cells_hold_the_volume_of_a_body_in_space(make, parameters, volume):
     field = (model.solid(state(model, [make(*parameters)])) - model.walls)[0, 0]
     assert float(field.sum()) * model.grid.cell_volume == pytest.approx(volume, rel=0.03)
     assert float(field.max()) == pytest.approx(1.0)
-
-
-@every_body_in_space
-def test_gradients_of_bodies_in_space_are_those_of_finite_differences(make, parameters, volume):
-    """Through p2g, the network and several bundles, without the constraints, which have kinks."""
-    model = model_in_space(solids=False)
-    weight = torch.randn(12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-
-    def loss(*given: torch.Tensor) -> torch.Tensor:
-        end = differentiable_rollout(model, state(model, [make(*given)]), FRAMES)[:, -1]
-        return 1e4 * (end * weight).sum()
-
-    values = leaves(parameters)
-    assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-6, rtol=2e-3)
-    for slope in torch.autograd.grad(loss(*values), values):
-        assert slope.abs() > 1e-4  # far above the tolerance
-
-
-def test_particles_in_space_come_to_rest_on_a_box_and_not_in_it():
-    model = model_in_space()
-    own = state(model, [Box((0.5, 0.5, 0.3), (0.6, 0.6, 0.2))])
-    above = own.position.clone()
-    above[..., 2] = 0.45
-    fast = torch.zeros_like(above)
-    fast[..., 2] = -0.03
-    moved = dataclasses.replace(own, position=above, velocity=fast)
-    end = differentiable_rollout(model, moved, 10)[:, -1]
-    assert end[..., 2].min() > 0.38
-
-
-def test_a_points_volume_is_its_part_of_a_cell():
-    grid = Grid.of(SCENE, 32)
-    _, share = sample_bodies([[Disc((0.5, 0.5), 0.2)]], SCENE, grid)
-    assert float(share.max()) * SCENE.particle_volume * SAMPLES**2 == pytest.approx(grid.cell_volume)

@@ -7,14 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box, cloud
 
-from nmpm.decoders import Absolute, Acceleration, Residual
+from nmpm.decoders import Absolute, Residual
 from nmpm.emulator import Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.constraints import Constraints, affordable, at_rest, energy, lowest_potential, mass_shares
 from nmpm.emulator.rollouts import differentiable_rollout, rollout, unroll
 from nmpm.errors import ConfigError, DataError
-from nmpm.processors import Pointwise, UNet
+from nmpm.processors import Pointwise
 from nmpm.transfer import without_kernels
-from nmpm.zoo import Zoo
 
 
 def emulator_of(
@@ -41,7 +40,7 @@ def test_energy_of_a_particle_that_falls_is_kept():
 
 
 @given(seed=st.integers(0, 10_000), fall=st.floats(-0.1, 0.1), allowed=st.floats(0, 2))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_steps_stay_within_the_budget_and_are_left_alone_below_it(seed, fall, allowed):
     generator = torch.Generator().manual_seed(seed)
     cells = 10 * torch.rand(1, 7, 2, generator=generator, dtype=torch.float64)
@@ -80,22 +79,6 @@ def test_a_body_that_gains_nothing_is_left_alone_to_the_bit():
     assert held[2, 0].item() == pytest.approx((2 * (0.02 + 0.01**2 / 2)) ** 0.5, rel=1e-9)
 
 
-def test_all_are_slowed_where_those_that_gain_do_not_suffice():
-    cells, before = [[9.0, 5.0], [30.0, 5.0]], [[0.8, 0.0], [0.0, 0.0]]
-    budget = 0.01 * 5.0 + (0.4**2 / 2) / 2  # less than the first alone has
-    held, spent, step = one_frame(cells, before, [[0.8, 0.0], [0.3, 0.0]], budget)
-    factors = held[:, 0] / step[:, 0]
-    assert factors[0].item() == pytest.approx(factors[1].item(), rel=1e-12)
-    assert 0 < factors[0] < 1
-    assert spent == pytest.approx(budget, abs=1e-12)
-
-
-def test_a_scene_that_cannot_afford_to_stay_takes_the_steps_of_least_energy():
-    held, _, step = one_frame([[9.0, 5.0]], [[0.0, 0.0]], [[0.0, -0.5]], -1.0)
-    assert held[0, 1].item() == pytest.approx(-0.01)  # where v² / 2 - g v is lowest
-    assert step[0, 1] < held[0, 1] < 0
-
-
 def test_heavy_particles_count_by_their_mass():
     scene = box(materials=("water", "steel"), densities=(1000.0, 8000.0))
     material, mask = torch.tensor([[0, 1, 1]]), torch.tensor([[True, True, False]])
@@ -110,15 +93,6 @@ def test_heavy_particles_count_by_their_mass():
     assert heavy[1, 0].item() == pytest.approx((2 * allowed * 9 / 8) ** 0.5, rel=1e-9)
 
 
-def test_equal_densities_are_as_none():
-    material, mask = torch.tensor([[0, 1, 1]]), torch.tensor([[True, True, False]])
-    one, other = (
-        mass_shares(box(materials=("water", "ice"), densities=given), material, mask, torch.float32)
-        for given in ((), (917.0, 917.0))
-    )
-    assert torch.equal(one, other)
-
-
 def limited_everywhere(monkeypatch):
     """As on a GPU: nothing is decided by reading values back, and no kernel of the CPU runs."""
     monkeypatch.setattr("nmpm.emulator.prediction.kernels_take", lambda *_: False)
@@ -127,11 +101,10 @@ def limited_everywhere(monkeypatch):
 
 
 @pytest.mark.parametrize("cells", [16, (16, 8)])
-@pytest.mark.parametrize("decoder", [Absolute(), Residual(), Acceleration()])
-def test_within_the_budget_the_path_is_the_free_one_to_the_bit_on_every_device(monkeypatch, decoder, cells):
+def test_within_the_budget_the_path_is_the_free_one_to_the_bit_on_every_device(monkeypatch, cells):
     scene = box()
     particles = cloud(scene, batch=2, speed=0.004)
-    free, held = (emulator_of(scene, decoder=decoder, cells=cells, energy=on) for on in (False, True))
+    free, held = (emulator_of(scene, cells=cells, energy=on) for on in (False, True))
     assert held.budget(particles) is not None
     solid = held.solid(particles)
     limited_everywhere(monkeypatch)
@@ -151,19 +124,6 @@ def test_with_and_without_branches_the_energy_limit_is_the_same_to_the_bit(monke
     assert torch.equal(rollout(emulator, particles, 24), by_branching)
 
 
-def test_a_scene_does_not_feel_the_energy_of_others():
-    scene = box()
-    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
-    emulator.output_scale.mul_(3.0)
-    budget = torch.stack([emulator.budget(particles)[0], torch.tensor(1e6)])
-    solid = emulator.solid(particles)
-    together = emulator(particles, RolloutContext(solid, budget)).position
-    for index in range(2):
-        own = slice(index, index + 1)
-        alone = emulator(particles.scenes(own), RolloutContext(solid[own], budget[own])).position
-        torch.testing.assert_close(together[own], alone, rtol=0, atol=1e-6)
-
-
 def test_gradients_through_the_energy_limit_are_finite(monkeypatch):
     scene = box()
     limited_everywhere(monkeypatch)
@@ -178,18 +138,6 @@ def test_gradients_through_the_energy_limit_are_finite(monkeypatch):
         assert position.grad.isfinite().all()
 
 
-def test_a_particle_that_is_not_finite_disturbs_no_other_scene():
-    scene = box()
-    emulator, particles = emulator_of(scene, energy=True), cloud(scene, batch=2)
-    expected = emulator(particles).position
-    broken = particles.velocity.clone()
-    broken[1, 3] = float("nan")
-    state = particles.with_motion(particles.position, broken)
-    found = emulator(state).position
-    assert torch.equal(found[0], expected[0])
-    assert found[1].isnan().any()
-
-
 def test_what_moves_less_than_the_rest_speed_on_average_is_at_rest():
     start = torch.zeros(1, 3, 2)
     ends = torch.tensor([[0.0, 0.0], [0.0, 0.39], [0.41, 0.0]])
@@ -197,7 +145,7 @@ def test_what_moves_less_than_the_rest_speed_on_average_is_at_rest():
     assert at_rest(start, path, 0.1, torch.zeros(1, 1, 2)).tolist() == [[True, True, False]]
 
 
-@pytest.mark.parametrize("frames", [2, 3, 8])
+@pytest.mark.parametrize("frames", [2, 3])
 def test_what_falls_freely_is_never_at_rest(frames):
     gravity = torch.tensor([[[0.0, -0.004]]])
     times = torch.arange(1.0, frames + 1)
@@ -209,19 +157,9 @@ def test_what_falls_freely_is_never_at_rest(frames):
     assert at_rest(start, path, 0.01, 0 * gravity).tolist() == [[True, True]]
 
 
-def test_a_block_thrown_straight_up_does_not_hang_in_the_air():
+def test_a_rollout_of_an_untrained_network_gains_no_energy():
     scene = box()
-    emulator = emulator_of(scene, rest_speed=0.05)
-    emulator.output_scale.zero_()  # free fall
-    particles = dataclasses.replace(cloud(scene, speed=0.0), velocity=torch.tensor([0.0, 0.0012]).expand(1, 30, 2))
-    held = rollout(emulator, particles, 48)
-    assert torch.equal(held, rollout(emulator.with_constraints(Constraints()), particles, 48))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_rollout_of_an_untrained_network_gains_no_energy(seed):
-    scene = box()
-    particles = cloud(scene, seed=seed, batch=2)
+    particles = cloud(scene, batch=2)
     wild, tame = emulator_of(scene), emulator_of(scene, energy=True)
     for emulator in (wild, tame):
         emulator.output_scale.mul_(3.0)
@@ -237,17 +175,6 @@ def test_a_rollout_of_an_untrained_network_gains_no_energy(seed):
     assert gain(tame) < 1e-5
 
 
-def test_energy_is_counted_from_the_start_of_the_rollout_not_of_a_bundle():
-    scene = box()
-    emulator = emulator_of(scene, energy=True)
-    particles = cloud(scene)
-    budget = emulator.budget(particles)
-    bundles = list(unroll(emulator, particles, 3))
-    assert budget is not None
-    torch.testing.assert_close(emulator.budget(particles), budget)
-    assert len(bundles) == 3
-
-
 def test_what_rests_stays_to_the_bit():
     scene = box(gravity=(0.0, 0.0))
     particles = cloud(scene, speed=0.0)
@@ -257,14 +184,6 @@ def test_what_rests_stays_to_the_bit():
     assert not torch.equal(rollout(restless, particles, 8)[:, -1], particles.position)
     predicted = rollout(resting, particles, 8)
     torch.testing.assert_close(predicted, particles.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-6)
-
-
-def test_what_moves_is_left_alone_to_the_bit():
-    scene = box()
-    particles = cloud(scene, speed=0.02)
-    free = emulator_of(scene, processor=UNet(width=4, depth=1))
-    held = emulator_of(scene, processor=UNet(width=4, depth=1), rest_speed=1e-9)
-    assert torch.equal(rollout(free, particles, 8), rollout(held, particles, 8))
 
 
 def test_nothing_is_held_in_training():
@@ -288,14 +207,13 @@ def test_a_rollout_in_training_mode_says_that_constraints_do_not_act(roll):
         roll(emulator_of(scene).train(), particles, 4)  # has nothing that could act
 
 
-def test_energy_needs_known_gravity():
+def test_constraints_that_cannot_be_are_refused():
     with pytest.raises(ConfigError, match="gravity is known"):
         emulator_of(box(gravity=None), energy=True)
-
-
-def test_a_negative_rest_speed_is_refused():
     with pytest.raises(ConfigError, match="rest_speed = -1"):
         Constraints(rest_speed=-1)
+    with pytest.raises(ConfigError, match="bounds = 'wrap' is not one of stop, reflect, error"):
+        Constraints(bounds="wrap")
 
 
 def test_a_network_is_shown_no_more_than_the_calibration_saw():
@@ -324,12 +242,6 @@ def test_a_weight_or_statistic_that_is_no_number_is_named(where):
         rollout(emulator, cloud(scene), 1)
 
 
-def test_constraints_travel_with_the_model():
-    emulator = emulator_of(box(), energy=True, rest_speed=0.02)
-    assert emulator.over(box()).constraints == emulator.constraints
-    assert Zoo.load("goop").emulator.constraints == Constraints(energy=True, rest_speed=0.01)
-
-
 def test_float64_is_computed_in_float64():
     scene = box()
     particles = cloud(scene)
@@ -343,26 +255,8 @@ def test_float64_is_computed_in_float64():
     assert 0 < (finer - exact).abs().max().item() < 1e-10  # lost in float32
 
 
-def test_energies_of_cells_that_are_not_square_are_counted_in_lengths():
-    scene = box()
-    square, oblong = emulator_of(scene, cells=16, energy=True), emulator_of(scene, cells=(16, 8), energy=True)
-    particles = cloud(scene)
-    fall = particles.with_motion(particles.position - torch.tensor([0.0, 0.1]), particles.velocity)
-    along = particles.with_motion(particles.position - torch.tensor([0.1, 0.0]), particles.velocity)
-    gains = [(e.budget(fall) - e.budget(particles)).item() for e in (square, oblong)]
-    assert gains[0] == pytest.approx(gains[1], rel=1e-4)  # both in units of the first axis' cells
-    assert oblong.budget(along).item() == pytest.approx(oblong.budget(particles).item(), rel=1e-4)
-
-
-def test_shares_are_of_real_particles():
-    mask = torch.tensor([[True, True, False], [True, True, True], [False, False, False]])
-    expected = torch.tensor([[0.5, 0.5, 0.0], [1 / 3] * 3, [0.0] * 3]).unsqueeze(-1)
-    material = torch.zeros(3, 3, dtype=torch.long)
-    torch.testing.assert_close(mass_shares(box(), material, mask, torch.float32), expected)
-
-
-@pytest.mark.parametrize("bounds", [((0.1, 0.9),), ((0.1, 0.9), (-0.2, 0.4)), ((0.1, 0.9), (-0.2, 0.4), (0.0, 2.0))])
-def test_nowhere_within_the_bounds_is_the_potential_lower(bounds):
+def test_nowhere_within_the_bounds_is_the_potential_lower():
+    bounds = ((0.1, 0.9), (-0.2, 0.4), (0.0, 2.0))
     generator = torch.Generator().manual_seed(0)
     scene = box(dim=len(bounds), bounds=bounds, domain=bounds)
     low, high = torch.tensor(bounds).T

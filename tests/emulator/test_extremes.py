@@ -11,10 +11,8 @@ from hypothesis import strategies as st
 from scenes import box, cloud
 
 from nmpm.emulator import Emulator, EmulatorRecipe
-from nmpm.emulator.rasterise import grid_state
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import DataError
-from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.processors import Pointwise
 from nmpm.scene import Scene
@@ -42,28 +40,6 @@ def at(scene: Scene, position: torch.Tensor, velocity: float = 0.0) -> Particles
     )
 
 
-@pytest.mark.parametrize("transfer", TRANSFERS)
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_no_particle_and_one(transfer, count):
-    scene = box()
-    particles = at(scene, torch.full((count, 2), 0.5))
-    emulator = emulator_of(scene, transfer)
-    assert rollout(emulator, particles, 5).shape == (1, 5, count, 2)
-    assert rollout(emulator, particles, 5).isfinite().all()
-
-
-@pytest.mark.parametrize("transfer", [Nearest(), Linear()])
-def test_a_million_particles_in_one_cell_keep_mass_and_momentum(transfer):
-    grid = Grid((8, 8), (0.0, 0.0), (1.0, 1.0), (False, False))
-    generator = torch.Generator().manual_seed(0)
-    cells = 3 + torch.rand(1, 1_000_000, 2, generator=generator)
-    velocity = 1 + 0.1 * torch.randn(1, 1_000_000, 2, generator=generator)
-    momentum, count = transfer.momentum(velocity, torch.ones(1, 1_000_000, 1), cells, grid)
-    # One after the other in float32, a million terms lose up to a few times 10⁻⁴ of their sum.
-    assert count.double().sum().item() == pytest.approx(1e6, rel=1e-3)
-    assert momentum.double().sum().item() == pytest.approx(velocity.double().sum().item(), rel=1e-3)
-
-
 def _near(value: float, direction: float) -> float:
     return torch.nextafter(torch.tensor(value), torch.tensor(direction)).item()
 
@@ -80,6 +56,7 @@ def test_faces_corners_bounds_and_a_hair_beyond(transfer):
     assert predicted.max() <= 0.9 + 1e-6
 
 
+@pytest.mark.slow
 @given(
     shape=st.sampled_from([(1, 13), (17, 1), (2, 3), (31, 37), (8, 8), (128, 3), (257, 9)]),
     transfer=st.sampled_from(TRANSFERS),
@@ -93,58 +70,8 @@ def test_thin_odd_and_prime_grids(shape, transfer, seed):
     assert predicted.isfinite().all()
 
 
-def test_a_box_a_hundred_times_as_long_as_high():
-    scene = box(bounds=((0.0, 100.0), (0.0, 1.0)), domain=((-0.5, 100.5), (-0.5, 1.5)), particle_volume=0.01)
-    emulator = emulator_of(scene, cells=404)
-    assert emulator.grid.shape == (404, 8)
-    position = torch.rand(50, 2) * torch.tensor([100.0, 1.0])
-    assert rollout(emulator, at(scene, position, 0.1), 4).isfinite().all()
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_the_size_of_the_domain_does_not_matter(scale):
-    unit = box(gravity=None)
-    scaled = box(
-        bounds=((0.1 * scale, 0.9 * scale),) * 2,
-        domain=((0.08 * scale, 0.92 * scale),) * 2,
-        particle_volume=unit.particle_volume * scale**2,
-        gravity=None,
-    )
-    particles = cloud(unit)
-    larger = dataclasses.replace(particles, position=scale * particles.position, velocity=scale * particles.velocity)
-    one, other = rollout(emulator_of(unit), particles, 6), rollout(emulator_of(scaled), larger, 6)
-    torch.testing.assert_close(other / scale, one, rtol=1e-5, atol=1e-5)
-
-
 def far_away(offset: float) -> Scene:
     return box(bounds=((offset + 0.1, offset + 0.9),) * 2, domain=((offset + 0.08, offset + 0.92),) * 2, gravity=None)
-
-
-def test_an_origin_far_away_costs_nothing_in_float64():
-    near, far = box(gravity=None), far_away(1e8)
-    particles = cloud(near)
-    here = particles.double()
-    there = dataclasses.replace(here, position=here.position + 1e8)
-    one, other = rollout(emulator_of(near), here, 6), rollout(emulator_of(far), there, 6)
-    assert other.dtype == torch.float64
-    torch.testing.assert_close(other - 1e8, one, rtol=0, atol=1e-6)
-
-
-UNWALLED = {"bounds": ((0.0, 1.0),), "domain": ((0.0, 1.0),)}
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize(
-    "changes", [{}, UNWALLED, UNWALLED | {"obstacles": True}, {"gravity": None, "gravity_varies": True}], ids=str
-)
-def test_states_in_float64_are_taken_by_every_kind_of_scene(dim, changes):
-    changes = {name: value * dim if name in UNWALLED else value for name, value in changes.items()}
-    scene = dataclasses.replace(box(dim), **changes, evolving=("heat",), parameters=("angle",))
-    particles = cloud(scene, statics=3 * scene.obstacles)
-    particles = particles.with_fields({"heat": particles.position[..., 0], "angle": torch.ones(1, 1)})
-    one, other = (rollout(emulator_of(scene, cells=8), state, 3) for state in (particles, particles.double()))
-    assert other.dtype == torch.float64
-    torch.testing.assert_close(other.float(), one, rtol=0, atol=1e-5)
 
 
 def test_an_origin_too_far_for_float32_is_refused_by_name():
@@ -172,33 +99,6 @@ def test_gradients_are_finite_beside_empty_cells_and_walls(transfer):
     for tensor in (leaf.grad, velocity.grad, *(p.grad for p in emulator.parameters())):
         assert tensor is not None
         assert tensor.isfinite().all()
-
-
-def test_a_material_without_particles_is_an_empty_channel():
-    scene = box(materials=("water", "sand"))
-    particles = at(scene, 0.3 + 0.4 * torch.rand(20, 2), 1e-3)
-    emulator = emulator_of(scene)
-    cells = emulator.grid.to_cells(particles.position)
-    velocity = emulator.grid.to_cell_displacement(particles.velocity)
-    state = grid_state(scene, emulator.grid, emulator.transfer, particles, cells, velocity, emulator.solid(particles))
-    names = scene.input_channels
-    assert state.isfinite().all()
-    assert not state[:, [names.index(name) for name in names if name.startswith("sand")]].any()
-    assert rollout(emulator, particles, 3).isfinite().all()
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_precision_around_leaves_transfers_alone(dtype):
-    scene, grid = box(), Grid((16, 16), (0.0, 0.0), (1.0, 1.0), (False, False))
-    particles = cloud(scene, count=200)
-    emulator = emulator_of(scene)
-    full = emulator(particles).position
-    with torch.autocast("cpu", dtype):
-        half = emulator(particles).position
-        summed = Linear().p2g(torch.full((1, 100, 1), 4097.0), 16 * torch.rand(1, 100, 2), grid)
-    assert half.dtype == torch.float32
-    assert (half - full).abs().max() < 1e-2
-    assert summed.sum().item() == pytest.approx(409700.0, rel=1e-5)
 
 
 class TestPoison:
@@ -232,6 +132,7 @@ class TestPoison:
         assert rollout(emulator_of(scene), padded, 2).isfinite().all()
 
 
+@pytest.mark.slow
 def test_gradients_at_places_that_are_no_numbers_do_not_end_the_process():
     """Torch's sampler crashes there on a CPU, so another process tries it."""
     program = """

@@ -1,7 +1,6 @@
 """Fields that particles carry: channels, rates, statistics, and scenes with more or fewer than the model."""
 
 import dataclasses
-import warnings
 
 import pytest
 import torch
@@ -65,14 +64,6 @@ def test_the_channels_follow_from_the_fields():
     assert not [name for name in small(box()).state_dict() if "field" in name]
 
 
-@pytest.mark.parametrize("name", ["velocity_x", "gravity_x", "a b", "position", ""])
-def test_names_that_channels_cannot_have_are_refused(name):
-    with pytest.raises(ConfigError, match="field cannot be called"):
-        box(evolving=(name,))
-    with pytest.raises(ConfigError, match="given twice"):
-        box(evolving=("heat",), parameters=("heat",))
-
-
 @pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic(), Affine()])
 def test_a_field_that_is_the_same_everywhere_is_so_on_the_grid_and_stays_so(transfer):
     scene = box(2, ("water", "sand"), evolving=("temperature",))
@@ -90,24 +81,6 @@ def test_a_field_that_is_the_same_everywhere_is_so_on_the_grid_and_stays_so(tran
     assert (predict_rollout(emulator, particles, 20).fields["temperature"] == 1.25).all()
 
 
-def test_a_field_is_carried_along_by_its_particles_to_the_bit():
-    scene = box(evolving=("temperature",))
-    emulator = constant_rate(small(scene), 0.0)
-    particles = with_fields(cloud(scene, speed=0.01))
-    predicted = predict_rollout(emulator, particles, 10)
-    assert (predicted.position[:, -1] != particles.position).any()
-    expected = particles.fields["temperature"].unsqueeze(1).expand(-1, 10, -1)
-    assert torch.equal(predicted.fields["temperature"], expected)
-
-
-def test_a_rollout_of_no_scene_has_none():
-    scene = box(evolving=("temperature",))
-    particles = with_fields(cloud(scene))
-    predicted = predict_rollout(small(scene), particles.scenes(slice(0)), 5)
-    assert predicted.position.shape == (0, 5, *particles.position.shape[1:])
-    assert predicted.fields["temperature"].shape == (0, 5, particles.position.shape[1])
-
-
 def test_a_uniform_rate_adds_up_over_frames_and_bundles():
     scene = box(evolving=("temperature",))
     emulator = constant_rate(small(scene), 0.5)
@@ -118,29 +91,7 @@ def test_a_uniform_rate_adds_up_over_frames_and_bundles():
     torch.testing.assert_close(found, particles.fields["temperature"].unsqueeze(1) + steps)
 
 
-def test_each_material_has_its_own_rate():
-    scene = box(2, ("water", "sand"), evolving=("temperature",))
-    emulator = constant_rate(small(scene), torch.tensor([1.0, -2.0]).view(1, 1, 2, 1, 1))
-    particles = with_fields(cloud(scene))
-    found = predict_rollout(emulator, particles, 1).fields["temperature"][:, 0] - particles.fields["temperature"]
-    torch.testing.assert_close(found, torch.where(particles.material == 0, 1.0, -2.0))
-
-
-@pytest.mark.parametrize("transfer", [Linear(), Quadratic()])
-def test_sums_of_fields_and_their_gathering_are_adjoint(transfer):
-    scene = box()
-    particles = cloud(scene, count=40)
-    grid = small(scene).grid
-    cells = grid.to_cells(particles.position).double()
-    values, field = torch.rand(1, 40, 3).double(), torch.rand(1, 3, *grid.shape).double()
-    sums, count = transfer.sums(values, torch.ones(1, 40, 1).double(), cells, grid)
-    left, right = (sums * field).sum(), (values * transfer.g2p(field, cells, grid)).sum()
-    torch.testing.assert_close(left, right)
-    torch.testing.assert_close(sums.sum((0, 2, 3)), values.sum((0, 1)))
-    assert float(count.sum()) == pytest.approx(40)
-
-
-@pytest.mark.parametrize("filler", [0.0, 1e30, float("nan")])
+@pytest.mark.parametrize("filler", [1e30, float("nan")])
 def test_padded_particles_change_no_field_to_the_bit(filler):
     scene = box(**ALL)
     emulator, particles = small(scene), with_fields(cloud(scene, count=20))
@@ -160,19 +111,6 @@ def test_padded_particles_change_no_field_to_the_bit(filler):
     assert torch.equal(one.fields["temperature"], other.fields["temperature"][..., :20])
 
 
-def test_the_order_of_particles_does_not_matter():
-    scene = box(**ALL)
-    emulator, particles = small(scene), with_fields(cloud(scene, count=25))
-    order = torch.randperm(25, generator=torch.Generator().manual_seed(1))
-    fields = {name: v if v.shape[1] == 1 else v[:, order] for name, v in particles.fields.items()}
-    changed = dataclasses.replace(
-        particles.with_motion(particles.position[:, order], particles.velocity[:, order]),
-        material=particles.material[:, order], fields=fields,
-    )  # fmt: skip
-    one, other = predict_rollout(emulator, particles, 6), predict_rollout(emulator, changed, 6)
-    torch.testing.assert_close(one.fields["temperature"][..., order], other.fields["temperature"])
-
-
 def test_a_rollout_goes_on_from_any_bundle_to_the_bit():
     scene = box(**ALL)
     emulator, particles = small(scene), with_fields(cloud(scene))
@@ -182,15 +120,6 @@ def test_a_rollout_goes_on_from_any_bundle_to_the_bit():
     rest = predict_rollout(emulator, first.state_after(particles), 3)
     assert torch.equal(whole.fields["temperature"][:, 3:], rest.fields["temperature"])
     assert torch.equal(whole.position, rollout(emulator, particles, 6))
-
-
-def test_a_field_that_still_changes_keeps_a_scene_at_rest_going():
-    scene = box(gravity=None, evolving=("temperature",))
-    emulator = constant_rate(small(scene), 1.0)
-    particles = with_fields(cloud(scene, speed=0.0))
-    found = predict_rollout(emulator, particles, 12)
-    assert torch.equal(found.position[:, 0], found.position[:, -1])
-    assert (found.fields["temperature"].diff(dim=1) > 0.5).all()
 
 
 def test_a_missing_field_has_its_training_mean_and_is_named():
@@ -210,27 +139,11 @@ def test_a_missing_field_has_its_training_mean_and_is_named():
     torch.testing.assert_close(found.fields["temperature"], expected.fields["temperature"])
 
 
-def test_a_field_that_the_model_does_not_have_changes_nothing():
-    scene = box()
-    emulator, particles = small(scene), cloud(scene)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert torch.equal(rollout(emulator, particles, 4), rollout(emulator, with_fields(particles), 4))
-
-
 def test_one_number_per_scene_is_not_taken_from_particles():
     scene = box(**ALL)
     particles = with_fields(cloud(scene)).with_fields({"friction": torch.zeros(1, 30)})
     with pytest.raises(DataError, match="one friction for each trajectory"):
         small(scene)(particles)
-
-
-def test_fields_that_are_not_finite_are_refused():
-    scene = box(**ALL)
-    particles = with_fields(cloud(scene))
-    particles.fields["temperature"][0, 4] = float("nan")
-    with pytest.raises(DataError, match="particle 4: its temperature is"):
-        rollout(small(scene), particles, 3)
 
 
 def test_calibration_measures_fields_over_real_particles_and_scenes():
@@ -263,12 +176,3 @@ def test_other_scenes_keep_the_models_fields_and_exports_refuse_them():
     assert recipe.scene == emulator.scene
     with pytest.raises(ConfigError, match=r"temperature, stiffness, friction.*exported files do not"):
         Step(emulator)
-
-
-def test_gradients_reach_the_fields():
-    scene = box(**ALL)
-    particles = with_fields(cloud(scene, count=6))
-    heat = particles.fields["temperature"].clone().requires_grad_(True)
-    bundle = small(scene)(particles.with_fields({"temperature": heat}))
-    bundle.fields["temperature"][:, -1].sum().backward()
-    assert (heat.grad.abs() > 0).all()

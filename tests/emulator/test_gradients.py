@@ -3,10 +3,10 @@ import dataclasses
 import pytest
 import torch
 
-from nmpm.emulator import Emulator, EmulatorRecipe, differentiable_rollout, rollout
+from nmpm.emulator import Emulator, EmulatorRecipe, differentiable_rollout
 from nmpm.emulator.constraints import Constraints
 from nmpm.errors import DataError
-from nmpm.obstacles import Disc, Ramp
+from nmpm.obstacles import Ramp
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from tests.scenes import box, cloud
@@ -72,24 +72,6 @@ def test_gradients_of_an_obstacle_alone_are_not_lost_to_the_kernels(constraints)
     alone = derivative(False)
     assert alone.abs() > 1e-9
     torch.testing.assert_close(alone, derivative(True), rtol=1e-4, atol=1e-9)
-
-
-def test_gradients_of_a_discs_place_are_finite_and_not_zero_with_contact():
-    model = emulator()
-    centre = torch.tensor([0.5, 0.4], dtype=torch.float64, requires_grad=True)
-    obstacle = Disc(centre, 0.08).particles(0.03).unsqueeze(0)
-    mask = torch.ones(obstacle.shape[:2], dtype=torch.bool)
-    particles = state(torch.tensor(0.0), obstacle=obstacle, obstacle_mask=mask)
-    loss(model, particles).backward()
-    assert centre.grad.isfinite().all()
-    assert centre.grad.abs().sum() > 0
-
-
-def test_positions_are_those_of_a_rollout():
-    model, particles = emulator(), state(torch.tensor(0.3))
-    with_gradients = differentiable_rollout(model, particles, FRAMES)
-    torch.testing.assert_close(with_gradients, rollout(model, particles, FRAMES), rtol=0, atol=1e-12)
-    assert with_gradients.shape[1] == FRAMES
 
 
 def test_what_a_bundle_keeps_is_recomputed():

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 
 import pytest
@@ -14,7 +13,7 @@ from nmpm.emulator import Emulator, EmulatorRecipe, rollout
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.runtimes import OpenVINO
 from nmpm.errors import ConfigError
-from nmpm.processors import Axial, ConvNeXt, GridProcessor, Identity, Pointwise, UNet
+from nmpm.processors import Axial, ConvNeXt, GridProcessor, Pointwise, UNet
 
 if find_spec("openvino") is None:  # importing it would report to its makers
     pytest.skip("openvino is not installed", allow_module_level=True)
@@ -49,9 +48,8 @@ def pair() -> tuple[Emulator, Emulator]:
         (box(3, materials=("water", "sand")), (8, 4, 6), SMALL),
         (box(), 8, ConvNeXt(width=6, depth=1, kernel=5)),
         (box(), 8, Axial(width=8, layers=1, heads=2, patch=4)),
-        (box(), 8, Identity()),
     ],
-    ids=["UNet", "periodic", "3-D", "ConvNeXt", "Axial", "Identity"],
+    ids=["UNet", "periodic", "3-D", "ConvNeXt", "Axial"],
 )
 def test_fields_are_those_of_torch(scene, cells, processor):
     network = emulator_of(scene, processor, cells)
@@ -68,23 +66,6 @@ def test_rollouts_are_those_of_torch_to_rounding(pair):
     apart = (rollout(quick, state, 9) - rollout(emulator, state, 9)) / spacing
     assert apart.abs().max() < 1e-3
     assert torch.equal(rollout(quick, state, 9), rollout(quick, state, 9))
-
-
-def test_results_are_in_memory_of_their_own(pair):
-    quick = pair[1]
-    first = quick.runtime.fields(quick.processor, grid_of(quick), torch.float32)
-    before = first.clone()
-    quick.runtime.fields(quick.processor, grid_of(quick, seed=1), torch.float32)
-    assert torch.equal(first, before)
-
-
-def test_threads_may_share_a_runtime(pair):
-    quick = pair[1]
-    grids = [grid_of(quick, seed=seed) for seed in range(16)]
-    alone = [quick.runtime.fields(quick.processor, grid, torch.float32) for grid in grids]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda grid: quick.runtime.fields(quick.processor, grid, torch.float32), grids))
-    assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
 
 
 @torch.no_grad()
@@ -112,26 +93,6 @@ def test_the_network_runs_in_its_own_precision():
     assert torch.equal(converted(state).position, quick(state).position)
 
 
-def test_a_processor_without_bfloat16_computes_in_float32_and_says_so(monkeypatch):
-    from nmpm.emulator.runtimes import openvino
-
-    class Core:
-        def get_property(self, *_):
-            return ["FP32", "INT8"]
-
-    monkeypatch.setattr(openvino, "_core", lambda _: Core())
-    with pytest.warns(UserWarning, match="no bfloat16: OpenVINO computes in float32"):
-        assert openvino._precision_here(None, torch.bfloat16) == torch.float32
-    assert openvino._precision_here(None, torch.float32) == torch.float32
-
-
-def test_options_limit_threads():
-    from nmpm.emulator.runtimes.openvino import _options
-
-    options = _options(torch.float32, 3)
-    assert (options["INFERENCE_NUM_THREADS"], options["NUM_STREAMS"]) == (3, 1)
-
-
 # ---- what it cannot do
 
 
@@ -156,19 +117,6 @@ class Spectral(GridProcessor):
 def test_networks_that_it_cannot_run_are_named():
     with pytest.raises(ConfigError, match="OpenVINO cannot run Spectral: use the runtime eager"):
         OpenVINO().fields(Spectral().eval(), torch.zeros(1, 3, 8, 8), torch.float32)
-
-
-def test_networks_that_it_cannot_compile_for_this_processor_are_named(monkeypatch):
-    from nmpm.emulator.runtimes import openvino
-
-    class Core:
-        def compile_model(self, *_):
-            raise RuntimeError("could not create a primitive descriptor")
-
-    monkeypatch.setattr(openvino, "_core", lambda _: Core())
-    network = emulator_of(processor=Pointwise())
-    with pytest.raises(ConfigError, match=r"OpenVINO cannot run .*: use the runtime eager .*primitive descriptor"):
-        OpenVINO().fields(network.processor, grid_of(network), torch.float32)
 
 
 def test_other_devices_and_types_are_refused(pair):

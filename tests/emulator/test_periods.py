@@ -73,14 +73,6 @@ def test_gradients_are_those_of_the_same_rollout():
     assert position.grad[..., 0].mean().item() == pytest.approx(1.0, abs=0.5)
 
 
-def test_what_rests_stays_where_it_is():
-    emulator = emulator_of(rest_speed=0.01)
-    start = drifting(0.0, periods=7.0)
-    predicted = rollout(emulator, start, 12)
-    assert torch.equal(predicted, predicted[:, :1].expand_as(predicted))
-    torch.testing.assert_close(predicted[:, 0], start.position, rtol=1e-6, atol=0)
-
-
 @pytest.mark.parametrize("varies", [False, True])
 def test_energy_is_that_of_the_whole_way_fallen(varies):
     scene = box(gravity=(9.81, 0.0), gravity_varies=varies, **CHANNEL)
@@ -91,11 +83,3 @@ def test_energy_is_that_of_the_whole_way_fallen(varies):
     fallen = start.position[:, None] + start.velocity[:, None] * torch.arange(1, 201)[:, None, None]
     assert (predicted[:, -1, :, 0] >= fallen[:, -1, :, 0] - 1e-3).all()  # no energy is lost to crossings
     assert monitor.peaks["energy"] < 0.02
-
-
-def test_a_monitor_sees_where_particles_are():
-    monitor = Monitor(Policy.STOP)
-    rollout(emulator_of(), drifting(0.05), 100, monitor)
-    assert monitor.peaks["speed"] < 1.1
-    assert abs(monitor.peaks["energy"]) < 1e-3
-    assert monitor.rest_share == 0

@@ -6,7 +6,6 @@ import torch
 from nmpm.emulator import Emulator, EmulatorRecipe, unroll
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import Monitor
-from nmpm.emulator.runtimes import Eager
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from tests.scenes import box, cloud
@@ -72,22 +71,6 @@ def test_only_scenes_that_move_are_computed():
         torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
         assert torch.equal(one[::2], other[::2])
     assert not torch.equal(found[-1][1, -1], found[-2][1, -1])
-
-
-def test_a_batch_of_compiled_shapes_sleeps_together():
-    model = emulator(rest_speed=0.05)
-    model.runtime = type("Fixed", (Eager,), {"fixed_shapes": True})()
-    batch, sizes = joined(cloud(WEIGHTLESS, speed=0.0), cloud(WEIGHTLESS, speed=0.02, seed=1)), []
-    model.processor.register_forward_hook(lambda _, inputs, __: sizes.append(len(inputs[0])))
-    list(unroll(model, batch, BUNDLES))
-    assert sizes == [2] * BUNDLES
-
-
-def test_training_computes_every_bundle():
-    model = emulator(rest_speed=1e3).train()
-    calls = count_calls(model)
-    list(unroll(model, cloud(WEIGHTLESS, speed=0.0), BUNDLES))
-    assert calls == [BUNDLES]
 
 
 def two_piles(wraps: bool) -> tuple[Emulator, Particles]:

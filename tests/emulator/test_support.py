@@ -1,8 +1,5 @@
 """Only what lies on something rests: closed forms, symmetries, and the kernels beside tensor operations."""
 
-import dataclasses
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -17,7 +14,7 @@ from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.fused.rest import find_support
 from nmpm.emulator.rollouts import rollout
-from nmpm.emulator.support import MAX_DROP, REACH, Support, drops, floor_rows
+from nmpm.emulator.support import REACH, Support, floor_rows
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.processors import Pointwise
@@ -67,25 +64,6 @@ def test_a_drop_under_the_ceiling_comes_down_as_fast_as_from_rest_in_each_bundle
     torch.testing.assert_close(predicted[..., :-1], drop.position.unsqueeze(1).expand_as(predicted)[..., :-1])
 
 
-def test_a_drop_comes_to_rest_near_the_floor():
-    scene = box(gravity=(0.0, -98.1))
-    predicted = rollout(emulator_of(scene), block(0.86, 0.9, scene=scene), 480)
-    assert torch.equal(predicted[:, -1], predicted[:, -2])
-    assert heights(predicted[:, -1]).min() < 0.1 + REACH * WIDTH
-    assert heights(predicted[:, -1]).max() < 0.1 + (REACH + 1) * WIDTH
-
-
-def test_a_drop_in_the_air_falls_and_one_on_a_column_stays():
-    heap, drop = block(0.1, 0.5), block(0.75, 0.8)
-    position = torch.cat([heap.position, drop.position], dim=1)
-    both = state_at_rest(box(), position[0])
-    predicted = rollout(emulator_of(box()), both, 4)
-    moved = (predicted[:, -1] - both.position).abs().amax(-1)[0] > 1e-5
-    lower = len(heap.position[0])
-    assert not moved[:lower].any()
-    assert moved[lower:].all()
-
-
 @pytest.mark.parametrize("solids", [True, False])
 def test_what_lies_on_an_obstacle_stays_and_what_hangs_below_it_falls(solids):
     scene = box(obstacles=True)
@@ -98,6 +76,7 @@ def test_what_lies_on_an_obstacle_stays_and_what_hangs_below_it_falls(solids):
     assert (fallen[len(above) :] > 1e-4).all()
 
 
+@pytest.mark.slow
 def test_what_falls_stops_at_an_obstacle():
     scene = box(obstacles=True, gravity=(0.0, -98.1))
     beam = lattice(((0.3, 0.7), (0.3, 0.4)), SPACING)
@@ -123,27 +102,7 @@ def test_where_there_is_no_floor_what_rests_stays_to_the_bit(scene):
     torch.testing.assert_close(predicted, drop.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-7)
 
 
-def test_falling_gains_no_energy():
-    scene, dt = box(obstacles=True), 0.0025
-    generator = torch.Generator().manual_seed(1)
-    cloud = 0.15 + 0.7 * torch.rand(80, 2, generator=generator)
-    clear = (cloud - 0.45).abs().amax(1) > 0.15  # contact would push out what is in the obstacle
-    state = state_at_rest(scene, cloud[clear], lattice(((0.35, 0.55), (0.4, 0.5)), SPACING))
-    path = rollout(emulator_of(scene), state, 80)
-    steps = path.diff(dim=1, prepend=state.position.unsqueeze(1))
-    energy = (steps.square().sum(-1) / 2 + 9.81 * dt**2 * heights(path)).double()
-    assert (energy <= 9.81 * dt**2 * heights(state.position).unsqueeze(1) + 1e-9).all()
-    assert energy[:, -1].mean() < energy[:, 0].mean() - 1e-7
-
-
-def test_a_bundle_falls_by_half_a_cell_at_most():
-    gravity = torch.tensor([[[0.0, -0.004]], [[3.0, -4.0]]])
-    slow, fast = drops(gravity, 4)[:, :, 0]
-    torch.testing.assert_close(slow[:, 1], -0.004 * torch.tensor([1.0, 3.0, 6.0, 10.0]))
-    torch.testing.assert_close(fast[-1], MAX_DROP * torch.tensor([0.6, -0.8]))
-
-
-@pytest.mark.parametrize(("gap", "held"), [(0, True), (REACH - 1, True), (REACH, False), (REACH + 2, False)])
+@pytest.mark.parametrize(("gap", "held"), [(REACH - 1, True), (REACH, False)])
 def test_gaps_of_less_than_the_reach_are_bridged(gap, held):
     grid = Grid((5, 12), (0.0, 0.0), (1.0, 1.0), (False, False))
     scene = box(bounds=((0.0, 5.0), (0.0, 12.0)), domain=((0.0, 5.0), (0.0, 12.0)))
@@ -153,16 +112,6 @@ def test_gaps_of_less_than_the_reach_are_bridged(gap, held):
     support = Support(filled, None, scene, grid).supported_cells(torch.tensor([[[0.0, -1.0]]]))
     assert support[0, 2, : 4 + min(gap, REACH - 1)].all()
     assert bool(support[0, 2, 3 + gap]) == held
-
-
-def test_an_overhang_of_a_cell_is_held_and_a_longer_one_not():
-    grid = Grid((8, 8), (0.0, 0.0), (1.0, 1.0), (False, False))
-    scene = box(bounds=((0.0, 8.0),) * 2, domain=((0.0, 8.0),) * 2)
-    filled = torch.zeros(1, 1, 8, 8)
-    filled[..., 2, :] = 1.0
-    filled[..., 3:6, 6] = 1.0
-    support = Support(filled, None, scene, grid).supported_cells(torch.tensor([[[0.0, -1.0]]]))
-    assert support[0, :6, 6].tolist() == [False, True, True, True, False, False]
 
 
 def random_support(seed: int, shape: tuple[int, ...], periodic: tuple[bool, ...], obstacles: bool) -> Support:
@@ -189,7 +138,7 @@ def random_support(seed: int, shape: tuple[int, ...], periodic: tuple[bool, ...]
     gravity=st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), min_size=6, max_size=6),
     obstacles=st.booleans(),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obstacles):
     dim = len(shape)
     support = random_support(seed, shape, tuple(wraps[:dim]), obstacles)
@@ -207,32 +156,7 @@ def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obst
         assert np.array_equal(held, expected[scene].flatten().numpy())
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("upwards", [False, True])
-def test_support_turns_with_gravity(axis, upwards):
-    shape = (7, 8, 9)
-    support = random_support(3, shape, (False,) * 3, True)
-    open_box = dataclasses.replace(support.scene, bounds=tuple((0.0, float(n)) for n in shape))
-    support = dataclasses.replace(support, scene=open_box)
-    down = torch.zeros(2, 1, 3)
-    down[..., axis] = 1.0 if upwards else -1.0
-    found = support.supported_cells(down)
-
-    def turn(values: Tensor) -> Tensor:
-        """The axis of gravity becomes the last one, with the floor at its lower end."""
-        turned = values.movedim(axis - 3, -1)
-        return turned.flip(-1) if upwards else turned
-
-    sizes = tuple(float(n) for n in turn(support.filled).shape[2:])
-    grid = Grid(tuple(map(int, sizes)), (0.0,) * 3, (1.0,) * 3, (False,) * 3)
-    sides = tuple((0.0, size) for size in sizes)
-    scene = dataclasses.replace(open_box, bounds=sides, domain=sides)
-    assert support.obstacle is not None
-    upright = Support(turn(support.filled), turn(support.obstacle), scene, grid)
-    assert torch.equal(turn(found), upright.supported_cells(torch.tensor([[[0.0, 0.0, -1.0]]]).expand(2, 1, 3)))
-
-
-@pytest.mark.parametrize(("dim", "obstacles"), list(itertools.product((2, 3), (False, True))))
+@pytest.mark.parametrize(("dim", "obstacles"), [(2, True), (3, False)])
 def test_bundles_are_those_of_tensor_operations(dim, obstacles):
     scene = box(dim, ("water", "sand"), obstacles=obstacles, boundary=("periodic",) + ("wall",) * (dim - 1),
                 domain=((0.1, 0.9),) + ((0.08, 0.92),) * (dim - 1))  # fmt: skip

@@ -58,6 +58,7 @@ def test_all_give_the_same_values_and_gradients_to_rounding(name, transfer):
         assert (one - other).abs().max() <= 1e-6 * scale * (10 if one.shape[1] == 500 else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["native", "sorted"])
 def test_the_same_bits_in_every_run_and_for_any_number_of_threads(name):
     script = f"""
