@@ -86,8 +86,6 @@ PARTS = [
     *({"transfer": part} for part in TRANSFERS),
     *({"decoder": part} for part in DECODERS),
 ]
-    [{"processor": p} for p in PROCESSORS] + [{"transfer": t} for t in TRANSFERS] + [{"decoder": d} for d in DECODERS]
-)
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: type(next(iter(part.values()))).__name__)
