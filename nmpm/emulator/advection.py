@@ -90,7 +90,7 @@ class Advection:
         """(B, m, N, D) positions that obey the constraints.
 
         Args:
-            start: What to start from.
+            start: Particles and grids.
             solid: (B, C_solid, *S), the share of each cell that is wall or obstacle.
             budget: (B,) energy that no frame may exceed; None for no such limit.
 
@@ -107,14 +107,7 @@ class Advection:
         return self._check_bounds(start, path)
 
     def uncrowded_path(self, start: BundleStart, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
-        """A constrained path (B, m, N, D) whose overfull cells at the end have been spread, evenly over its frames.
-
-        Args:
-            start: What it started from.
-            path: (B, m, N, D) from `constrained_path`.
-            solid: As for `constrained_path`.
-            budget: As for `constrained_path`.
-        """
+        """A path (B, m, N, D) of `constrained_path` with overfull cells at its end spread, evenly over its frames."""
         volume = self.scene.particle_volume / self.grid.cell_volume
         taken = solid if solid.shape[1] else self.walls.expand(1, 1, *self.grid.shape)
         crowding = Crowding(self.constraints.density_cap, volume, 1 - taken, self.grid)
@@ -232,10 +225,9 @@ class Advection:
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""
+        rule, (low, high) = BOUNDS[self.constraints.bounds], self.bounds.unbind(0)
         if all(self.scene.periodic):
             return cells
-        low, high = self.bounds.unbind(0)
-        rule = BOUNDS[self.constraints.bounds]
         if not any(self.scene.periodic):
             return rule(cells, low, high)
         columns = [

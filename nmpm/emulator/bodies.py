@@ -60,12 +60,7 @@ def sample_bodies(scenes: Sequence[Sequence[Body]], scene: Scene, grid: Grid) ->
 
 
 def solid_share(distance: Tensor, width: float) -> Tensor:
-    """1 inside of a body, 0 outside, and smoothly between over a band of some width around its outline.
-
-    Args:
-        distance: (...) signed distances, negative inside.
-        width: Of the band, in the same unit.
-    """
+    """1 inside of a body, where signed distances are negative, 0 outside; smooth over a band of some width around 0."""
     u = (2 * distance / width).clamp(-1, 1)
     return 0.5 - 0.75 * u + 0.25 * u**3
 

@@ -28,7 +28,7 @@ _FULL = 0.995
 
 @dataclass(frozen=True)
 class _Inputs:
-    """Statistics of a sample's grid states: the number of cells, and (C,) figures of their values."""
+    """Statistics (C,) of a sample's grid states, and their number of cells."""
 
     cells: int
     mean: Tensor
@@ -91,11 +91,8 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
 def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
     """The volume fraction that the fullest 0.5% of the occupied cells exceed, for `Constraints.density_cap`.
 
-    Cells that are half solid or less than half full do not count. The value is read back from the device.
-
-    Args:
-        emulator: Gives scene and grid.
-        windows: Of training data, drawn from whole trajectories, as crowding grows while material settles.
+    Cells that are half solid or less than half full do not count. Windows are of training data, drawn from whole
+    trajectories, as crowding grows while material settles.
 
     Raises:
         ValueError: if no cell is half full.
@@ -231,7 +228,7 @@ def gravity_range(emulator: Emulator) -> tuple[Tensor, Tensor]:
 
 
 def usual_gravity(emulator: Emulator) -> Tensor:
-    """The gravity (D,) to show a model with whose scenes differ in it, in length/s².
+    """The gravity (D,), in length/s², to show a model with whose scenes differ in it.
 
     Downwards along the second axis, as strong as in the root mean square of the training, within the calibrated range.
     """

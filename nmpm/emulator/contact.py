@@ -38,14 +38,12 @@ Depth = Callable[[Tensor], Tensor]
 
 
 def obstacle_share(solid: Tensor, walls: Tensor) -> Tensor:
-    """The share of each cell's room that is obstacle, (B, 1, *S) in [0, 1].
+    """The share of each cell without its wall that is obstacle, (B, 1, *S) in [0, 1].
 
-    Args:
-        solid: (B, 1, *S), the share that is wall or obstacle.
-        walls: (*S), the share that is wall.
+    From the shares of the whole cell that are wall or obstacle, (B, 1, *S), and wall, (*S).
     """
-    room = 1 - walls
-    return torch.where(room > 0, (solid - walls) / room.clamp(min=1e-6), 0.0).clamp(0, 1)
+    free = 1 - walls
+    return torch.where(free > 0, (solid - walls) / free.clamp(min=1e-6), 0.0).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -61,15 +59,12 @@ class Contact:
     grid: Grid
 
     def hold(self, start: Tensor, path: Tensor, mask: Tensor | None = None) -> Tensor:
-        """A path that does not lead into an obstacle; one that starts in an obstacle leads out.
+        """A path (B, m, N, D) that does not lead into an obstacle; one that starts in an obstacle leads out.
 
         Args:
             start: (B, N, D) in cells.
-            path: (B, m, N, D) as predicted.
+            path: (B, m, N, D) as predicted; kept for particles that keep clear of obstacles.
             mask: (B, N) bool, False for padding, whose path is returned as it is and changes no other; None for none.
-
-        Returns:
-            (B, m, N, D): the path itself for particles that keep clear of obstacles.
         """
         return self.hold_touching(start, path, mask) if is_eager_cpu(start) else self.hold_all(start, path, mask)
 
@@ -91,12 +86,12 @@ class Contact:
         if not bool(touching.any()):
             return path
         scene, particle = touching.nonzero().unbind(1)
-        depth, own = partial(self._depth, scene), pieces[scene]
+        depth, count = partial(self._depth, scene), pieces[scene]
         mine, begin, stuck = path[scene, :, particle], start[scene, particle], inside[scene, particle]
-        touch = _touch(depth, begin, mine, own, _largest(pieces))
+        touch = _touch(depth, begin, mine, count, _largest(pieces))
         longest = path.new_zeros(len(path)).scatter_reduce(0, scene, _length(touch.along), "amax")
         finer = _pieces(longest.unsqueeze(1))[scene]
-        held = _slid(depth, mine, touch, own, finer, _largest(finer))
+        held = _slid(depth, mine, touch, count, finer, _largest(finer))
         if bool(stuck.any()):
             held[stuck] = _pushed_out(partial(self._depth, scene[stuck]), begin[stuck], path.shape[1])
         path = path.clone()

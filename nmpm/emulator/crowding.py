@@ -1,13 +1,11 @@
-"""Crowding: particles of overfull cells spread into the room around them, so that material keeps its volume.
+"""Crowding: particles of overfull cells spread into the free volume around them, so that material keeps its volume.
 
-φ is the volume fraction of all particles on the grid, linearly rasterised, s the solid fraction, and 1 - s the room of
-a cell. A pressure ψ on the nodes solves, approximately, the linear complementarity problem
+φ is the volume fraction of all particles, linearly rasterised, s the solid fraction, and 1 - s a cell's free volume. A pressure ψ on the nodes solves, approximately, the linear complementarity problem
 
     ψ >= 0,    φ / cap + Δψ <= 1 - s,    equality where ψ > 0,
 
 with no flux into solids, by projected Jacobi sweeps, and particles move by -∇ψ: overfull cells empty into the nearest
-room, and particles without an overfull cell nearby do not move at all. All in cells; nothing is read back from the
-device.
+free volume; particles without an overfull cell nearby do not move. All in cells; nothing is read back from the device.
 
 Source: Kugelstadt, Longva, Thürey & Bender, Implicit Density Projection for Volume Conserving Liquids, IEEE TVCG 27
 (2021), for the projection; here the density may also be lower than the cap, and one p2g and one g2p suffice a bundle.
@@ -23,7 +21,7 @@ from torch import Tensor
 
 from nmpm.grid import Grid
 from nmpm.transfer import Linear
-from nmpm.transfer.execution import chunks, is_eager_cpu
+from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
 MAX_SHIFT = 0.5
@@ -43,32 +41,27 @@ class Crowding:
     Args:
         cap: Volume fraction above which a cell without solid is overfull.
         particle: Volume of a particle, as a share of a cell.
-        room: (B or 1, 1, *S) share of each cell that is not solid.
+        free: (B or 1, 1, *S) share of each cell that is not solid.
         grid: The grid.
     """
 
     cap: float
     particle: float
-    room: Tensor
+    free: Tensor
     grid: Grid
 
     def shift(self, cells: Tensor, real: Tensor) -> Tensor | None:
-        """Displacements that spread overfull cells; None, on a CPU only, if there are none.
+        """(B, N, D) displacements that spread overfull cells; None, on a CPU only, if there are none.
 
-        Args:
-            cells: (B, N, D) positions.
-            real: (B, N, 1) bool, False for padding.
-
-        Returns:
-            (B, N, D), at most `MAX_SHIFT` along each axis, exactly zero away from overfull cells and for padding.
+        Of positions (B, N, D) of which some are real (B, N, 1), not padding. At most `MAX_SHIFT` along each axis,
+        exactly zero away from overfull cells and for padding.
         """
         full = Linear().p2g(real.to(cells.dtype), cells, self.grid) * (self.particle / self.cap)
-        excess = full - self.room
+        excess = full - self.free
         if is_eager_cpu(excess) and not bool((excess > 0).any()):
             return None
         flow = torch.cat(self._flow(excess), dim=1)
-        parts = [linear_g2p(flow, cells[:, chunk], self.grid) for chunk in chunks(cells.shape[1], cells.device)]
-        shift = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
+        shift = linear_g2p(flow, cells, self.grid)
         return torch.where(real, shift.clamp(-MAX_SHIFT, MAX_SHIFT), 0.0)
 
     def _flow(self, excess: Tensor) -> list[Tensor]:
@@ -88,8 +81,8 @@ class Crowding:
         """For each axis the conductance of the faces (B or 1, 1, *S) from each node to the next; zero at solids."""
         first, faces = self.grid.spacing[0], []
         for axis, (spacing, extent) in enumerate(zip(self.grid.spacing, self.grid.shape, strict=True)):
-            room = self.room.to(dtype)
-            face = torch.minimum(room, _roll(room, -1, axis)) * (first / spacing) ** 2
+            free = self.free.to(dtype)
+            face = torch.minimum(free, _roll(free, -1, axis)) * (first / spacing) ** 2
             if not self.grid.periodic[axis]:
                 last = torch.arange(extent, device=face.device) == extent - 1
                 face = torch.where(last.view(-1, *(1,) * (self.grid.dim - 1 - axis)), 0.0, face)

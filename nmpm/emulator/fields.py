@@ -24,11 +24,7 @@ Gather = Callable[[Tensor, Tensor], Tensor]
 
 
 class FieldScales(nn.Module):
-    """Mean and standard deviation of each of a scene's fields in the training data; no tensors where it has none.
-
-    Args:
-        scene: Names the fields.
-    """
+    """Mean and standard deviation of each of a scene's fields in the training data; no tensors where it has none."""
 
     mean: Tensor
     std: Tensor
@@ -83,7 +79,7 @@ class FieldScales(nn.Module):
         return (particles.fields[name].to(self.mean.dtype) - self.mean[index]) / self.std[index]
 
     def evolve(self, particles: Particles, places: Tensor, rates: Tensor, gather: Gather) -> Mapping[str, Tensor]:
-        """The evolving fields in the frames of a bundle, (B, m, N) by name.
+        """The evolving fields in the frames of a bundle, (B, m, N) by name, from their values at its start.
 
         Args:
             particles: The state that the bundle starts from.

@@ -18,13 +18,7 @@ ROUNDING = 1e-3
 
 
 class _Numbers(NamedTuple):
-    """Numbers of a state that must be finite.
-
-    Args:
-        name: What an error calls one of them, with the index into K.
-        values: (B, K, V).
-        real: (B, K) bool, False for padding.
-    """
+    """Numbers (B, K, V) of a state that must be finite where they are real (B, K), and what an error calls them."""
 
     name: str
     values: Tensor

@@ -48,10 +48,8 @@ COMPILED = "processor._orig_mod."
 class Emulator(nn.Module):
     """A learned simulator of one family of scenes.
 
-    Args:
-        recipe: Its form.
-
     Attributes:
+        runtime: Computes the network.
         thread_choice: Sets torch's number of threads for each call; None to leave it alone.
     """
 
@@ -142,7 +140,7 @@ class Emulator(nn.Module):
         return self.runtime.fixed_shapes or compiled
 
     def with_network(self, precision: torch.dtype) -> Emulator:
-        """This emulator if its network has weights of this type, else a copy with the network's weights converted.
+        """This emulator, or a copy with the network's weights converted.
 
         Raises:
             ConfigError: if the network has complex weights, as FNOs do, which have no such type.
@@ -150,10 +148,8 @@ class Emulator(nn.Module):
         if precision == self.network_precision:
             return self
         if any(weight.is_complex() for weight in self.processor.parameters()):
-            raise ConfigError(
-                f"{type(self.recipe.processor).__name__} has complex weights, which cannot be {precision}: use"
-                " torch.autocast."
-            )
+            name = type(self.recipe.processor).__name__
+            raise ConfigError(f"{name} has complex weights, which cannot be {precision}: use torch.autocast.")
         other = copy.deepcopy(self)
         other.processor.to(precision)
         return other
@@ -204,10 +200,7 @@ class Emulator(nn.Module):
         return self.rebuilt(self.recipe.over(scene))
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
-        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes.
-
-        Weights that need no gradients need none in the copy.
-        """
+        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
         with torch.random.fork_rng(devices=[]):  # the weights drawn here are replaced
             other = recipe.build().to(self.device)
         if other.network_precision != self.network_precision:
@@ -219,11 +212,7 @@ class Emulator(nn.Module):
         return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
-        """The context of a rollout from this state: solids and, if constrained, its energy.
-
-        Warns:
-            UserWarning: naming each field that the state lacks.
-        """
+        """The context of a rollout from this state; warns of fields that the state lacks."""
         self.field_scales.warn_of_missing(particles)
         solid = self.solid(particles)
         return steps_for(self, particles, solid).prepare_rollout(solid, self.budget(particles))
@@ -255,12 +244,7 @@ class Emulator(nn.Module):
         )
 
     def forward(self, particles: Particles, context: RolloutContext | None = None) -> Bundle:
-        """Predict the next m frames.
-
-        Args:
-            particles: The state to start from.
-            context: From `context` of the rollout's first state; of this state when left out.
-        """
+        """Predict the next m frames from a state; the context is that of the rollout's first state, or of this one."""
         context = self.context(particles) if context is None else context
         if self.thread_choice is None:
             return self.runtime.bundle(self, particles, context)

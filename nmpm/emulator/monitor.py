@@ -38,14 +38,9 @@ class RolloutStoppedError(NmpmError):
 
 @dataclass(frozen=True)
 class Incident:
-    """A limit passed for the first time in a rollout.
+    """A limit passed for the first time in a rollout, by the last frame of a bundle, from 1, in a scene of the batch.
 
-    Args:
-        what: "speed", "energy", "crowding" or "not finite".
-        frame: Last frame of the bundle in which it was seen, from 1.
-        scene: Index in the batch.
-        value: What was measured.
-        limit: What is allowed.
+    `what` is "speed", "energy", "crowding" or "not finite".
     """
 
     what: str

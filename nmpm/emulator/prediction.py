@@ -110,11 +110,7 @@ def _full_precision(device: str) -> AbstractContextManager[object]:
 
 @dataclass(frozen=True)
 class FusedSteps(Steps):
-    """All steps as kernels; only for what `steps_for` gives them to.
-
-    Args:
-        parameters: Of the emulator.
-    """
+    """All steps as kernels; only for what `steps_for` gives them to."""
 
     parameters: KernelParameters
 
@@ -131,21 +127,15 @@ class FusedSteps(Steps):
 
 @dataclass(frozen=True)
 class TrainingSteps(TensorSteps):
-    """The steps of trainings as kernels with gradients; only for what `steps_for` gives them to.
-
-    Args:
-        parameters: Of the emulator.
-    """
+    """The steps of trainings as kernels with gradients; only for what `steps_for` gives them to."""
 
     parameters: KernelParameters
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         from nmpm.emulator.fused.autograd import Rasterise
 
-        own = particles
-        cells, velocity, gravity, state = Rasterise.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
-            self.parameters, own.position, own.velocity, own.gravity, own.material, own.mask, solid
-        )
+        given = (particles.position, particles.velocity, particles.gravity, particles.material, particles.mask)
+        cells, velocity, gravity, state = Rasterise.apply(self.parameters, *given, solid)  # type: ignore[no-untyped-call]
         return cells, velocity, gravity, state
 
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)

@@ -26,15 +26,8 @@ def grid_state(
 ) -> Tensor:
     """The grid state in grid units, (B, C_in, *S).
 
-    Args:
-        scene: Says which channels there are.
-        grid: What to rasterise onto.
-        transfer: How to.
-        particles: Gives materials, mask, gravity and fields.
-        cells: (B, N, D) positions in cells.
-        velocity: (B, N, D) in cells per frame.
-        solid: (B, C_solid, *S).
-        scales: Of the scene's fields; needed where it has any.
+    Particles are at `cells` (B, N, D) with `velocity` (B, N, D) in cells per frame, among `solid` (B, C_solid, *S). Scenes
+    with fields need their scales.
     """
     membership = _membership(particles, len(scene.materials))
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
@@ -58,15 +51,7 @@ def _constant(values: Tensor, grid: Grid) -> Tensor:
 
 
 def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, walls: Tensor) -> Tensor:
-    """The share of each cell taken by walls and obstacles, (B, 1, *S) in [0, 1]; (B, 0, *S) where a scene has none.
-
-    Args:
-        scene: Says whether there are any.
-        grid: What to rasterise onto.
-        transfer: How to.
-        particles: Gives the obstacles.
-        walls: (*S), from `wall_fraction`.
-    """
+    """The share of each cell taken by walls (*S) and obstacles, (B, 1, *S) in [0, 1]; (B, 0, *S) in unwalled scenes."""
     batch = particles.position.shape[0]
     if not scene.walled:
         return walls.new_zeros(batch, 0, *grid.shape)
@@ -81,14 +66,9 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
 
 
 def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, volume: Tensor, cells: Tensor) -> Tensor:
-    """The share of each cell taken by particles of all kinds, (B, 1, *S); above 1 where they are crowded.
+    """The share of each cell taken by particles at `cells` (B, N, D), (B, 1, *S); above 1 where they are crowded.
 
-    Args:
-        scene: Gives the particles' volume.
-        grid: What to rasterise onto.
-        transfer: How to.
-        volume: (B, N), how much of a particle's volume each stands for: a mask, or shares in the precision of `cells`.
-        cells: (B, N, D) positions in cells.
+    `volume` (B, N) is how much of a particle's volume each stands for: a mask, or shares in the precision of `cells`.
     """
     count = transfer.p2g(volume.to(cells.dtype).unsqueeze(-1), cells, grid)
     return count * (scene.particle_volume / grid.cell_volume)

@@ -26,13 +26,12 @@ def unroll(
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
-    Once a scene's bundle ends in exactly the state that it started from, as at rest, all further ones would be the
-    same: it is repeated without a call. Only on a CPU, as comparing states elsewhere would halt the device.
+    On a CPU, scenes whose state no longer changes are repeated without a call.
 
     Args:
         emulator: Predicts m frames a call.
         particles: The state to start from.
-        bundles: How many calls to make.
+        bundles: Number of bundles.
         monitor: Measures each bundle before it is yielded.
         frames: Number of frames that are used, if not all: the monitor names none beyond.
     """
@@ -55,12 +54,7 @@ def unroll(
 
 
 class _Calls:
-    """The calls of a rollout, of the scenes that are not at rest.
-
-    Args:
-        emulator: Predicts m frames a call.
-        particles: The state to start from.
-    """
+    """The calls of a rollout, of the scenes that are not at rest."""
 
     def __init__(self, emulator: Emulator, particles: Particles) -> None:
         self._emulator, self._count = emulator, len(particles.position)
@@ -191,14 +185,9 @@ def unroll_with_gradients(
     call: Call,
     state_after: Callable[[Bundle, Particles], Particles] = Bundle.state_after,
 ) -> Iterator[Bundle]:
-    """Predict bundle after bundle, each from the last, with gradients.
+    """Predict bundle after bundle with gradients, each by a `call` such as `recomputed`.
 
-    Args:
-        emulator: Predicts m frames a call.
-        particles: The state to start from.
-        bundles: How many calls to make.
-        call: Makes one, such as `recomputed`.
-        state_after: What the next call starts from, of a bundle and of what it started from.
+    The next bundle starts from the `state_after` a bundle, of what that started from.
     """
     context = emulator.context(particles)
     for _ in range(bundles):

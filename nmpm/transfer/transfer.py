@@ -24,12 +24,7 @@ from nmpm.transfer.execution import add, chunks
 
 @dataclass(frozen=True)
 class Stencil:
-    """The nodes that each particle touches, with weights.
-
-    Args:
-        node: (B, N, J) int64, flat index of the J nodes of each particle (last axis fastest).
-        weight: (B, N, J), summing to one over J.
-    """
+    """Flat indices (B, N, J) int64 of the nodes that each particle touches, and weights (B, N, J) that sum to one."""
 
     node: Tensor
     weight: Tensor
@@ -101,15 +96,12 @@ def gather(stencil: Stencil, field: Tensor) -> Tensor:
 
 
 def tensor_product(base: Tensor, weights: list[Tensor], grid: Grid) -> Stencil:
-    """The stencil of a kernel that is a product over axes.
+    """The stencil of K ** D nodes of a kernel that is a product over axes.
 
     Args:
         base: (B, N, D) int64, lowest node touched along each axis, before folding or wrapping.
         weights: K tensors (B, N, D): the one-dimensional weights of nodes base, base + 1, … along each axis.
         grid: Gives shape and which axes wrap.
-
-    Returns:
-        A stencil of K ** D nodes.
     """
     batch, count, dim = base.shape
     node = base.new_zeros(batch, count, 1)

@@ -30,14 +30,7 @@ Box = list[tuple[int, int]]  # of blocks: first and last, exclusive, along each 
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a grid, as a network with a radius sees it.
-
-    Args:
-        cells: Number of cells.
-        periodic: Whether it wraps.
-        radius: Of the network, in cells.
-        alignment: Of the network, in cells.
-    """
+    """One axis of a grid, in cells, and radius and alignment of the network on it."""
 
     cells: int
     periodic: bool
@@ -46,7 +39,6 @@ class Axis:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks."""
         return -(-self.cells // BLOCK)
 
     @property
@@ -88,13 +80,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class GridCrop:
-    """A part of one scene's grid.
-
-    Args:
-        scene: Its index in the batch.
-        start: First cell along each axis, negative where the crop wraps.
-        shape: Cells along each axis.
-    """
+    """A part of the grid of a scene of the batch: first cell, negative where it wraps, and cells along each axis."""
 
     scene: int
     start: tuple[int, ...]
@@ -102,7 +88,6 @@ class GridCrop:
 
     @property
     def cells(self) -> int:
-        """Number of cells."""
         return math.prod(self.shape)
 
     def take(self, grid: Tensor, axes: Sequence[Axis]) -> Tensor:
@@ -130,11 +115,7 @@ class GridCrop:
 def cover_blocks(blocks: Blocks, axes: Sequence[Axis], scene: int, most: int) -> list[GridCrop]:
     """Crops in which the marked blocks (*blocks) of a scene may be read: boxes are cut while that makes them cheaper.
 
-    Args:
-        blocks: True where particles may be.
-        axes: Of the grid.
-        scene: Its index in the batch.
-        most: Cells of a crop at most; but boxes narrower than the halo are not cut for that, as it would cost more.
+    A crop has at most so many cells; but boxes narrower than the halo are not cut for that, as it would cost more.
     """
     spans = [
         [axis.span(*ends) for axis, ends in zip(axes, box, strict=True)]
@@ -195,14 +176,9 @@ def _lengths(marks: Blocks, origin: int, axis: Axis) -> Any:
 def predict_on_crops(
     network: Callable[[Tensor], Tensor], grid: Tensor, crops: Sequence[GridCrop], axes: Sequence[Axis], most: int
 ) -> Tensor:
-    """A network's output (B, m, C_out, *S) on crops, NaN in all other cells.
+    """A network's output (B, m, C_out, *S) on at least one crop of a grid (B, C_in, *S), NaN in all other cells.
 
-    Args:
-        network: Maps (B, C_in, *S) to (B, m, C_out, *S).
-        grid: (B, C_in, *S).
-        crops: Parts of it, at least one.
-        axes: Of the grid.
-        most: Cells that the network computes at once at most; a crop may have more.
+    The network computes `most` cells at once, or one crop.
     """
     parts: list[tuple[GridCrop, Tensor]] = []
     for batch in _equal_shapes(crops, most):

@@ -38,12 +38,7 @@ class Runtime(ABC):
 
     @abstractmethod
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
-        """The network's output (B, m, C_out, *S) for a normalised grid state (B, C_in, *S).
-
-        Args:
-            network: Holds the weights.
-            grid: Float32, or float64 in an emulator of that type.
-            precision: In which the network is to compute.
+        """The network's output (B, m, C_out, *S), in a precision, for a normalised grid state (B, C_in, *S).
 
         Raises:
             ConfigError: if this runtime cannot run the network, or gradients are asked for that it does not have.
