@@ -1,6 +1,7 @@
 """Crowding: particles of overfull cells spread into the free volume around them, so that material keeps its volume.
 
-φ is the volume fraction of all particles, linearly rasterised, s the solid fraction, and 1 - s a cell's free volume. A pressure ψ on the nodes solves, approximately, the linear complementarity problem
+φ is the volume fraction of all particles, linearly rasterised, s the solid fraction, and 1 - s a cell's free volume.
+A pressure ψ on the nodes solves, approximately, the linear complementarity problem
 
     ψ >= 0,    φ / cap + Δψ <= 1 - s,    equality where ψ > 0,
 

@@ -26,8 +26,8 @@ def grid_state(
 ) -> Tensor:
     """The grid state in grid units, (B, C_in, *S).
 
-    Particles are at `cells` (B, N, D) with `velocity` (B, N, D) in cells per frame, among `solid` (B, C_solid, *S). Scenes
-    with fields need their scales.
+    Particles are at `cells` (B, N, D) with `velocity` (B, N, D) in cells per frame, among `solid` (B, C_solid, *S).
+    Scenes with fields need their scales.
     """
     membership = _membership(particles, len(scene.materials))
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
