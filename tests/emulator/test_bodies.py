@@ -81,14 +81,6 @@ def test_the_cells_hold_the_area_of_a_body(make, parameters):
     assert area == pytest.approx(areas[type(body).__name__], rel=0.02)
 
 
-def test_bodies_that_overlap_are_solid_once():
-    model = emulator()
-    left, right = Ramp((0.45, 0.5), 0.2, 0.1, 0.0), Ramp((0.5, 0.5), 0.2, 0.1, 0.0)
-    torch.testing.assert_close(
-        obstacle_field(model, left, right), obstacle_field(model, Ramp((0.475, 0.5), 0.25, 0.1, 0.0))
-    )
-
-
 @every_family
 def test_gradients_of_every_parameter_are_those_of_finite_differences(make, parameters):
     """Through p2g, the network and several bundles, without the constraints, which have kinks."""

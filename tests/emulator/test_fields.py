@@ -7,10 +7,10 @@ import torch
 from scenes import box, cloud
 
 from nmpm.decoders import Residual
-from nmpm.emulator import EmulatorRecipe, predict_rollout, rollout, unroll
+from nmpm.emulator import EmulatorRecipe, predict_rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.rasterise import grid_state
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
 from nmpm.scene import Scene
@@ -111,17 +111,6 @@ def test_padded_particles_change_no_field_to_the_bit(filler):
     assert torch.equal(one.fields["temperature"], other.fields["temperature"][..., :20])
 
 
-def test_a_rollout_goes_on_from_any_bundle_to_the_bit():
-    scene = box(**ALL)
-    emulator, particles = small(scene), with_fields(cloud(scene))
-    whole = predict_rollout(emulator, particles, 6)
-    with torch.no_grad():
-        first = next(unroll(emulator, particles, 1))
-    rest = predict_rollout(emulator, first.state_after(particles), 3)
-    assert torch.equal(whole.fields["temperature"][:, 3:], rest.fields["temperature"])
-    assert torch.equal(whole.position, rollout(emulator, particles, 6))
-
-
 def test_a_missing_field_has_its_training_mean_and_is_named():
     scene = box(**ALL)
     emulator, particles = small(scene), with_fields(cloud(scene))
@@ -137,13 +126,6 @@ def test_a_missing_field_has_its_training_mean_and_is_named():
     expected = predict_rollout(emulator, particles.with_fields(means), 5)
     torch.testing.assert_close(found.position, expected.position)
     torch.testing.assert_close(found.fields["temperature"], expected.fields["temperature"])
-
-
-def test_one_number_per_scene_is_not_taken_from_particles():
-    scene = box(**ALL)
-    particles = with_fields(cloud(scene)).with_fields({"friction": torch.zeros(1, 30)})
-    with pytest.raises(DataError, match="one friction for each trajectory"):
-        small(scene)(particles)
 
 
 def test_calibration_measures_fields_over_real_particles_and_scenes():

@@ -49,14 +49,6 @@ def test_gradients_of_the_state_are_those_of_finite_differences(name):
     )
 
 
-def test_gradients_of_a_ramps_angle_are_those_of_finite_differences():
-    model = emulator(solids=False)
-    angle = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda given: loss(model, state(given)), angle, eps=1e-7, atol=1e-6)
-    loss(model, state(angle)).backward()
-    assert angle.grad.abs() > 1e-9
-
-
 @pytest.mark.parametrize("constraints", [{}, {"density_cap": 0.5, "energy": True, "rest_speed": 0.01}])
 def test_gradients_of_an_obstacle_alone_are_not_lost_to_the_kernels(constraints):
     """In float32, where rollouts without gradients take fused kernels."""
@@ -72,28 +64,6 @@ def test_gradients_of_an_obstacle_alone_are_not_lost_to_the_kernels(constraints)
     alone = derivative(False)
     assert alone.abs() > 1e-9
     torch.testing.assert_close(alone, derivative(True), rtol=1e-4, atol=1e-9)
-
-
-def test_what_a_bundle_keeps_is_recomputed():
-    """The graph holds states, not activations: its tensors do not grow with the network's width."""
-
-    def kept(width: int) -> int:
-        torch.manual_seed(0)
-        recipe = EmulatorRecipe(box(), 16, frames=2, processor=UNet(width, 1))
-        model, total = recipe.build().eval().requires_grad_(False), 0
-
-        def pack(tensor: torch.Tensor) -> torch.Tensor:
-            nonlocal total
-            total += tensor.numel()
-            return tensor
-
-        particles = cloud(box())
-        particles = dataclasses.replace(particles, position=particles.position.requires_grad_())
-        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-            differentiable_rollout(model, particles, 8)
-        return total
-
-    assert kept(4) == kept(16)
 
 
 def test_states_are_checked():

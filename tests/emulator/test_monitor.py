@@ -1,4 +1,3 @@
-import dataclasses
 import warnings
 
 import pytest
@@ -9,10 +8,8 @@ from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Flip
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.input_checks import check_inputs
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
 from nmpm.emulator.rollouts import rollout, stream
-from nmpm.errors import DataError
 from nmpm.processors import Pointwise
 
 
@@ -78,59 +75,6 @@ class TestReadLate:
         assert late.at_walls == early.at_walls
         assert late.report() == early.report()
         assert late.incidents[0].frame < 4 * 16
-
-    def test_stop_comes_at_the_next_reading_and_names_the_frame(self):
-        scene = box()
-        emulator, particles = emulator_of(scene, 1e-6), cloud(scene, speed=0.0)
-        monitor, yielded = Monitor(Policy.STOP, speed=0.05), []
-        with pytest.raises(RolloutStoppedError, match=r"speed 0\.\d+ .* by frame 4"):
-            yielded.extend(stream(emulator, particles, 100, monitor))
-        assert len(yielded) == 15
-        assert monitor.incidents[0].frame < 64
-
-    def test_padding_is_not_watched(self):
-        scene = box()
-        particles = cloud(scene)
-        mask = particles.mask.clone()
-        mask[:, 0] = False
-        fast = particles.velocity.clone()
-        fast[:, 0] = 1.0
-        state = dataclasses.replace(particles, velocity=fast, mask=mask)
-        monitor = Monitor(Policy.STOP)
-        rollout(emulator_of(scene, 1e-6), state, 4, monitor)
-        assert monitor.peaks["speed"] < 1
-
-
-def test_inputs_are_checked_in_one_reading(monkeypatch):
-    scene = box()
-    emulator, particles = emulator_of(scene, 1e-6), cloud(scene)
-    read, to_bool = [], torch.Tensor.__bool__
-    monkeypatch.setattr(torch.Tensor, "__bool__", lambda values: read.append(values) or to_bool(values))
-    check_inputs(emulator, particles)
-    assert len(read) == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "place", "value", "message"),
-    [
-        ("gravity", (1, 1), float("nan"), r"Scene 1 of the batch, its gravity is \[.*nan\]; it must be finite"),
-        ("gravity", (0, 0), -float("inf"), "Scene 0 of the batch, its gravity"),
-        ("obstacle", (1, 4), float("nan"), r"Scene 1 of the batch, obstacle particle 4: its position is \[nan"),
-        ("material", (0, 7), 2, r"particle 7: its material is 2; .* the model's 2 \(water, sand\)"),
-        ("material", (1, 7), -1, "Scene 1 of the batch, particle 7: its material is -1"),
-    ],
-)
-def test_a_state_that_cannot_be_is_named_unless_it_is_padding(name, place, value, message):
-    scene = box(materials=("water", "sand"), obstacles=True)
-    particles = cloud(scene, batch=2, statics=6)
-    particles = dataclasses.replace(particles, gravity=particles.gravity.clone())
-    emulator = emulator_of(scene, 1e-6)
-    getattr(particles, name)[place] = value
-    with pytest.raises(DataError, match=message):
-        check_inputs(emulator, particles)
-    if name != "gravity":
-        (particles.mask if name == "material" else particles.obstacle_mask)[place] = False
-        check_inputs(emulator, particles)
 
 
 class TestBounds:

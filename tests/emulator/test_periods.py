@@ -10,7 +10,7 @@ from nmpm.decoders import Flip, Residual
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import Monitor, Policy
-from nmpm.emulator.rollouts import differentiable_rollout, rollout
+from nmpm.emulator.rollouts import rollout
 from nmpm.processors import Identity, Pointwise
 
 PERIOD = 0.8
@@ -53,24 +53,6 @@ def test_trajectories_are_unwrapped():
     assert expected[:, -1].max() > 20 * PERIOD
     torch.testing.assert_close(predicted, expected, rtol=1e-4, atol=1e-4)
     assert (predicted[..., 0].diff(dim=1) > 0).all()
-
-
-def test_within_the_domain_a_rollout_is_that_of_calls_to_the_bit():
-    emulator, state = emulator_of(scale=0.1), cloud(STILL)
-    predicted = rollout(emulator, state, 8)
-    first = emulator(state)
-    second = emulator(first.state_after(state))
-    assert torch.equal(predicted, torch.cat([first.position, second.position], dim=1))
-
-
-def test_gradients_are_those_of_the_same_rollout():
-    emulator, start = emulator_of(scale=0.1), drifting(0.2)
-    position = start.position.clone().requires_grad_()
-    predicted = differentiable_rollout(emulator, start.with_motion(position, start.velocity), 16)
-    torch.testing.assert_close(predicted, rollout(emulator, start, 16), rtol=1e-4, atol=1e-4)
-    predicted[:, -1, :, 0].sum().backward()
-    assert position.grad is not None
-    assert position.grad[..., 0].mean().item() == pytest.approx(1.0, abs=0.5)
 
 
 @pytest.mark.parametrize("varies", [False, True])

@@ -33,6 +33,8 @@ def test_a_runtime_is_found_by_name_and_another_is_refused_with_the_known_ones()
     assert list(RUNTIMES)[-1] == "eager"
     with pytest.raises(ConfigError, match=r"No runtime is called 'openvin'.*cuda-graph.*Did you mean openvino\?"):
         emulator_of().with_runtime("openvin")
+    with pytest.raises(ConfigError, match="needs a CUDA GPU; the model is on cpu"):
+        emulator_of().with_runtime("cuda-graph")
 
 
 def test_torch_in_bfloat16_without_instructions_for_it_warns(monkeypatch):
@@ -42,11 +44,6 @@ def test_torch_in_bfloat16_without_instructions_for_it_warns(monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         emulator_of()(cloud(box()))
-
-
-def test_cuda_graphs_need_a_gpu():
-    with pytest.raises(ConfigError, match="needs a CUDA GPU; the model is on cpu"):
-        emulator_of().with_runtime("cuda-graph")
 
 
 # ---- programs
@@ -76,15 +73,6 @@ def test_changed_weights_are_compiled_again(change):
     assert after is not before
     assert all(torch.equal(own, weight) for own, weight in zip(after, network.parameters(), strict=True))
     assert find(programs, network) is after
-
-
-def test_programs_used_last_are_kept():
-    programs, network = Programs(), torch.nn.Linear(2, 2)
-    made = [find(programs, network, settings) for settings in range(8)]
-    assert find(programs, network, 0) is made[0]
-    find(programs, network, 8)
-    assert find(programs, network, 0) is made[0]
-    assert find(programs, network, 1) is not made[1]
 
 
 # ---- CUDA graphs

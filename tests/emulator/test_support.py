@@ -47,13 +47,6 @@ def heights(position: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_heap_on_the_floor_stays_to_the_bit(dim):
-    heap = block(0.1, 0.2, dim)
-    predicted = rollout(emulator_of(box(dim)), heap, 16)
-    torch.testing.assert_close(predicted, heap.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
 def test_a_drop_under_the_ceiling_comes_down_as_fast_as_from_rest_in_each_bundle(dim):
     scene, drop = box(dim), block(0.86, 0.9, dim)
     predicted = rollout(emulator_of(scene), drop, 8)
@@ -74,17 +67,6 @@ def test_what_lies_on_an_obstacle_stays_and_what_hangs_below_it_falls(solids):
     fallen = heights(state.position - predicted[:, -1])[0]
     assert (fallen[: len(above)].abs() < 1e-6).all()
     assert (fallen[len(above) :] > 1e-4).all()
-
-
-@pytest.mark.slow
-def test_what_falls_stops_at_an_obstacle():
-    scene = box(obstacles=True, gravity=(0.0, -98.1))
-    beam = lattice(((0.3, 0.7), (0.3, 0.4)), SPACING)
-    state = state_at_rest(scene, lattice(((0.4, 0.6), (0.8, 0.84)), 2 * SPACING), beam)
-    predicted = rollout(emulator_of(scene), state, 480)
-    assert torch.equal(predicted[:, -1], predicted[:, -2])
-    assert heights(predicted[:, -1]).min() > 0.4 - 0.5 * WIDTH
-    assert heights(predicted[:, -1]).max() < 0.4 + (REACH + 2) * WIDTH
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 """The network on windows gives what it gives on the whole grid, to rounding, wherever particles read it."""
 
-import copy
 import dataclasses
-import pickle
 from contextlib import nullcontext
 
 import numpy as np
@@ -72,14 +70,6 @@ def test_a_network_on_crops_gives_its_output_in_all_marked_blocks(processor, sha
         cells = [slice(i * BLOCK, (i + 1) * BLOCK) for i in place[1:]]
         assert read[(place[0], *cells)].all()
     assert (parts - whole).abs().nan_to_num(0).max() < 1e-5
-
-
-def test_two_distant_drops_get_a_crop_each():
-    axes = [Axis(256, False, 9, 2)] * 2
-    blocks = np.zeros((64, 64), np.bool_)
-    blocks[4:8, 4:8] = blocks[56:60, 50:54] = True
-    one, other = cover_blocks(blocks, axes, 0, 10**9)
-    assert one.cells == other.cells < 64**2
 
 
 def emulator_of(scene, cells=96, processor=SMALL, scale=0.1, frames=4, **parts) -> Emulator:
@@ -172,11 +162,6 @@ def test_what_windows_cannot_do_is_refused():
         emulator_of(scene).requires_grad_(True).with_runtime("windows")(drops(scene))
 
 
-def test_copies_keep_the_limit():
-    for copied in (copy.deepcopy(Windows(5)), pickle.loads(pickle.dumps(Windows(5)))):  # noqa: S301
-        assert vars(copied) == vars(Windows(5))
-
-
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["position", "velocity"])
 def test_non_finite_values_stay_visible(bad, name):
@@ -184,7 +169,3 @@ def test_non_finite_values_stay_visible(bad, name):
     getattr(particles, name)[0, 3, 0] = bad
     parts, whole = (e(particles).velocity.isfinite() for e in (emulator.with_runtime("windows"), emulator))
     assert torch.equal(parts[0, 3], whole[0, 3])
-
-
-def test_scenes_without_particles():
-    assert rollout(emulator_of(box()).with_runtime("windows"), cloud(box(), 0), 5).shape == (1, 5, 0, 2)
