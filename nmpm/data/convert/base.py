@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import abc
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from nmpm.data.families import STATIC_NAMES
 from nmpm.data.format import SPLITS, Metadata, Trajectory
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval
 
 UNKNOWN_LENGTH = 0
@@ -119,11 +121,90 @@ class DatasetFormat(abc.ABC):
         """
 
 
-def split_name(stem: str) -> str | None:
-    """The split that a file's name begins with, or None: "test_sub" means test."""
-    return next((split for split in SPLITS if stem.lower().startswith(split)), None)
+class FileFormat(DatasetFormat):
+    """Abstract reader of a format whose trajectories lie in files of one kind, one subclass per format.
+
+    The files of the splits are in folders called train, valid and test, or have names that begin so; other files, and a
+    file alone, are the test split.
+    """
+
+    pattern: ClassVar[str]
+    """Of the files' names."""
+    family: ClassVar[str] = "deepmind"
+    """Meaning of the type ids where the user names no family."""
+    assumed: ClassVar[frozenset[str]] = frozenset()
+    """Fields of the metadata that the files do not state."""
+
+    @abc.abstractmethod
+    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+        """Facts about the dataset, before the user's corrections, and notes, from its first file.
+
+        Raises:
+            DataError: as `open`.
+        """
+
+    @abc.abstractmethod
+    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:
+        """Yields the trajectories of a file.
+
+        Raises:
+            DataError: naming the file, if it is damaged.
+        """
+
+    def count(self, file: Path) -> int | None:  # noqa: ARG002 (for subclasses)
+        """Number of trajectories in a file; None where only reading them all would tell."""
+        return 1
+
+    def recognises(self, path: Path) -> bool:
+        return bool(split_files(path, self.pattern))
+
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        files = split_files(path, self.pattern)
+        if not files:
+            raise DataError(f"{path}: no file {self.pattern} there.")
+        stated, notes = self.metadata(next(iter(files.values()))[0], options)
+        metadata = options.apply_to(stated)
+        counts = {split: [self.count(file) for file in paths] for split, paths in files.items()}
+        alone = {split: paths[0] for split, paths in files.items() if len(paths) == 1}
+        named = (
+            f"{file.name} becomes the {split} split."
+            for split, file in alone.items()
+            if split not in (file.stem, file.parent.name)
+        )
+        return ForeignDataset(
+            metadata=metadata,
+            splits={
+                split: Rereadable(partial(self._read_all, paths, metadata, options)) for split, paths in files.items()
+            },
+            notes=(f"Particle types have the meaning of the {options.family or self.family} family.", *notes, *named),
+            counts={
+                split: None if None in numbers else sum(n or 0 for n in numbers) for split, numbers in counts.items()
+            },
+            assumed=self.assumed,
+        )
+
+    def _read_all(self, files: tuple[Path, ...], metadata: Metadata, options: Options) -> Iterator[Trajectory]:
+        for file in files:
+            yield from self.read(file, metadata, options)
 
 
-def family_note(family: str) -> str:
-    """The note that says how type ids are read."""
-    return f"Particle types have the meaning of the {family} family."
+def split_files(path: Path, pattern: str) -> dict[str, tuple[Path, ...]]:
+    """The files of each split, ordered by the numbers in their names; see `FileFormat`."""
+    if path.is_file():
+        return {split_name(path.name) or "test": (path,)} if path.match(pattern) else {}
+    files = {split: list((path / split).glob(pattern)) for split in SPLITS}
+    if not any(files.values()):
+        beside = list(path.glob(pattern))
+        files = {split: [file for file in beside if split_name(file.name) == split] for split in SPLITS}
+        if not any(files.values()):
+            files = {split_name(path.name) or "test": beside}
+    return {split: tuple(sorted(paths, key=_numbers)) for split, paths in files.items() if paths}
+
+
+def split_name(name: str) -> str | None:
+    """The split that a file's name begins with, or None: "test_sub.npz" means test."""
+    return next((split for split in SPLITS if name.lower().startswith(split)), None)
+
+
+def _numbers(path: Path) -> tuple[list[int], str]:
+    return [int(digits) for digits in re.findall(r"\d{1,18}", path.name)], path.name

@@ -8,66 +8,33 @@ string), in some datasets with further lists such as `step_context` or `force`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, family_note, split_name
+from nmpm.data.convert.base import FileFormat, Options
 from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
-from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
+from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError
 
-_SUFFIX = ".tfrecord"
 
-
-class DeepMind(DatasetFormat):
-    """A folder of TFRecord files with a `metadata.json`, or one such file beside it."""
+class DeepMind(FileFormat):
+    """TFRecord files with a `metadata.json` beside them."""
 
     name: ClassVar[str] = "deepmind"
     summary: ClassVar[str] = "DeepMind's TFRecord files with metadata.json (Learning to Simulate)"
+    pattern: ClassVar[str] = "*.tfrecord"
 
-    def recognises(self, path: Path) -> bool:
-        return any(path.glob(f"*{_SUFFIX}")) if path.is_dir() else path.suffix == _SUFFIX and path.is_file()
+    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+        return read_metadata(file.parent, options.family or self.family), ()
 
-    def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = _files(path)
-        if not files:
-            raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
-        family = options.family or "deepmind"
-        folder = next(iter(files.values())).parent
-        metadata = options.apply_to(read_metadata(folder, family))
-        offsets = {split: record_offsets(file) for split, file in files.items()}
-        for split, file in files.items():
-            if not offsets[split]:
-                raise DataError(f"{file}: the file has no record.")
-        renamed = [f"{file.name} becomes the {split} split." for split, file in files.items() if file.stem != split]
-        return ForeignDataset(
-            metadata=metadata,
-            splits={s: Rereadable(partial(_trajectories, files[s], tuple(offsets[s]), metadata.dim)) for s in files},
-            notes=(family_note(family), *renamed),
-            counts={split: len(starts) for split, starts in offsets.items()},
-        )
+    def count(self, file: Path) -> int:
+        return len(record_offsets(file))
 
-
-def _files(path: Path) -> dict[str, Path]:
-    """The TFRecord of each split."""
-    files = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path] * (path.suffix == _SUFFIX and path.is_file())
-    by_split = {split: [file for file in files if split_name(file.stem) == split] for split in SPLITS}
-    for split, same in by_split.items():
-        if len(same) > 1:
-            raise DataError(
-                f"{path}: {', '.join(f.name for f in same)} all belong to the split {split}; give one of the files."
-            )
-    if len(files) == 1 and not any(by_split.values()):
-        by_split["test"] = files
-    return {split: same[0] for split, same in by_split.items() if same}
-
-
-def _trajectories(path: Path, offsets: tuple[int, ...], dim: int) -> Iterator[Trajectory]:
-    for index, offset in enumerate(offsets):
-        yield _trajectory(read_record(path, offset, index), dim, f"{path}: record {index}")
+    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+        for index, offset in enumerate(record_offsets(file)):
+            yield _trajectory(read_record(file, offset, index), metadata.dim, f"{file}: record {index}")
 
 
 def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,12 +17,11 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable, split_name
+from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
 from nmpm.data.families import find_family
-from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import ConfigError, DataError, NmpmError
 
-_SUFFIX = ".msgpack.zst"
 _FLUID, _WALL = 0, 1
 _DT, _GRAVITY = 0.02, -9.81
 _FRAME_BYTES = 2**27
@@ -31,42 +29,41 @@ _ITEMS = 256  # of a list or map
 _KIND = re.compile(rb"[<>|=]?[biuf]\d{1,2}")
 
 
-class Dmcf(DatasetFormat):
-    """One file, a folder of files, or folders train, valid and test with files."""
+class Dmcf(FileFormat):
+    """A file per trajectory; particle type 0 is the fluid, type 1 the solid boundary."""
 
     name: ClassVar[str] = "dmcf"
     summary: ClassVar[str] = "DMCF's *.msgpack.zst files (needs the extra: pip install nmpm[convert])"
+    pattern: ClassVar[str] = "*.msgpack.zst"
+    family: ClassVar[str] = "lagrangebench"
+    assumed: ClassVar[frozenset[str]] = frozenset({"dt", "gravity"})
 
-    def recognises(self, path: Path) -> bool:
-        return bool(_files(path))
-
-    def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = _files(path)
-        if not files:
-            raise DataError(f"{path}: no *{_SUFFIX} file there.")
-        family = options.family or "lagrangebench"
-        sample = next(iter(files.values()))[0]
-        first = next(_frames(sample), {})
-        return ForeignDataset(
-            metadata=options.apply_to(_metadata(first, find_family(family).types, options, sample)),
-            splits={split: Rereadable(partial(_trajectories, paths)) for split, paths in files.items()},
-            notes=(
-                f"The fluid becomes particle type {_FLUID}, the solid boundary type {_WALL} ({family} family).",
-                *(() if options.dt else (f"The files do not state dt; {_DT:g} s is assumed (--dt).",)),
-                *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
-            ),
-            counts={split: len(paths) for split, paths in files.items()},
-            assumed=frozenset({"dt", "gravity"}),
+    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+        first = next(_frames(file), {})
+        position = _array(first, "pos", f"{file}, frame 0")
+        dim = position.shape[1]
+        everything = np.concatenate([position, _wall(first, dim, file)])
+        metadata = Metadata(
+            bounds=tuple(zip(everything.min(0).tolist(), everything.max(0).tolist(), strict=True)),
+            dt=_DT,
+            dim=dim,
+            sequence_length=UNKNOWN_LENGTH,
+            particle_types=dict(find_family(options.family or self.family).types),
+            static_types=frozenset({_WALL}),
+            gravity=tuple(_GRAVITY if axis == 1 else 0.0 for axis in range(dim)),
         )
+        notes = (
+            f"The fluid becomes particle type {_FLUID}, the solid boundary type {_WALL}.",
+            *(() if options.dt else (f"The files do not state dt; {_DT:g} s is assumed (--dt).",)),
+            *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
+        )
+        return metadata, notes
 
-
-def _files(path: Path) -> dict[str, tuple[Path, ...]]:
-    if path.is_file():
-        return {split_name(path.name) or "test": (path,)} if path.name.endswith(_SUFFIX) else {}
-    folders = {split: sorted((path / split).glob(f"*{_SUFFIX}")) for split in SPLITS}
-    if not any(folders.values()):
-        folders = {"test": sorted(path.glob(f"*{_SUFFIX}"))}
-    return {split: tuple(paths) for split, paths in folders.items() if paths}
+    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+        frames = list(_frames(file))
+        if not frames:
+            raise DataError(f"{file}: the file has no frame.")
+        yield _trajectory(frames, file)
 
 
 def _frames(path: Path) -> Iterator[dict[str, Any]]:
@@ -114,22 +111,6 @@ def _value(value: Any, where: str) -> Any:
         raise DataError(f"{where}: not an array as msgpack-numpy writes it ({one_line(error, 100)}).") from error
 
 
-def _metadata(first: dict[str, Any], types: Any, options: Options, path: Path) -> Metadata:
-    position = _array(first, "pos", f"{path}, frame 0")
-    dim = position.shape[1]
-    everything = np.concatenate([position, _wall(first, dim, path)])
-    bounds = tuple((float(low), float(high)) for low, high in zip(everything.min(0), everything.max(0), strict=True))
-    return Metadata(
-        bounds=bounds,
-        dt=options.dt or _DT,
-        dim=dim,
-        sequence_length=UNKNOWN_LENGTH,
-        particle_types=dict(types),
-        static_types=frozenset({_WALL}),
-        gravity=tuple(_GRAVITY if axis == 1 else 0.0 for axis in range(dim)),
-    )
-
-
 def _array(frame: dict[str, Any], name: str, where: str) -> np.ndarray:
     array = frame.get(name)
     if not isinstance(array, np.ndarray) or array.ndim != 2 or 0 in array.shape or array.dtype.kind != "f":
@@ -145,14 +126,6 @@ def _wall(first: dict[str, Any], dim: int, path: Path) -> np.ndarray:
     if wall.shape[1] != dim:
         raise DataError(f"{path}: 'box' has {wall.shape[1]} axes, 'pos' has {dim}.")
     return wall
-
-
-def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
-    for path in files:
-        frames = list(_frames(path))
-        if not frames:
-            raise DataError(f"{path}: the file has no frame.")
-        yield _trajectory(frames, path)
 
 
 def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:

@@ -11,7 +11,6 @@ import math
 import re
 import zipfile
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,43 +18,37 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, family_note, split_name
+from nmpm.data.convert.base import FileFormat, Options
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
-from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata
+from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError, NmpmError
 
-_SUFFIX = ".npz"
 _ALL = "gns_data"
 
 
-class GnsNpz(DatasetFormat):
-    """A folder of train.npz, valid.npz, test.npz with a `metadata.json`, or one such file beside it."""
+class GnsNpz(FileFormat):
+    """NumPy files with a `metadata.json` beside them."""
 
     name: ClassVar[str] = "gns-npz"
     summary: ClassVar[str] = "NumPy files of geoelements/gns with metadata.json"
+    pattern: ClassVar[str] = "*.npz"
 
     def recognises(self, path: Path) -> bool:
-        return bool(_files(path)) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
+        return super().recognises(path) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
 
-    def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = {split_name(file.stem) or "test": file for file in reversed(_files(path))}
-        if not files:
-            raise DataError(f"{path}: no train{_SUFFIX}, valid{_SUFFIX} or test{_SUFFIX} there.")
-        family = options.family or "deepmind"
-        metadata = options.apply_to(read_metadata(next(iter(files.values())).parent, family))
-        members = {split: _members(files[split]) for split in SPLITS if split in files}
-        return ForeignDataset(
-            metadata=metadata,
-            splits={split: Rereadable(partial(_trajectories, files[split], names)) for split, names in members.items()},
-            notes=(family_note(family),),
-            counts={split: None if names == (_ALL,) else len(names) for split, names in members.items()},
-        )
+    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+        return read_metadata(file.parent, options.family or self.family), ()
 
+    def count(self, file: Path) -> int | None:
+        names = _members(file)
+        return None if names == (_ALL,) else len(names)
 
-def _files(path: Path) -> list[Path]:
-    if path.is_dir():
-        return [file for split in SPLITS if (file := path / f"{split}{_SUFFIX}").exists()]
-    return [path] if path.suffix == _SUFFIX and path.is_file() else []
+    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+        for name in _members(file):
+            where = f"{file}: {one_line(name, 60)}"
+            content = _array(file, name, where)
+            for row in content if name == _ALL else [content]:
+                yield _trajectory(row, where)
 
 
 def _members(path: Path) -> tuple[str, ...]:
@@ -65,7 +58,7 @@ def _members(path: Path) -> tuple[str, ...]:
         with zipfile.ZipFile(path) as file:
             items = [item for item in file.infolist() if item.filename.endswith(".npy")]
     except NPZ_ERRORS as error:
-        raise DataError(f"{path}: cannot be read as {_SUFFIX} ({error}). Copy or download it again.") from error
+        raise DataError(f"{path}: cannot be read as .npz ({error}). Copy or download it again.") from error
     if not items:
         raise DataError(f"{path}: the file has no array.")
     unpacked = sum(item.file_size for item in items)
@@ -73,14 +66,6 @@ def _members(path: Path) -> tuple[str, ...]:
         raise DataError(f"{path}: unpacks to {unpacked:,} bytes, more than {EXPANSION} times its size.")
     names = [item.filename.removesuffix(".npy") for item in items]
     return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d{1,18}", name)]))
-
-
-def _trajectories(path: Path, names: tuple[str, ...]) -> Iterator[Trajectory]:
-    for name in names:
-        where = f"{path}: {one_line(name, 60)}"
-        content = _array(path, name, where)
-        for row in content if name == _ALL else [content]:
-            yield _trajectory(row, where)
 
 
 def _array(path: Path, name: str, where: str) -> Any:

@@ -7,19 +7,17 @@ the time between frames nor the walls: for the published datasets (Rochman-Shara
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import h5py
 import numpy as np
 
-from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, Rereadable
+from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
 from nmpm.data.families import find_family
-from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.data.statistics import first_moving_particle
 from nmpm.errors import DataError
@@ -53,102 +51,65 @@ _PUBLISHED = {
 }
 
 
-class NeuralMpm(DatasetFormat):
+class NeuralMpm(FileFormat):
     """A folder with folders train, valid and test of `sim_*.h5` files, or one of these."""
 
     name: ClassVar[str] = "neuralmpm"
     summary: ClassVar[str] = "NeuralMPM's folders of sim_*.h5 files, also from the hub's iSach/NeuralMPM"
+    pattern: ClassVar[str] = "sim_*.h5"
 
-    def recognises(self, path: Path) -> bool:
-        return bool(_files(path))
-
-    def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = _files(path)
-        if not files:
-            raise DataError(f"{path}: no train, valid or test folder with sim_*.h5 files there.")
-        published = _PUBLISHED.get(path.resolve().name.lower())
-        first = next(_trajectories(next(iter(files.values()))[:1], published.material if published else None))
-        metadata = options.apply_to(_metadata(path, published, first, options))
-        material = published.material if published else _only_material(options, path, files)
-        family = options.family or "deepmind"
-        return ForeignDataset(
-            metadata=metadata,
-            splits={split: Rereadable(partial(_trajectories, paths, material)) for split, paths in files.items()},
-            notes=(*_notes(path, published, first, metadata), f"Particle types have the ids of the {family} family."),
-            counts={split: len(paths) for split, paths in files.items()},
+    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+        folder, published = file.resolve().parent.parent, _published(file)
+        first = _trajectory(_content(file), published.material if published else None, file)
+        if published is None and options.dt is None:
+            raise DataError(
+                f"{folder}: the files do not state the time between frames, and no published dataset is called"
+                f" {folder.name!r} ({', '.join(_PUBLISHED)}). Give --dt, and --gravity and --bounds if you know them."
+            )
+        dim, low, high = first.position.shape[2], first.position.min(axis=(0, 1)), first.position.max(axis=(0, 1))
+        fits = published is not None and len(published.domain) == dim
+        metadata = Metadata(
+            bounds=published.domain if published and fits else tuple(zip(low.tolist(), high.tolist(), strict=True)),
+            dt=published.dt if published else options.dt or 1.0,
+            dim=dim,
+            sequence_length=UNKNOWN_LENGTH,
+            particle_types=dict(find_family(options.family or self.family).types),
+            static_types=frozenset({_BOUNDARY}),
+            gravity=published.gravity if published and fits else None,
         )
+        stated = options.apply_to(metadata)
+        notes = [
+            f"Recognised as the published {folder.name}: dt {stated.dt:g}, bounds {stated.bounds}, gravity"
+            f" {stated.gravity or 'as stated in each file'}."
+            if published
+            else "Bounds are the extent of the first trajectory; give --bounds if you know them."
+        ]
+        if first_moving_particle(first.position, first.particle_type == _BOUNDARY, stated.bounds) is not None:
+            notes.append("The boundary moves in the first trajectory.")
+        if _GRAVITY in first.fields:
+            notes.append("`grav` is kept as a field, and used as gravity in length/s² where it has D numbers.")
+        return metadata, tuple(notes)
+
+    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+        published, content = _published(file), _content(file)
+        material = published.material if published else None
+        if published is None and "types" not in content:
+            stated = [i for i in options.types or {} if i != _BOUNDARY]
+            if len(stated) != 1:
+                raise DataError(f"{file}: it does not state the particles' material. State it: --types 5=water.")
+            material = stated[0]
+        yield _trajectory(content, material, file)
 
 
-def _files(path: Path) -> dict[str, tuple[Path, ...]]:
-    """The files of each split, ordered by the numbers in their names."""
-    folders = {split: path / split for split in SPLITS}
-    if path.is_dir() and path.name in SPLITS and any(path.glob("sim_*.h5")):
-        folders = {path.name: path}
-    paths = {split: sorted(folder.glob("sim_*.h5"), key=_number) for split, folder in folders.items()}
-    return {split: tuple(files) for split, files in paths.items() if files}
+def _published(file: Path) -> _Published | None:
+    """The published dataset whose name the folder around the splits has."""
+    return _PUBLISHED.get(file.resolve().parent.parent.name.lower())
 
 
-def _number(path: Path) -> tuple[int, str]:
-    digits = re.findall(r"\d+", path.stem)
-    return (int(digits[-1]) if digits else -1, path.name)
-
-
-def _metadata(path: Path, published: _Published | None, first: Trajectory, options: Options) -> Metadata:
-    family = find_family(options.family or "deepmind")
-    dim = first.position.shape[2]
-    if published is None and options.dt is None:
-        raise DataError(
-            f"{path}: the files do not state the time between frames, and no published dataset is called"
-            f" {path.resolve().name!r} ({', '.join(_PUBLISHED)}). Give --dt, and --gravity and --bounds if"
-            " you know them."
-        )
-    low, high = first.position.min(axis=(0, 1)), first.position.max(axis=(0, 1))
-    observed = tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
-    return Metadata(
-        bounds=published.domain if published and len(published.domain) == dim else observed,
-        dt=published.dt if published else options.dt or 1.0,
-        dim=dim,
-        sequence_length=UNKNOWN_LENGTH,
-        particle_types=dict(family.types),
-        static_types=frozenset({_BOUNDARY}),
-        gravity=published.gravity if published and published.gravity and len(published.gravity) == dim else None,
-    )
-
-
-def _notes(path: Path, published: _Published | None, first: Trajectory, metadata: Metadata) -> list[str]:
-    notes = []
-    if published is not None:
-        notes.append(
-            f"Recognised as the published {path.resolve().name}: dt {metadata.dt:g}, bounds {metadata.bounds}, gravity"
-            f" {metadata.gravity or 'as stated in each file'}."
-        )
-    else:
-        notes.append("Bounds are the extent of the first trajectory; give --bounds if you know them.")
-    wall = first.particle_type == _BOUNDARY
-    if first_moving_particle(first.position, wall, metadata.bounds) is not None:
-        notes.append("The boundary moves in the first trajectory.")
-    if _GRAVITY in first.fields:
-        notes.append("`grav` is kept as a field, and used as gravity in length/s² where it has D numbers.")
-    return notes
-
-
-def _only_material(options: Options, path: Path, files: dict[str, tuple[Path, ...]]) -> int | None:
-    """The type of all particles where the files have no types: the only one that the user names."""
-    with open_hdf5(next(iter(files.values()))[0]) as file:
-        if "types" in file:
-            return None
-    stated = [i for i in options.types or {} if i != _BOUNDARY]
-    if len(stated) != 1:
-        raise DataError(f"{path}: the files do not state the particles' material. State it: --types 5=water.")
-    return stated[0]
-
-
-def _trajectories(files: tuple[Path, ...], material: int | None) -> Iterator[Trajectory]:
-    for path in files:
-        with open_hdf5(path) as file:
-            check_self_contained(file, path)
-            content = {name: _values(file, name, path) for name in file}
-        yield _trajectory(content, material, path)
+def _content(file: Path) -> dict[str, np.ndarray]:
+    with open_hdf5(file) as opened:
+        check_self_contained(opened, file)
+        return {name: _values(opened, name, file) for name in opened}
 
 
 def _values(file: Any, name: str, path: Path) -> np.ndarray:

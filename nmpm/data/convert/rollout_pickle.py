@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from nmpm._support.bounded_files import read_bounded
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable, family_note
+from nmpm.data.convert.base import FileFormat, Options
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
-from nmpm.data.format import Trajectory
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import parse_metadata
 from nmpm.errors import DataError
 
@@ -20,37 +19,34 @@ _BYTES = 2**31
 _NEEDED = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
 
 
-class RolloutPickle(DatasetFormat):
+class RolloutPickle(FileFormat):
     """A `rollout_*.pkl` of DeepMind's code or its PyTorch successors, or a folder of them."""
 
     name: ClassVar[str] = "rollout-pickle"
     summary: ClassVar[str] = "rollouts as DeepMind's code pickles them (ground_truth_rollout, …)"
+    pattern: ClassVar[str] = "*.pkl"
 
-    def recognises(self, path: Path) -> bool:
-        return bool(_files(path))
-
-    def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = _files(path)
-        if not files:
-            raise DataError(f"{path}: no .pkl file there.")
-        family = options.family or "deepmind"
-        metadata = parse_metadata(_to_plain(_content(files[0])["metadata"], files[0]), files[0], family)
-        return ForeignDataset(
-            metadata=options.apply_to(metadata),
-            splits={"test": Rereadable(partial(_trajectories, files))},
-            notes=(
-                family_note(family),
-                "The true trajectories become the positions; the predictions are kept as the field"
-                " predicted_rollout, with the initial positions in front.",
-            ),
-            counts={"test": len(files)},
+    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+        plain = _to_plain(_content(file)["metadata"], file)
+        note = (
+            "The true trajectories become the positions; the predictions are kept as the field predicted_rollout, with"
+            " the initial positions in front."
         )
+        return parse_metadata(plain, file, options.family or self.family), (note,)
 
-
-def _files(path: Path) -> tuple[Path, ...]:
-    if path.is_dir():
-        return tuple(sorted(path.glob("*.pkl")))
-    return (path,) if path.suffix == ".pkl" and path.is_file() else ()
+    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+        content = _content(file)
+        arrays: dict[str, np.ndarray] = {
+            key: number_array(content[key], f"{file}: {key}")
+            for key in ("initial_positions", "ground_truth_rollout", "predicted_rollout", "particle_types")
+            if key in content
+        }
+        try:
+            initial, types = arrays.pop("initial_positions"), arrays.pop("particle_types")
+            fields = {key: np.concatenate([initial, part]).astype(np.float32) for key, part in arrays.items()}
+            yield Trajectory(fields.pop("ground_truth_rollout"), types, {}, fields)
+        except (ValueError, TypeError, MemoryError) as error:
+            raise DataError(f"{file}: {error}") from error
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -65,19 +61,3 @@ def _to_plain(metadata: Any, path: Path) -> dict[str, Any]:
     if not isinstance(metadata, dict):
         raise DataError(f"{path}: metadata must map keys to values; it is {type(metadata).__name__}.")
     return {key: item.tolist() if isinstance(item, np.ndarray | np.generic) else item for key, item in metadata.items()}
-
-
-def _trajectories(files: tuple[Path, ...]) -> Iterator[Trajectory]:
-    for path in files:
-        content = _content(path)
-        arrays: dict[str, np.ndarray] = {
-            key: number_array(content[key], f"{path}: {key}")
-            for key in ("initial_positions", "ground_truth_rollout", "predicted_rollout", "particle_types")
-            if key in content
-        }
-        try:
-            initial, types = arrays.pop("initial_positions"), arrays.pop("particle_types")
-            fields = {key: np.concatenate([initial, part]).astype(np.float32) for key, part in arrays.items()}
-            yield Trajectory(fields.pop("ground_truth_rollout"), types, {}, fields)
-        except (ValueError, TypeError, MemoryError) as error:
-            raise DataError(f"{path}: {error}") from error

@@ -42,7 +42,7 @@ def record_offsets(path: Path) -> list[int]:
     """Byte offsets of the records of a file; lengths are checked, payloads are skipped.
 
     Raises:
-        DataError: if the file is cut off or a length is damaged.
+        DataError: if the file is empty or cut off, or a length is damaged.
     """
     check_regular(path)
     size = path.stat().st_size
@@ -54,6 +54,8 @@ def record_offsets(path: Path) -> list[int]:
                 raise _damage_error(path, len(offsets), offset, "the file ends within it")
             offsets.append(offset)
             file.seek(length + 4, 1)
+    if not offsets:
+        raise DataError(f"{path}: the file has no record.")
     return offsets
 
 

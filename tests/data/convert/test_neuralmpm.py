@@ -57,7 +57,7 @@ def test_an_unknown_dataset_needs_the_time_step_and_material(tmp_path):
     write(tmp_path / "mine" / "train" / "sim_0.h5")
     with pytest.raises(DataError, match=r"no published dataset is called 'mine'.*--dt"):
         convert(tmp_path / "mine", tmp_path / "out")
-    with pytest.raises(DataError, match=r"do not state the particles' material.*--types 5=water"):
+    with pytest.raises(DataError, match=r"does not state the particles' material.*--types 5=water"):
         convert(tmp_path / "mine", tmp_path / "out", options=Options(dt=0.01))
     convert(tmp_path / "mine", tmp_path / "out", options=Options(dt=0.01, types={5: "milk"}))
     assert FolderSource(tmp_path / "out").scene.materials == ("milk",)
