@@ -64,18 +64,6 @@ def test_types_that_the_files_do_not_name_can_be_named(dataset, tmp_path, monkey
     assert "honey (40-50)" in capsys.readouterr().out
 
 
-def test_the_format_can_be_named(tmp_path, monkeypatch, capsys):
-    """As the error for a dataset of unknown format advises."""
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
-    records.write_records(tmp_path / "ramps" / "train.tfrecord", records.trajectory_record(*made()))
-    (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
-    path = str(tmp_path / "ramps")
-    assert main(["inspect", path, "--format", "deepmind", "--gravity", "0,-9.81", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["path"] == path
-    assert main(["inspect", path, "--format", "nothing"]) == 1
-    assert "No format is called 'nothing'" in capsys.readouterr().err
-
-
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").touch()
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "file"))

@@ -4,14 +4,12 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from scenes import box
 
 from nmpm.data.arrays import write_trajectories
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.inspection import inspect
 from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.sources import FolderSource, StatedFacts
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
@@ -122,30 +120,6 @@ def test_trajectories_that_store_a_field_differently_are_refused(folder):
         collate(list(data.data_source.recordings("train")), data.scene)
 
 
-def test_a_single_particle_has_one_number_as_larger_trajectories_have():
-    def recording(count, values):
-        return Recording(
-            frames=torch.rand(5, count, 2), material=torch.zeros(count, dtype=torch.int64), obstacle=torch.zeros(0, 2),
-            gravity=torch.zeros(2), fields={"friction": values},
-        )  # fmt: skip
-
-    numbers = [recording(count, torch.full((1, 1), float(count))) for count in (1, 3, 2)]
-    assert collate(numbers, box()).fields["friction"].flatten().tolist() == [1.0, 3.0, 2.0]
-    of_particles = [recording(count, torch.full((1, count), float(count))) for count in (1, 3)]
-    assert collate(of_particles, box()).fields["friction"].tolist() == [[[1.0, 0.0, 0.0]], [[3.0, 3.0, 3.0]]]
-    with pytest.raises(DataError, match="friction has another shape"):
-        collate([*numbers, of_particles[1]], box())
-    with pytest.raises(DataError, match="friction has another shape"):
-        collate([numbers[0], recording(1, torch.ones(5, 1))], box())
-
-
-def test_a_models_fields_are_read_where_the_metadata_declare_none(folder):
-    scene = infer_scene(folder)
-    write_metadata(folder, made_up_metadata())
-    recordings = SplitRecordings(data_of(folder).data_source.recordings("test").split, read_metadata(folder), scene)
-    assert set(recordings[0].fields) == set(scene.fields)
-
-
 def test_an_inspection_says_what_varies_and_which_channels_that_makes(folder):
     found = inspect(FolderSource(folder))
     assert found.channels["temperature"].endswith(": goop.temperature, predicted")
@@ -167,10 +141,3 @@ def test_arrays_are_written_with_the_fields_of_their_scene(folder, tmp_path):
     write_trajectories(path, [Trajectory(run.position, types, fields=run.fields)], scene)
     assert read_metadata(path.parent).fields == ("temperature",)
     assert infer_scene(path.parent).evolving == ("temperature",)
-
-
-def test_names_in_metadata_are_checked(folder):
-    path = folder / "metadata.json"
-    path.write_text(path.read_text().replace('"friction",', '"not a name",'))
-    with pytest.raises(DataError, match=r"fields = .* should be a list of names of fields"):
-        read_metadata(folder)

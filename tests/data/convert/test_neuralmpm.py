@@ -81,14 +81,6 @@ def test_inconsistent_content_is_refused_by_name(tmp_path, change, message):
     assert "sim_0.h5" in str(caught.value)
 
 
-def test_truncated_files_are_named(tmp_path):
-    path = tmp_path / "Goop" / "train" / "sim_0.h5"
-    write(path)
-    path.write_bytes(path.read_bytes()[:-500])
-    with pytest.raises(DataError, match=r"sim_0\.h5: cannot be read as HDF5"):
-        convert(tmp_path / "Goop", tmp_path / "out")
-
-
 def test_a_moving_boundary_is_noted_and_kept(tmp_path):
     path = tmp_path / "Goop" / "train" / "sim_0.h5"
     write(path)
