@@ -23,18 +23,6 @@ def test_cache_folder_from_the_environment_or_the_home(home, monkeypatch):
     assert catalog.dataset_home() == Path.home() / ".cache" / "nmpm"
 
 
-def test_goop_is_embedded():
-    assert "goop" in catalog.catalog()
-    assert dict(catalog.describe("goop").counts) == {"train": 200, "valid": 10, "test": 30}
-
-
-def test_scene_without_simulating(home):
-    scene = catalog.scene("goop")
-    assert scene.materials == ("goop",)
-    assert scene.bounds == ((0.1, 0.9), (0.1, 0.9))
-    assert not home.exists()
-
-
 def test_ensure_simulates_once(home):
     folder = catalog.ensure("goop", counts=COUNTS, frames=2)
     assert folder.parent == home / "datasets"
@@ -44,12 +32,6 @@ def test_ensure_simulates_once(home):
     before = (folder / "train.h5").stat().st_mtime_ns
     assert catalog.ensure("goop", counts=COUNTS, frames=2) == folder
     assert (folder / "train.h5").stat().st_mtime_ns == before
-
-
-def test_the_folder_depends_on_all_that_determines_the_data(home):
-    variants = [{}, {"seed": 1}, {"frames": 2}, {"counts": COUNTS}]
-    folders = {catalog.dataset_folder("goop", catalog.simulation_request("goop", **variant)) for variant in variants}
-    assert len(folders) == len(variants)
 
 
 @pytest.mark.parametrize("ask", [catalog.ensure, catalog.scene, catalog.describe])

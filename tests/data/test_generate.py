@@ -2,7 +2,6 @@ import dataclasses
 import errno
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -50,11 +49,6 @@ def test_contains_the_simulated_trajectories_in_order(made):
     np.testing.assert_array_equal(read.particle_type, again.particle_type)
 
 
-def test_every_trajectory_has_its_own_seed(made):
-    seeds = [Split(made / f"{split}.h5").attributes(index)["seed"] for split, n in COUNTS.items() for index in range(n)]
-    assert len(set(seeds)) == sum(COUNTS.values())
-
-
 def test_metadata_states_the_facts_and_the_source(made):
     metadata = read_metadata(made)
     assert (metadata.bounds, metadata.dt, metadata.dim) == (GOOP.box, GOOP.frame_dt, 2)
@@ -78,19 +72,6 @@ def test_metadata_has_the_statistics_of_the_training_split(made):
         np.testing.assert_allclose(extra[f"{key}_std"], values.std(0), rtol=1e-9)
 
 
-def test_bytes_do_not_depend_on_the_number_of_workers(made, tmp_path):
-    generate(TINY, tmp_path, COUNTS, seed=5, workers=2)
-    assert fingerprints(tmp_path) == fingerprints(made)
-    assert not (tmp_path / ".parts").exists()
-
-
-def test_trajectories_do_not_depend_on_the_counts(made, tmp_path):
-    generate(TINY, tmp_path, {"train": 2, "valid": 1, "test": 3}, seed=5)
-    np.testing.assert_array_equal(
-        Split(tmp_path / "test.h5").read(1).position, Split(made / "test.h5").read(1).position
-    )
-
-
 def test_a_dataset_grows_from_a_smaller_one_by_the_same_bytes(made, tmp_path, monkeypatch):
     counts = {"train": 6, "valid": 0, "test": 1}
     generate(TINY, tmp_path / "whole", counts, seed=5)
@@ -102,15 +83,6 @@ def test_a_dataset_grows_from_a_smaller_one_by_the_same_bytes(made, tmp_path, mo
     assert fingerprints(tmp_path / "grown") == fingerprints(tmp_path / "whole")
 
 
-def test_a_damaged_dataset_to_copy_from_is_named(made, tmp_path):
-    damaged = tmp_path / "damaged"
-    shutil.copytree(made, damaged)
-    content = (made / "train.h5").read_bytes()
-    (damaged / "train.h5").write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=r"damaged.train\.h5"):
-        generate(TINY, tmp_path / "grown", {"train": 6, "valid": 1, "test": 2}, seed=5, known=damaged)
-
-
 def test_a_complete_dataset_is_not_rewritten(made):
     before = {path: path.stat().st_mtime_ns for path in made.iterdir()}
     generate(TINY, made, COUNTS, seed=5)
@@ -118,7 +90,7 @@ def test_a_complete_dataset_is_not_rewritten(made):
 
 
 def test_a_killed_simulation_resumes_with_the_same_bytes(tmp_path):
-    counts = {"train": 60, "valid": 1, "test": 1}
+    counts = {"train": 30, "valid": 1, "test": 1}
     killed = tmp_path / "killed"
     process = start_simulation(killed, counts)
     deadline = time.monotonic() + 60
@@ -128,7 +100,7 @@ def test_a_killed_simulation_resumes_with_the_same_bytes(tmp_path):
     process.wait(timeout=60)
     (killed / ".train.h5.99999.part").write_bytes(b"half a file")
     finished = {path.name: path.stat().st_mtime_ns for path in killed.glob(".parts/*.npz")}
-    assert 3 <= len(finished) < 60
+    assert 3 <= len(finished) < 30
     assert not (killed / "metadata.json").exists()
 
     generate(TINY, killed, counts, seed=5)
@@ -200,25 +172,6 @@ def test_another_seed_takes_the_place_of_an_unstable_one(made, tmp_path, caplog)
     generate(TINY, tmp_path, COUNTS, seed=5)  # the same data as requested
 
 
-def test_a_dataset_of_stable_seeds_names_none(made):
-    assert "redrawn" not in read_metadata(made).extra["simulation"]
-
-
-def test_a_preset_that_is_always_unstable_is_an_error(tmp_path, monkeypatch):
-    def blows_up(preset, seed, *_):
-        raise UnstableError(f"seed {seed}: blown up")
-
-    monkeypatch.setattr(MpmPreset, "simulate", blows_up)
-    with pytest.raises(UnstableError, match="5 seeds in a row"):
-        generate(TINY, tmp_path, COUNTS, seed=5)
-
-
-def test_concurrent_processes_give_the_same_bytes(made, tmp_path):
-    processes = [start_simulation(tmp_path, COUNTS) for _ in range(2)]
-    assert [process.wait(timeout=120) for process in processes] == [0, 0]
-    assert fingerprints(tmp_path) == fingerprints(made)
-
-
 def test_a_full_disk_is_an_error_and_the_next_call_continues(made, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -236,7 +189,6 @@ def test_a_full_disk_is_an_error_and_the_next_call_continues(made, tmp_path, mon
 @pytest.mark.parametrize(
     ("preset", "counts", "seed", "message"),
     [
-        (TINY, COUNTS, 6, "seed is 5, requested 6"),
         (TINY, {**COUNTS, "train": 5}, 5, "counts.train is 4, requested 5"),
         (dataclasses.replace(TINY, frames=31), COUNTS, 5, "preset.frames is 30, requested 31"),
     ],
@@ -244,12 +196,6 @@ def test_a_full_disk_is_an_error_and_the_next_call_continues(made, tmp_path, mon
 def test_a_folder_with_other_data_is_refused(made, preset, counts, seed, message):
     with pytest.raises(DataError, match=f"{message}.*[Cc]hoose another folder, or delete"):
         generate(preset, made, counts, seed)
-
-
-def test_an_unfinished_folder_of_other_data_is_refused(tmp_path, monkeypatch):
-    interrupted(tmp_path, monkeypatch, seed=1)
-    with pytest.raises(DataError, match="seed is 1, requested 2"):
-        generate(TINY, tmp_path, COUNTS, seed=2)
 
 
 def test_foreign_files_are_not_overwritten(tmp_path):
@@ -268,16 +214,10 @@ def test_a_damaged_part_is_named(tmp_path, monkeypatch):
     assert not (tmp_path / "train.h5").exists()
 
 
-def test_no_file_for_an_empty_split(tmp_path):
-    generate(TINY, tmp_path, {"train": 0, "valid": 1, "test": 0})
-    assert [path.name for path in tmp_path.glob("*.h5")] == ["valid.h5"]
-    assert len(read_metadata(tmp_path).extra["vel_std"]) == 2
-
-
 NONE = dict.fromkeys(COUNTS, 0)
 
 
-IMPOSSIBLE = ({"train": 1}, {**COUNTS, "test": -1}, NONE, {**COUNTS, "more": 1}, {**COUNTS, "test": 1.5}, "{train:3}")
+IMPOSSIBLE = ({"train": 1}, {**COUNTS, "test": -1}, NONE, {**COUNTS, "test": 1.5}, "{train:3}")
 
 
 @pytest.mark.parametrize("counts", IMPOSSIBLE)

@@ -42,18 +42,12 @@ def whole(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 9])
-def test_every_item_is_in_one_shard(count):
-    shards = [Shard(index, count).select(range(7)) for index in range(1, count + 1)]
-    assert sorted(item for shard in shards for item in shard) == list(range(7))
-    assert max(map(len, shards)) - min(map(len, shards)) <= 1
-
-
 def test_the_last_shard_completes_the_bytes_of_one_process(whole, tmp_path):
     assert run_shard(tmp_path, 2, 2) == 4
     assert not list(tmp_path.glob("*.h5"))
     assert run_shard(tmp_path, 1, 2) == 0
     assert fingerprints(tmp_path) == fingerprints(whole)
+    assert run_shard(tmp_path, 2, 3) == 0  # complete: nothing is done
     assert not (tmp_path / ".parts").exists()
 
 
@@ -74,29 +68,13 @@ def test_parts_of_machines_without_a_common_folder_are_merged(whole, tmp_path):
     assert fingerprints(tmp_path / "b") == fingerprints(whole)
 
 
-def test_without_a_shard_the_missing_ones_are_simulated(whole, tmp_path):
-    run_shard(tmp_path, 1, 3)
-    generate(TINY, tmp_path, COUNTS, seed=5, workers=1)
-    assert fingerprints(tmp_path) == fingerprints(whole)
-
-
-def test_a_shard_of_a_complete_dataset_does_nothing(whole):
-    before = {path: path.stat().st_mtime_ns for path in whole.iterdir()}
-    assert run_shard(whole, 2, 3) == 0
-    assert {path: path.stat().st_mtime_ns for path in whole.iterdir()} == before
-
-
-def test_a_shard_without_trajectories_leaves_the_rest_to_the_others(tmp_path):
-    assert run_shard(tmp_path, 9, 9) == 7
-
-
 def test_shards_of_different_datasets_do_not_mix(tmp_path):
     run_shard(tmp_path, 1, 2, seed=1)
     with pytest.raises(DataError, match="seed is 1, requested 2"):
         run_shard(tmp_path, 2, 2, seed=2)
 
 
-@pytest.mark.parametrize("text", ["0/4", "5/4", "1/0", "1", "a/b", "-1/4", "1/4/2", "", "1 /4", "²/4"])
+@pytest.mark.parametrize("text", ["0/4", "5/4", "1", "a/b", "²/4"])
 def test_wrong_shards_are_refused(text):
     with pytest.raises(ConfigError, match="as in 1/8, 2/8"):
         Shard.parse(text)

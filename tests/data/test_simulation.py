@@ -78,16 +78,6 @@ def test_processes_give_the_same_bytes(tmp_path):
     assert fingerprints(tmp_path / "processes") == fingerprints(tmp_path / "here")
 
 
-def test_few_frames_are_not_worth_processes(monkeypatch):
-    started = []
-    monkeypatch.setattr(simulation, "_simulate_in_processes", lambda *all_: started.append(all_[2]) or iter(()))
-    enough = simulation.FRAMES_PER_PROCESS // TINY.frames + 1
-    for count, workers in ((1, 8), (2 * enough, 1), (2 * enough, 8), (3 * enough, 8), (100 * enough, 8)):
-        if count > enough and workers > 1:
-            list(simulate_all(TINY, [(index,) for index in range(count)], workers))
-    assert started == [2, 3, 8]
-
-
 def test_a_script_without_a_main_guard_simulates_a_preset_of_its_own_wherever_it_runs(tmp_path):
     work = tmp_path / "a folder"
     work.mkdir()

@@ -26,22 +26,10 @@ def test_auto_prefers_a_gpu():
 
 
 @pytest.mark.usefixtures("cpu_alone")
-def test_auto_takes_the_cpu_where_there_is_no_other():
-    assert find_device("auto") == find_device(torch.device("cpu")) == torch.device("cpu")
-
-
-@pytest.mark.usefixtures("cpu_alone")
-@pytest.mark.parametrize("name", ["cuda", "cuda:1", "mps", "xpu", "cpu:3"])
+@pytest.mark.parametrize("name", ["cuda:1", "mps", "cpu:3"])
 def test_devices_of_other_machines(name):
     with pytest.raises(ConfigError, match=f"has no device '{name}'; it has cpu"):
         find_device(name)
-
-
-@pytest.mark.parametrize("name", ["", "gpu", "cuda:x", "c" * 1000, None])
-def test_names_that_are_no_devices(name):
-    with pytest.raises(ConfigError, match="is not one of auto, cpu, cuda, mps") as caught:
-        find_device(name)
-    assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize(

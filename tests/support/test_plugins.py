@@ -43,6 +43,7 @@ def test_an_installed_processor_can_be_named_by_its_class(installed):
     assert made.hidden == (3,)
 
 
+@pytest.mark.slow
 def test_it_is_on_the_command_line_too(installed):
     folder = installed("anothers_processor", MODULE)
     words = ["fit", "--config", "goop.yaml", "--model.processor", "anothers_processor.Mine", "--print_config"]

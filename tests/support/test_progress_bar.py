@@ -41,10 +41,3 @@ def test_elsewhere_long_work_prints_a_line_now_and_then(output, monkeypatch, rec
     if "force_terminal" in kind:
         assert lines == ["work: 6 of 9 (67%), 0:01:00 left", "more work: 9 of 9, 0:01:20 in all"]
     assert not recwarn.list
-
-
-def test_short_work_prints_nothing_into_a_file(output):
-    file = output(force_terminal=False)
-    with progress_bar("work", None) as step:
-        step()
-    assert not file.getvalue()

@@ -30,18 +30,6 @@ def test_cancelling_stops_the_work():
     assert task.failed
 
 
-def test_a_cancelled_task_stops_waiting_for_another():
-    release = threading.Event()
-    slow = Task(lambda: release.wait(60))
-    waiting = Task(slow.result)
-    waiting.cancel()
-    with pytest.raises(AbandonedError):
-        waiting.result()
-    assert not slow.failed
-    release.set()
-    assert slow.result() is True
-
-
 READS = """
 from nmpm.data.datamodule import TrajectoryDataModule
 data = TrajectoryDataModule(path={path!r}, horizon=4, buffer_size=2, passes=0.01)
@@ -61,7 +49,9 @@ time.sleep(3)
 """
 
 
-@pytest.mark.parametrize("script", [READS, SIMULATES], ids=["read", "simulated"])
+@pytest.mark.parametrize(
+    "script", [pytest.param(READS, marks=pytest.mark.slow, id="read"), pytest.param(SIMULATES, id="simulated")]
+)
 def test_the_program_exits_while_trajectories_are_made(make_dataset, script):
     script = script.format(path=str(make_dataset(train=((12, 5),) * 60)))
     done = subprocess.run([sys.executable, "-c", script], timeout=60, check=False, capture_output=True, text=True)

@@ -49,7 +49,7 @@ def buffer_of(folder, length: int = 5, **options) -> TrajectoryBuffer:
 
 class TestPlan:
     @given(plan=PLANS, index=st.integers(0, 500), world=st.integers(1, 4))
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=30, deadline=None)
     def test_windows_lie_inside_trajectories_of_the_buffer(self, plan, index, world):
         for rank in range(world):
             members = plan.members(index // plan.batches_per_buffer(world))
@@ -59,15 +59,8 @@ class TestPlan:
                 assert trajectory in members
                 assert 0 <= start <= plan.frames[trajectory] - plan.length
 
-    @given(plan=PLANS, order=st.permutations(range(12)))
-    @settings(max_examples=30, deadline=None)
-    def test_a_batch_depends_on_its_index_only(self, plan, order):
-        alone = {index: plan.batch(index, 1, 2) for index in order}
-        again = WindowPlan(plan.frames, plan.length, plan.batch_size, plan.buffer_size, plan.passes, plan.seed)
-        assert [alone[index] for index in range(12)] == [again.batch(index, 1, 2) for index in range(12)]
-
     @given(plan=PLANS)
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=10, deadline=None)
     def test_buffers_cover_all_trajectories(self, plan):
         total = len(plan.frames)
         for buffer in range(5):
@@ -85,7 +78,7 @@ class TestPlan:
 
     @given(plan=PLANS, legs=st.lists(st.tuples(*[st.integers(1, 7)] * 3), min_size=2, max_size=4))
     @example(plan=WindowPlan((6,), 2, 1, 1, 1, 0), legs=[(1, 1, 4), (1, 1, 1)])  # one window left of five
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=30, deadline=None)
     def test_batches_of_another_size_continue_the_sequence(self, plan, legs):
         """Legs of some batches, of some size, for some ranks: no place is drawn twice or left out."""
         index, before, expected = 0, None, (0, 0)
@@ -108,17 +101,7 @@ class TestPlan:
         assert parts[0] + parts[1] + parts[2] == whole.batch(index, 0, 1)
         assert plan.resume_after(index, whole.batch_size, 1, 3) == plan
 
-    def test_windows_are_equally_likely(self):
-        plan = WindowPlan(frames=(8,) * 6, length=3, batch_size=4, buffer_size=2, passes=1, seed=3)
-        drawn = Counter(w for index in range(300) for w in plan.batch(index, 0, 1))
-        assert len(drawn) == 36
-        assert max(drawn.values()) - min(drawn.values()) <= 2
-
-    def test_order_depends_on_the_seed(self):
-        plans = [WindowPlan((30, 30), 4, 8, 2, 1, seed) for seed in (0, 1)]
-        assert plans[0].batch(0, 0, 1) != plans[1].batch(0, 0, 1)
-
-    @pytest.mark.parametrize("wrong", [{"batch_size": 0}, {"buffer_size": -1}, {"passes": 0}, {"seed": -1}])
+    @pytest.mark.parametrize("wrong", [{"batch_size": 0}, {"seed": -1}, {"emphasis": -0.1}, {"openings": 1.5}])
     def test_invalid_numbers_are_refused(self, wrong):
         known = {"frames": (9,), "length": 3, "batch_size": 2, "buffer_size": 2, "passes": 1, "seed": 0}
         with pytest.raises(ConfigError, match=f"{next(iter(wrong))} = "):
@@ -135,28 +118,14 @@ class TestBuffer:
                 assert torch.equal(window.frames[row, :, :count], truth[:, :count])
                 assert torch.equal(window.obstacle[row], truth[0, count:])
 
-    @pytest.mark.parametrize("start", [0, 1, 5, 6, 7, 40])
-    def test_resumes_at_any_batch(self, make_dataset, start):
-        buffer = buffer_of(make_dataset(train=((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))))
+    @pytest.mark.parametrize(("start", "shares"), [(1, {}), (5, {}), (6, {"emphasis": 0.5, "openings": 0.3}), (40, {})])
+    def test_resumes_at_any_batch(self, make_dataset, start, shares):
+        buffer = buffer_of(make_dataset(train=((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))), **shares)
         straight = list(islice(buffer.batches(), start + 8))
         resumed = list(islice(buffer.batches(start), 8))
         for expected, window in zip(straight[start:], resumed, strict=True):
             assert torch.equal(window.frames, expected.frames)
             assert torch.equal(window.mask, expected.mask)
-
-    def test_ranks_see_different_windows(self, make_dataset):
-        buffer = buffer_of(make_dataset())
-        for first, second in zip(*[islice(buffer.batches(rank=r, world=2), 5) for r in (0, 1)], strict=True):
-            assert first.frames.shape[0] == second.frames.shape[0]
-            assert first.frames.shape != second.frames.shape or not torch.equal(first.frames, second.frames)
-
-    def test_reads_each_trajectory_of_a_constant_buffer_once(self, make_dataset, monkeypatch):
-        buffer = buffer_of(make_dataset(), buffer_size=16)
-        read = Counter()
-        original = Split.read
-        monkeypatch.setattr(Split, "read", lambda self, i, *a: (read.update([i]), original(self, i, *a))[1])
-        list(islice(buffer.batches(), 50))
-        assert read == {0: 1, 1: 1, 2: 1}
 
     def test_closing_the_iterator_ends_its_thread(self, make_dataset, monkeypatch):
         buffer = buffer_of(make_dataset(train=((12, 5),) * 8), buffer_size=2)
@@ -188,23 +157,6 @@ class TestBuffer:
         with pytest.raises(DataError, match=f"trajectory {later:05d}: position of particle 2 in frame 3"):
             next(batches)
 
-    def test_a_trajectory_shorter_than_a_window_is_refused(self, make_dataset):
-        with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* 8 frames to predict needs 10"):
-            buffer_of(make_dataset(train=((12, 5), (9, 5))), length=10)
-
-
-def test_waterdrop(recorded):
-    folder = recorded / "deepmind-waterdrop"
-    scene = infer_scene(folder, family="deepmind", gravity=(0, -9.81))
-    split = Split(folder / "train.h5")
-    recordings = SplitRecordings(split, read_metadata(folder, "deepmind"), scene)
-    plan = WindowPlan(tuple(map(split.frames, range(9))), length=18, batch_size=16, buffer_size=4, passes=4, seed=0)
-    window = next(TrajectoryBuffer(recordings, plan).batches(7))
-    for row, (trajectory, start) in enumerate(plan.batch(7, 0, 1)):
-        truth = torch.from_numpy(split.read(trajectory, start, start + 18).position)
-        assert torch.equal(window.frames[row, :, : truth.shape[1]], truth)
-    torch.testing.assert_close(window.gravity, torch.tensor([[0, -9.81 * 0.0025**2]]).expand(16, 2))
-
 
 def test_emphasis_draws_windows_in_proportion_to_their_motion():
     frames = torch.zeros(40, 3, 2)
@@ -233,25 +185,6 @@ def test_emphasis_does_not_take_the_way_across_a_periodic_border_for_motion():
     np.testing.assert_allclose(share, 1 / 11, rtol=1e-4)
 
 
-def test_with_emphasis_a_batch_depends_on_its_index_only(make_dataset):
-    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, batch_size=4, emphasis=0.5)
-    buffer = data.train_dataloader().buffer
-    run = list(islice(buffer.batches(), 6))
-    resumed = list(islice(buffer.batches(start=3), 3))
-    for one, other in zip(run[3:], resumed, strict=True):
-        assert torch.equal(one.frames, other.frames)
-    plain = TrajectoryDataModule(path=str(data.data_source.path), horizon=4, batch_size=4).train_dataloader().buffer
-    assert any(not torch.equal(a.frames, b.frames) for a, b in zip(run, plain.batches(), strict=False))
-
-
-def test_with_emphasis_ranks_together_have_the_batch_of_one_process(make_dataset):
-    folder = make_dataset()
-    of = {size: TrajectoryDataModule(path=str(folder), horizon=4, batch_size=size, emphasis=0.5) for size in (2, 6)}
-    parts = [of[2].train_dataloader().buffer.batches(rank=rank, world=3) for rank in range(3)]
-    for *ranks, whole in islice(zip(*parts, of[6].train_dataloader().buffer.batches(), strict=True), 12):
-        assert torch.equal(torch.cat([part.frames for part in ranks]), whole.frames)
-
-
 def test_openings_move_windows_to_the_first_frames_of_their_trajectories():
     plan = WindowPlan(frames=(60, 40, 10), length=8, batch_size=1000, buffer_size=3, passes=100, seed=0)
     plain = plan.batch(0, 0, 1)
@@ -273,11 +206,3 @@ def test_with_openings_ranks_together_have_the_batch_of_one_process(make_dataset
     parts = [of[2].train_dataloader().buffer.batches(rank=rank, world=3) for rank in range(3)]
     for *ranks, whole in islice(zip(*parts, of[6].train_dataloader().buffer.batches(), strict=True), 12):
         assert torch.equal(torch.cat([part.frames for part in ranks]), whole.frames)
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.5])
-@pytest.mark.parametrize("name", ["emphasis", "openings"])
-def test_shares_of_windows_outside_of_0_to_1_are_refused(make_dataset, name, share):
-    data = TrajectoryDataModule(path=str(make_dataset()), horizon=4, **{name: share})
-    with pytest.raises(ConfigError, match=name):
-        data.train_dataloader()

@@ -42,6 +42,7 @@ def stream(folder, buffer_size: int) -> subprocess.CompletedProcess:
     return subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the memory of a process as Linux does")
 def test_memory_is_bounded_by_the_buffer(dataset):
     assert TRAJECTORIES * FRAMES * PARTICLES * 8 > 1.9 * ALLOWED

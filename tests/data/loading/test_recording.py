@@ -5,8 +5,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.format import Split, Trajectory, read_metadata, write_split
-from nmpm.data.loading.padded_batch import PaddedRecordings, collate, unwrap
+from nmpm.data.format import Split, read_metadata
+from nmpm.data.loading.padded_batch import PaddedRecordings, unwrap
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
@@ -27,11 +27,6 @@ def test_separates_static_particles(make_dataset):
     assert recorded.material.tolist() == [0] * 7
 
 
-def test_gravity_is_per_frame_squared(make_dataset):
-    gravity = recordings_of(make_dataset())[0].gravity
-    torch.testing.assert_close(gravity, torch.tensor([0.0, -9.81 * 0.0025**2]))
-
-
 def test_gravity_of_the_trajectory_comes_first(make_dataset):
     folder = make_dataset()
     with h5py.File(folder / "train.h5", "a") as file:
@@ -39,27 +34,13 @@ def test_gravity_of_the_trajectory_comes_first(make_dataset):
     torch.testing.assert_close(recordings_of(folder)[1].gravity, torch.tensor([0.0025**2, 0.0]))
 
 
-@pytest.mark.parametrize("gravity", ["down", [float("nan"), 0.0], [1.0, 0.0, 0.0]])
-def test_a_gravity_that_is_no_vector_is_reported(make_dataset, gravity):
-    folder = make_dataset()
+def test_a_gravity_that_is_no_vector_is_reported(make_dataset):
+    folder, gravity = make_dataset(), [float("nan"), 0.0]
     recordings = recordings_of(folder)
     with h5py.File(folder / "train.h5", "a") as file:
         file["00001"].attrs["gravity"] = gravity
     with pytest.raises(DataError, match=r"trajectory 00001: the attribute gravity = .* should be 2 finite numbers"):
         recordings[1]
-
-
-def test_unknown_gravity_is_zero(make_dataset):
-    assert recordings_of(make_dataset(gravity=None))[0].gravity.tolist() == [0, 0]
-
-
-def test_padding_particles_of_a_file_are_dropped(make_dataset):
-    folder = make_dataset(particle_types={-1: "padding", 3: "boundary", 7: "goop"})
-    with h5py.File(folder / "train.h5", "a") as file:
-        file["00000/particle_type"][2] = -1
-        file["00000/position"][:, 2] = 1e6
-    recordings = recordings_of(folder)
-    np.testing.assert_array_equal(recordings[0].frames, recordings.split.read(0).position[:, [0, 1, 3, 4]])
 
 
 def test_positions_outside_the_domain_are_refused(make_dataset):
@@ -109,7 +90,7 @@ PERIODIC = Scene(
 
 
 @given(seed=st.integers(0, 1000), frames=st.integers(2, 40))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_unwrap_inverts_wrapping(seed, frames):
     generator = torch.Generator().manual_seed(seed)
     steps = (torch.rand(2, frames, 5, 2, generator=generator) - 0.5) * 0.9
@@ -120,32 +101,3 @@ def test_unwrap_inverts_wrapping(seed, frames):
     wrapped[..., 0] = wrapped[..., 0].remainder(2)
     unwrap(wrapped, PERIODIC)
     torch.testing.assert_close(wrapped, path, rtol=0, atol=1e-5)
-
-
-def test_walls_do_not_wrap():
-    frames = torch.tensor([0.0, 0.0, 1.9, 0.9]).reshape(1, 2, 1, 2)
-    before = frames.clone()
-    unwrap(frames, PERIODIC)
-    assert (frames[..., 1] == before[..., 1]).all()
-    torch.testing.assert_close(frames[0, 1, 0, 0], torch.tensor(-0.1))
-
-
-def test_heated_channel_moves_little(recorded):
-    recordings = recordings_of(
-        recorded / "jaxsph-heated-channel-2d", family="lagrangebench", boundary=("periodic", "wall")
-    )
-    raw = recordings[0].frames
-    window = collate([recordings[0]], recordings.scene)
-    assert raw[:, :, 0].diff(dim=0).abs().max() > 0.9
-    assert window.frames.diff(dim=1).abs().max() < 0.1
-    assert window.frames[..., 0].max() > 1.5
-    torch.testing.assert_close(window.frames[0, ..., 0].remainder(1), raw[..., 0].remainder(1), rtol=0, atol=1e-5)
-    assert window.obstacle.shape[1] == 306
-
-
-def test_dimensions_contradict_the_scene(make_dataset):
-    recordings = recordings_of(make_dataset())
-    path = recordings.split.path.with_name("deep.h5")
-    write_split(path, [Trajectory(np.zeros((3, 2, 3)), np.full(2, 7))])
-    with pytest.raises(DataError, match="positions have 3 dimensions, the scene has 2"):
-        SplitRecordings(Split(path), recordings.reader.metadata, recordings.scene)
