@@ -46,14 +46,8 @@ DECAY, WARM_UP = 0.01, 50
 
 @dataclass(frozen=True)
 class Training:
-    """How a graph simulator is trained.
-
-    Args:
-        seconds: Of the schedule; training stops then.
-        noise: Standard deviation of the last velocity's noise, in length per frame; the paper's.
-        batch: Windows of a step.
-        rate: Adam's first learning rate; it falls exponentially by `DECAY` over the schedule.
-        seed: Of windows and noise.
+    """How a graph simulator is trained: seconds of the schedule, noise of the last velocity in length per frame,
+    windows of a step, Adam's first learning rate, and the seed of windows and noise.
     """
 
     seconds: float
@@ -65,13 +59,7 @@ class Training:
 
 @dataclass(frozen=True)
 class GraphWindow:
-    """Consecutive frames of one scene.
-
-    Args:
-        history: (N, H + 1, D) positions, the present ones last.
-        following: (N, D) positions of the next frame.
-        around: What does not move with them.
-    """
+    """Positions (N, H + 1, D) of consecutive frames, the present one last, and those of the next frame, (N, D)."""
 
     history: Tensor
     following: Tensor
@@ -80,8 +68,7 @@ class GraphWindow:
     def with_noise(self, noise: float, generator: torch.Generator) -> GraphWindow:
         """The same with a random walk on the positions, whose last velocity has noise of this standard deviation.
 
-        The next positions are shifted like the present ones: their velocity is the true one, so that the acceleration
-        to be predicted takes the noise back.
+        The next positions are shifted like the present ones, so that the acceleration takes the noise back.
         """
         steps = self.history.shape[1] - 1
         shape = (len(self.history), steps, self.history.shape[2])
@@ -136,18 +123,7 @@ def validation_loss(simulator: GraphSimulator, recordings: Sequence[Recording], 
 
 
 class GraphTrainer:
-    """A training of a graph simulator, in place; its statistics are calibrated first.
-
-    Args:
-        simulator: To train.
-        recordings: Of at least 3 frames.
-        settings: Length, noise, rates.
-        clock: Measures `settings.seconds`: the process' CPU time when left out.
-
-    Attributes:
-        spent: Seconds so far, of training alone.
-        steps: Taken so far.
-    """
+    """A training of a graph simulator, in place; `spent` are its seconds by the clock, of training alone."""
 
     def __init__(
         self,
@@ -162,11 +138,6 @@ class GraphTrainer:
         self._optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.rate)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self.spent, self.steps = 0.0, 0
-
-    @property
-    def done(self) -> bool:
-        """Whether the schedule is over."""
-        return self.spent >= self.settings.seconds
 
     def step(self) -> None:
         """Take one step; a DataError if the loss becomes non-finite."""
@@ -215,12 +186,7 @@ def converged(curve: Sequence[tuple[float, float]]) -> bool:
 
 
 class GraphPredictor:
-    """A trained graph simulator as a predictor of `nmpm trade`.
-
-    Args:
-        simulator: In evaluation mode.
-        curve: (minutes, validation loss) of its training in the order of time; the last is the simulator's own.
-    """
+    """A trained graph simulator as a predictor of `nmpm trade`, named by its weights and its training."""
 
     def __init__(self, simulator: GraphSimulator, curve: Sequence[tuple[float, float]]) -> None:
         self.simulator = simulator
@@ -228,7 +194,6 @@ class GraphPredictor:
         self.name = f"GNS {short_digest(simulator.state_dict())}, {curve[-1][0]:.3g} min of training{steady}"
 
     def __call__(self, particles: Particles, frames: int) -> Tensor:
-        """Positions (B, frames, N, D)."""
         return self.simulator.rollout(particles, frames)
 
 
@@ -260,7 +225,7 @@ def main() -> None:
         trainer.load_state_dict(state)
     checks = {max(chosen.minutes) * (i + 1) / CHECKS for i in range(CHECKS)}
     due = sorted(minutes for minutes in {*chosen.minutes, *checks} if 60 * minutes > trainer.spent)
-    while not trainer.done:
+    while trainer.spent < settings.seconds:
         trainer.step()
         while due and trainer.spent >= 60 * due[0]:
             minutes = due.pop(0)
@@ -280,17 +245,16 @@ def _recordings(folder: Path, scene: Scene, split: str) -> list[Recording]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dataset", choices=catalog())
-    parser.add_argument(
-        "--minutes", type=float, nargs="+", default=[2.0, 5.0, 10.0], help="written then; the last ends"
-    )
-    parser.add_argument("--trajectories", type=int, default=40, help="to train on")
-    parser.add_argument("--width", type=int, default=32, help="of latent vectors; the paper's is 128")
-    parser.add_argument("--batch", type=int, default=1)
-    parser.add_argument("--rate", type=float, default=1e-3)
-    parser.add_argument("--noise", type=float, default=6.7e-4, help="of the last velocity, in length per frame")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("runs/gns"))
+    add = parser.add_argument
+    add("dataset", choices=catalog())
+    add("--minutes", type=float, nargs="+", default=[2.0, 5.0, 10.0], help="written then; the last ends")
+    add("--trajectories", type=int, default=40, help="to train on")
+    add("--width", type=int, default=32, help="of latent vectors; the paper's is 128")
+    add("--batch", type=int, default=1)
+    add("--rate", type=float, default=1e-3)
+    add("--noise", type=float, default=6.7e-4, help="of the last velocity, in length per frame")
+    add("--seed", type=int, default=0)
+    add("--out", type=Path, default=Path("runs/gns"))
     return parser
 
 

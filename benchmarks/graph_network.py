@@ -8,7 +8,6 @@ walls. N moving and M static particles, D dimensions, E directed edges, H veloci
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import cast
 
 import torch
@@ -49,18 +48,13 @@ def radius_graph(position: Tensor, radius: float) -> Tensor:
 
 def perceptron(inputs: int, width: int, outputs: int) -> nn.Sequential:
     """A multilayer perceptron with two hidden layers and ReLU."""
-    layers: list[nn.Module] = []
-    for before, after in pairwise([inputs, width, width]):
-        layers += [nn.Linear(before, after), nn.ReLU()]
-    return nn.Sequential(*layers, nn.Linear(width, outputs))
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs)
+    )
 
 
 class MessagePassing(nn.Module):
-    """One step: each edge is updated from its ends, each node from the sum of its incoming edges; both residually.
-
-    Args:
-        width: Of the latent vectors of nodes and edges.
-    """
+    """One step: each edge is updated from its ends, each node from the sum of its incoming edges; both residually."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -86,14 +80,7 @@ class MessagePassing(nn.Module):
 
 
 class GraphNetwork(nn.Module):
-    """Encode features of nodes and edges, pass messages, decode an output of each node.
-
-    Args:
-        node_features, edge_features: Inputs of a node and of an edge.
-        outputs: Of a node.
-        width: Of the latent vectors and hidden layers.
-        steps: Message-passing steps, each with weights of its own.
-    """
+    """Encode features of nodes and edges, pass messages in steps with weights of their own, decode outputs of nodes."""
 
     def __init__(self, node_features: int, edge_features: int, outputs: int, width: int, steps: int) -> None:
         super().__init__()
@@ -113,13 +100,7 @@ class GraphNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The inputs of a scene that stay the same over a rollout.
-
-    Args:
-        material: (N,) int64.
-        obstacle: (M, D) particles that do not move; M may be 0.
-        gravity: (D,) in length per frame squared.
-    """
+    """The inputs that stay the same over a rollout: materials (N,), static particles (M, D) and gravity (D,)."""
 
     material: Tensor
     obstacle: Tensor
@@ -127,16 +108,7 @@ class Neighbours:
 
 
 class GraphSimulator(nn.Module):
-    """Predicts the next frame of one scene from the last ones, on the CPU.
-
-    Args:
-        scene: Facts of the scenes.
-        width: Of the latent vectors and hidden layers; the paper's is 128.
-        steps: Message-passing steps.
-
-    Raises:
-        ConfigError: if an axis is periodic, or the scene has fields.
-    """
+    """Predicts the next frame of one scene from the last ones, on the CPU; `width` is that of the latent vectors."""
 
     velocity_mean: Tensor
     velocity_std: Tensor
@@ -157,19 +129,17 @@ class GraphSimulator(nn.Module):
             self.register_buffer(f"{name}_std", torch.ones(scene.dim))
 
     def forward(self, history: Tensor, around: Neighbours) -> Tensor:
-        """Normalised accelerations (N, D) of the moving particles; no absolute position enters.
-
-        Args:
-            history: (N, H + 1, D) positions of the last frames, the present one last.
-            around: Of N moving and M static particles.
-        """
+        """Normalised accelerations (N, D) from positions (N, H + 1, D), the present ones last."""
         static = around.obstacle.unsqueeze(1).expand(-1, history.shape[1], -1)
         frames = torch.cat([history, static])
         present = frames[:, -1]
         velocity = (frames.diff(dim=1) - self.velocity_mean) / self.velocity_std
         low, high = present.new_tensor(self.scene.bounds).T
         walls = torch.cat([present - low, high - present], dim=-1) / self.radius
-        parts = [velocity.flatten(1), walls.clamp(-1, 1), self._kinds(around)]
+        materials = len(self.scene.materials)  # obstacles are a kind of their own
+        kinds = torch.cat([around.material, around.material.new_full((len(around.obstacle),), materials)])
+        kinds = nn.functional.one_hot(kinds, materials + self.scene.obstacles).float()
+        parts = [velocity.flatten(1), walls.clamp(-1, 1), kinds]
         if self.scene.gravity_varies:
             parts.append((around.gravity / self.acceleration_std).expand_as(present))
         ends = radius_graph(present, self.radius)
@@ -177,12 +147,6 @@ class GraphSimulator(nn.Module):
         edges = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], dim=-1)
         output: Tensor = self.network(torch.cat(parts, dim=-1), edges, ends)
         return output[: len(history)]
-
-    def _kinds(self, around: Neighbours) -> Tensor:
-        """One at each particle's material, or at the last column for obstacles: (N + M, K)."""
-        materials = len(self.scene.materials)
-        kinds = torch.cat([around.material, around.material.new_full((len(around.obstacle),), materials)])
-        return nn.functional.one_hot(kinds, materials + self.scene.obstacles).float()
 
     def advance(self, history: Tensor, around: Neighbours) -> Tensor:
         """The next positions (N, D): x + v + a, frames being equal steps."""
