@@ -67,8 +67,9 @@ def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Me
     material = window.material[0, moving]
     ours, theirs = predicted[0, :, moving].double(), window.target[0, :, moving].double()
     curve = squared_errors(window, predicted)
-    errors = {f"mse@{h}": float(curve[:h].mean()) for h in measures.horizons if h <= len(curve)}
-    errors |= {"mse": float(curve.mean()), "field": field_error(scene, ours, theirs, material)}
+    errors = {"mse": float(curve.mean())}
+    errors |= {f"mse@{h}": float(curve[:h].mean()) for h in measures.horizons if h <= len(curve)}
+    errors["field"] = field_error(scene, ours, theirs, material)
     if measures.emd_frames:
         frames = _evenly_spaced(len(ours), measures.emd_frames)
         errors["emd"] = earth_mover_of_materials(ours[frames], theirs[frames], material, measures.emd_particles)

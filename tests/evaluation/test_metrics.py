@@ -55,13 +55,6 @@ def test_padding_does_not_count_and_trajectories_of_any_length_do():
     assert metric.compute()["mse"] == 0.5
 
 
-def test_earth_mover_of_a_shift_is_its_length_and_ignores_order():
-    cloud_ = torch.rand(1, 30, 2)
-    moved = cloud_[:, torch.randperm(30)] + torch.tensor([0.3, 0.4])
-    assert earth_mover(cloud_, cloud_[:, torch.randperm(30)]) == pytest.approx(0, abs=1e-12)
-    assert earth_mover(cloud_, moved) == pytest.approx(0.5, rel=1e-6)
-
-
 @pytest.mark.parametrize(("particles", "dimensions"), [(1, 2), (7, 3), (200, 2)])
 def test_earth_mover_is_the_cost_of_the_best_assignment(particles: int, dimensions: int):
     generator = torch.Generator().manual_seed(particles)
@@ -69,16 +62,6 @@ def test_earth_mover_is_the_cost_of_the_best_assignment(particles: int, dimensio
     costs = torch.cdist(ours, theirs).numpy()
     best = [cost[linear_sum_assignment(cost)].mean() for cost in costs]
     assert earth_mover(ours, theirs) == pytest.approx(sum(best) / 3, rel=1e-9)
-
-
-def test_errors_are_those_of_float64_to_a_millionth():
-    generator = torch.Generator().manual_seed(0)
-    target = torch.rand(2, 50, 3000, 2, generator=generator)
-    predicted = target + 1e-3 * torch.randn(target.shape, generator=generator)
-    metric = MSE(())
-    metric.update(recorded(target), predicted)
-    exact = (predicted.double() - target.double()).square().mean().item()
-    assert metric.compute()["mse"].item() == pytest.approx(exact, rel=1e-6)
 
 
 def test_states_of_metrics_need_no_float64():
@@ -92,7 +75,7 @@ def test_states_of_metrics_need_no_float64():
     assert EarthMover().compute() == {}
 
 
-def test_earth_mover_keeps_materials_apart():
+def test_earth_mover_ignores_order_and_keeps_materials_apart():
     metric = EarthMover(every=1)
     ours = torch.tensor([[[[0.0, 0.0], [1.0, 0.0]]]])
     theirs = ours.flip(2)
@@ -145,15 +128,10 @@ def test_free_fall_is_the_parabola_and_stops_at_the_first_wall():
     scene = box()
     particles = cloud(scene, speed=0.0)
     path = free_fall(scene, particles, 400)
+    assert (still(particles, 7) == particles.position[:, None]).all()
     early = torch.arange(1, 11).view(1, -1, 1)
     fallen = particles.position[:, None, :, 1] + particles.gravity[0, 1] * early * (early + 1) / 2
     torch.testing.assert_close(path[:, :10, :, 1], fallen, atol=1e-6, rtol=0)
     torch.testing.assert_close(path[:, -1, :, 1], torch.full((1, 30), 0.1))
     thrown = particles.with_motion(particles.position, torch.tensor([0.0, 0.02]).expand_as(particles.position))
     assert (free_fall(scene, thrown, 400)[:, -1, :, 1] == torch.tensor(0.9)).all()
-
-
-def test_still_is_still():
-    scene = box()
-    particles = cloud(scene)
-    assert (still(particles, 7) == particles.position[:, None]).all()

@@ -21,7 +21,7 @@ from nmpm._support.messages import counted
 from nmpm.evaluation.bootstrap import Floats
 from nmpm.evaluation.trade.choices import Kind
 from nmpm.evaluation.trade.models import OTHER_SCENES
-from nmpm.evaluation.trade.ranking import Point, Rank, describe_measure, rank
+from nmpm.evaluation.trade.ranking import Point, Rank, rank
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.viz.panel import PanelRenderer
 from nmpm.viz.trajectories import LabelledTrajectories
@@ -50,12 +50,12 @@ _PANEL = 420  # pixels of a square panel's side
 _DPI = 130
 
 
-def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str = "mse") -> None:
+def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
     """Write a PNG: emulators and simulator settings as points with bootstrap intervals, the others as lines.
 
     Points that predict several scenes at once are left out, as are unstable ones. Rings mark the Pareto set.
     """
-    ranks = rank(points, measure)
+    ranks = rank(points)
     shown = [p for p in points if p.stable and p.batch == 1 and p.name in ranks and math.isfinite(p.milliseconds)]
     marked = sorted((p for p in shown if p.kind in _MARKERS and not p.exact), key=_legend_order)
     lines = [p for p in shown if p.kind not in _MARKERS and ranks[p.name].mean > 0]
@@ -72,7 +72,7 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, measure: str
     for point in shown:
         if point.exact and point.kind is Kind.SIMULATOR:  # a logarithmic axis has no place for an error of 0
             axes.axvline(point.milliseconds, color=_MARKERS[point.kind]["color"], lw=1, label="simulator as shipped")
-    _describe(axes, shown, measure)
+    _describe(axes, shown)
     below = f"\n(below the picture: {far})" if far else ""
     axes.set_title(f"{scenes.name}: time and error on {len(scenes)} test scenes{below}")
     if marked:
@@ -104,7 +104,7 @@ def _draw_points(axes: Any, points: Sequence[Point], ranks: Mapping[str, Rank], 
     )  # fmt: skip
 
 
-def _describe(axes: Any, shown: Sequence[Point], measure: str) -> None:
+def _describe(axes: Any, shown: Sequence[Point]) -> None:
     """Logarithmic axes with names, and space beside the outermost points."""
     machine = ""
     if shown:
@@ -112,7 +112,7 @@ def _describe(axes: Any, shown: Sequence[Point], measure: str) -> None:
         machine = f"; {times.hardware}, {counted(shown[0].threads, 'thread')}, {times.clock}"
     axes.set(
         xscale="log", yscale="log", xlabel=f"milliseconds per frame, one scene at a time{machine}",
-        ylabel=describe_measure(measure),
+        ylabel="MSE of the full rollout",
     )  # fmt: skip
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -8,12 +8,10 @@ is; times stay.
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +19,6 @@ from numpy.typing import NDArray
 from nmpm.evaluation.bootstrap import Floats, intervals, resampled_means
 from nmpm.evaluation.figures import Unit
 from nmpm.evaluation.trade.choices import Kind, Settings
-from nmpm.evaluation.trade.models import OTHER_SCENES
-
-MEASURES: Mapping[str, str] = MappingProxyType(
-    {
-        "mse": "MSE of the full rollout",
-        "field": "share of the material in another cell",
-        "emd": "earth mover's distance",
-        "kinetic": "kinetic energy, relative error",
-        "height": "settled height, relative error",
-        "crowding": "particles per cell, relative error",
-    }
-)
 
 
 @dataclass(frozen=True)
@@ -120,33 +106,19 @@ class Point:
     @property
     def of_other_scenes(self) -> bool:
         """Whether it is a model that was trained on other scenes."""
-        return str(self.settings.get("model", "")).endswith(OTHER_SCENES)
+        return "scenes_differ_in" in self.settings
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     """Lower quartile, median and upper quartile; NaN where there are no values."""
-    if len(values) < 2:
-        return (values[0],) * 3 if values else (float("nan"),) * 3
-    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
+    low, middle, high = np.percentile(values or [math.nan], (25, 50, 75)).tolist()
     return low, middle, high
 
 
 def measure_names(points: Sequence[Point]) -> list[str]:
-    """Errors that all stable points have, in order: full MSE, MSE at horizons, the others."""
+    """Errors that all stable points have."""
     stable = [point for point in points if point.stable and point.errors]
-    if not stable:
-        return []
-    shared = [name for name in stable[0].errors if all(name in point.errors for point in stable)]
-    return sorted(shared, key=lambda name: (name != "mse", not name.startswith("mse@"), _horizon(name)))
-
-
-def _horizon(name: str) -> int:
-    return int(name.partition("@")[2] or 0)
-
-
-def describe_measure(name: str) -> str:
-    """An error in words."""
-    return MEASURES.get(name, f"MSE of the first {name.partition('@')[2]} frames")
+    return [name for name in stable[0].errors if all(name in point.errors for point in stable)] if stable else []
 
 
 @dataclass(frozen=True)
@@ -167,7 +139,7 @@ class Rank:
     probability: float = 0.0
 
 
-def rank(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str, Rank]:
+def rank(points: Sequence[Point], measure: str = "mse") -> dict[str, Rank]:
     """The rank of each point that has the error in all scenes, by name."""
     measured = [point for point in points if math.isfinite(point.mean(measure))]
     if not measured:
@@ -175,13 +147,13 @@ def rank(points: Sequence[Point], measure: str, seed: int = 0) -> dict[str, Rank
     errors = np.stack([point.errors[measure] for point in measured])
     ranks = {
         point.name: Rank(float(row.mean()), float(bounds[0]), float(bounds[1]))
-        for point, row, bounds in zip(measured, errors, intervals(errors, seed), strict=True)
+        for point, row, bounds in zip(measured, errors, intervals(errors), strict=True)
     }
     for most in (math.inf, 1):  # points of one scene at a time compete among themselves: their times are latencies
         competing = [point.competes and point.batch <= most for point in measured]
         competitors = list(compress(measured, competing))
         times, rows = np.array([point.milliseconds for point in competitors]), errors[competing]
-        members, shares = pareto_members(times, rows.mean(1)), pareto_probabilities(times, rows, seed)
+        members, shares = pareto_members(times, rows.mean(1)), pareto_probabilities(times, rows)
         for point, member, share in zip(competitors, members, shares, strict=True):
             ranks[point.name] = replace(ranks[point.name], member=bool(member), probability=float(share))
     return ranks
@@ -197,11 +169,11 @@ def pareto_members(times: Floats, errors: Floats) -> NDArray[np.bool_]:
     return np.asarray(~dominates.any(axis=-2))
 
 
-def pareto_probabilities(times: Floats, errors: Floats, seed: int = 0) -> Floats:
+def pareto_probabilities(times: Floats, errors: Floats) -> Floats:
     """Share of resamples of the scenes in which each point is in the Pareto set, (P,), from errors (P, S)."""
     if not len(times):
         return np.zeros(0)
-    members = [pareto_members(times, part) for part in np.array_split(resampled_means(errors, seed), 20)]
+    members = [pareto_members(times, part) for part in np.array_split(resampled_means(errors), 20)]
     return np.asarray(np.concatenate(members).mean(axis=0))
 
 
@@ -220,22 +192,20 @@ class Recommendation:
     sentence: str
 
 
-def recommend(points: Sequence[Point], measure: str = "mse", seed: int = 0) -> list[Recommendation]:
+def recommend(points: Sequence[Point]) -> list[Recommendation]:
     """What to run for any budget of milliseconds per frame of one scene: steps from the least budget on.
 
     Args:
         points: All of them; those that predict several scenes at once are left out, as a budget is for one scene.
-        measure: The error that counts.
-        seed: Of the bootstrap.
     """
-    ranks = rank(points, measure, seed)
+    ranks = rank(points)
     usable = [point for point in points if point.competes and point.batch == 1 and point.name in ranks]
     steps: list[Recommendation] = []
     least = math.inf
     for point in sorted(usable, key=lambda point: (point.milliseconds, ranks[point.name].mean)):
         if ranks[point.name].mean < least:
             least = ranks[point.name].mean
-            steps.append(Recommendation(point.milliseconds, point.name, _sentence(point, usable, ranks, measure)))
+            steps.append(Recommendation(point.milliseconds, point.name, _sentence(point, usable, ranks)))
     return steps
 
 
@@ -248,7 +218,7 @@ _DO = {
 _BEST = {Kind.MODEL: "the best emulator", Kind.SIMULATOR: "the best simulator setting"}
 
 
-def _sentence(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank], measure: str) -> str:
+def _sentence(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank]) -> str:
     if point.exact:
         return f"Run the simulator as it is ({point.milliseconds:.3g} ms per frame): it made these data."
     unit = Unit.of(one.mean for one in ranks.values())
@@ -256,7 +226,7 @@ def _sentence(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank], 
     beside = f"; {_BEST[competitor.kind]} there, {competitor.name}, has " if competitor else ""
     beside += _error(ranks[competitor.name], unit) if competitor else ""
     return (
-        f"{_DO[point.kind]} {point.name}: {describe_measure(measure)} {_error(ranks[point.name], unit)}, "
+        f"{_DO[point.kind]} {point.name}: MSE of the full rollout {_error(ranks[point.name], unit)}, "
         f"{point.milliseconds:.3g} ms per frame{beside}."
     )
 
@@ -275,20 +245,21 @@ def _error(rank: Rank, unit: Unit) -> str:
     return f"{unit.show(rank.mean, 3)} ({unit.show(rank.low, 3)} to {unit.show(rank.high, 3)}){unit}"
 
 
-def beside_simulator(points: Sequence[Point], measure: str = "mse") -> str:
+def beside_simulator(points: Sequence[Point]) -> str:
     """The most accurate emulator beside the simulator's stable settings, in a sentence; empty without emulators."""
-    timed = [point for point in points if point.competes and math.isfinite(point.mean(measure))]
+    timed = [point for point in points if point.competes and math.isfinite(point.mean("mse"))]
     simulators = [point for point in timed if point.kind is Kind.SIMULATOR]
     models = [point for point in timed if point.kind is Kind.MODEL and point.batch == 1]
     if not models:
         return ""
-    model = min(models, key=lambda model: model.mean(measure))
+    model = min(models, key=lambda model: model.mean("mse"))
     as_fast = [point for point in simulators if point.milliseconds <= model.milliseconds]
-    as_good = [point for point in simulators if point.mean(measure) <= model.mean(measure)]
+    as_good = [point for point in simulators if point.mean("mse") <= model.mean("mse")]
+    error = model.mean("mse")
     fast, good = "no stable simulator setting is as fast", "none is as accurate"
     if as_fast:
-        best = min(as_fast, key=lambda point: point.mean(measure))
-        fast = f"{best.name} is no slower and has {best.mean(measure) / model.mean(measure):.2g} × its error"
+        best = min(as_fast, key=lambda point: point.mean("mse"))
+        fast = f"{best.name} is no slower and has {best.mean('mse') / error:.2g} × its error"
     if as_good:
         cheapest = min(as_good, key=lambda point: point.milliseconds)
         good = (

@@ -156,9 +156,9 @@ def _figure(value: float) -> float | None:
     return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
-def likely_points(points: Sequence[Point], measure: str = "mse") -> list[Point]:
-    """The points in the Pareto set of time and an error, or likely to be, and the floors."""
-    ranks = rank(points, measure)
+def likely_points(points: Sequence[Point]) -> list[Point]:
+    """The points in the Pareto set of time and MSE, or likely to be, and the floors."""
+    ranks = rank(points)
     return [
         point
         for point in points
@@ -198,7 +198,7 @@ def _summary(
     particles = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
     frames = max(scenes.frames(index) for index in range(len(scenes)))
     horizons = [name for name in measure_names(points) if name.startswith("mse@") and name != f"mse@{frames}"]
-    ranks = rank(points, "mse")
+    ranks = rank(points)
     unit = Unit.of([point.mean(name) for point in shown for name in (*horizons, "mse", "emd")])
     heads = [name.replace("mse", "MSE") for name in horizons]
     ordered = sorted(shown, key=lambda point: (point.kind is Kind.FLOOR, point.milliseconds))

@@ -83,7 +83,7 @@ def test_kinds_are_drawn_apart_and_names_stay_inside(tmp_path, monkeypatch):
         point("ours", time=1.0, errors=(0.8, 1.2), model="ours"),
         point("ours, batch 8", time=0.5, errors=(0.8, 1.2), batch=8),
         point("ours, free", time=0.9, errors=(0.8, 1.2), failures={0: "gains 30% of energy"}),
-        point("theirs (of other scenes)", time=0.7, errors=(0.9, 1.1), model="theirs (of other scenes)"),
+        point("theirs (of other scenes)", time=0.7, errors=(0.9, 1.1), scenes_differ_in="domain"),
         point("a graph", Kind.OTHER, 3.0, (2.0, 2.4)),
         point("nothing moves", Kind.TRIVIAL, 0.001, (50.0, 50.0)),
         point("twin: 6 of 12 substeps", Kind.FLOOR, 4.0, (0.4, 0.6)),
