@@ -33,18 +33,18 @@ TOLERANCE = 1e-3
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["export", "goop", "--format", "onnx"]."""
-    chosen = _parser().parse_args(words[1:])
-    out = chosen.out or Path(f"{_file_stem(chosen.model, chosen.part)}.{chosen.format}")
-    if out.suffix != f".{chosen.format}":
-        raise ConfigError(f"--out {out}: for --format {chosen.format} its name must end in .{chosen.format}.")
+    options = _parser().parse_args(words[1:])
+    out = options.out or Path(f"{_file_stem(options.model, options.part)}.{options.format}")
+    if out.suffix != f".{options.format}":
+        raise ConfigError(f"--out {out}: for --format {options.format} its name must end in .{options.format}.")
     check_output("--out", out)
-    check_device(chosen.device)
-    if chosen.format == "onnx" and chosen.device != "cpu":
+    check_device(options.device)
+    if options.format == "onnx" and options.device != "cpu":
         raise ConfigError(
-            f"--device {chosen.device}: ONNX files run on any device, which ONNX Runtime's providers decide; leave the"
+            f"--device {options.device}: ONNX files run on any device, which ONNX Runtime's providers decide; leave the"
             " option out, or take --format pt2, whose machine code is for one device."
         )
-    _export(chosen, out)
+    _export(options, out)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -75,18 +75,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _export(chosen: argparse.Namespace, out: Path) -> None:
+def _export(options: argparse.Namespace, out: Path) -> None:
     from nmpm._support.devices import find_device
     from nmpm._support.progress import progress_bar
     from nmpm.zoo import export, load_model
 
-    model = load_model(chosen.model, root=chosen.root)
-    emulator = model.emulator.unconstrained() if chosen.free else model.emulator
+    model = load_model(options.model, root=options.root)
+    emulator = model.emulator.unconstrained() if options.free else model.emulator
     kinds: Mapping[str, type[Part]] = {kind.__name__: kind for kind in (export.Step, export.Network, export.Solid)}
-    part = kinds[chosen.part](emulator).to(find_device(chosen.device))
-    form = export.FORMATS[chosen.format]
+    part = kinds[options.part](emulator).to(find_device(options.device))
+    form = export.FORMATS[options.format]
     with progress_bar(f"Writing {out.name}", 2) as step:
-        form.write(part, export.description(part, chosen.model, _training_data(model.card)), out)
+        form.write(part, export.description(part, options.model, _training_data(model.card)), out)
         step(f"Comparing {out.name} with the model")
         difference = form.difference(part, out, batch=1, count=300)
     if not difference <= TOLERANCE:

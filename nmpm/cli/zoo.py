@@ -30,17 +30,9 @@ def run(words: list[str]) -> int | None:
     if not words[1:]:
         parser.print_help(sys.stderr)
         return 2
-    chosen = parser.parse_args(words[1:])
-    actions: dict[str, Callable[[argparse.Namespace], int | None]] = {
-        "list": _list,
-        "card": _card,
-        "add": _add,
-        "verify": _verify,
-        "refresh": _refresh,
-        "push": _push,
-        "pull": _pull,
-    }
-    return actions[chosen.command](chosen)
+    options = parser.parse_args(words[1:])
+    action: Callable[[argparse.Namespace], int | None] = options.action
+    return action(options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -50,23 +42,27 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--root", type=Path, help=_ROOT)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add_command(name: str, about: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
+    def add_command(action: Callable[[argparse.Namespace], int | None], about: str) -> argparse.ArgumentParser:
+        name = action.__name__.removeprefix("_")
+        command = commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
+        command.set_defaults(action=action)
+        command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
+        return command
 
-    listing = add_command("list", "names, data and full-rollout errors of the models")
-    card = add_command("card", "errors, times, training and known failures of one model")
+    add_command(_list, "names, data and full-rollout errors of the models")
+    card = add_command(_card, "errors, times, training and known failures of one model")
     card.add_argument("name", help=_MODEL)
     card.add_argument("--yaml", action="store_true", help="everything known of it, for programs")
-    add = add_command("add", "make an entry of your own zoo, or of --root, from a finished run")
+    add = add_command(_add, "make an entry of your own zoo, or of --root, from a finished run")
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="name of the new model, e.g. goop/mine")
     add.add_argument("--about", default="", help="description of the data and their origin, for the card")
-    verify = add_command("verify", "measure the figures of cards again; 1 if one is not confirmed")
+    verify = add_command(_verify, "measure the figures of cards again; 1 if one is not confirmed")
     verify.add_argument("name", nargs="?", help=f"{_MODEL} (default: every model)")
     verify.add_argument("--full", action="store_true", help="all test scenes to their end (default: a few, 100 frames)")
     verify.add_argument("--data", type=Path, metavar="FOLDER", help="test data, of models of recorded data")
     add_device_option(verify)
-    refresh = add_command("refresh", "write READMEs, charts and the table of --root's models again")
+    refresh = add_command(_refresh, "write READMEs, charts and the table of --root's models again")
     refresh.add_argument("name", nargs="?", help="name of your own, or an entry's folder (default: every model)")
     refresh.add_argument(
         "--measure",
@@ -82,28 +78,26 @@ def _parser() -> argparse.ArgumentParser:
         "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
     )
     add_device_option(refresh, "where the speed is measured: ")
-    push = add_command("push", "upload a model to the Hugging Face hub")
+    push = add_command(_push, "upload a model to the Hugging Face hub")
     push.add_argument("name", help=_MODEL)
     push.add_argument("repository", help="owner/repository, created if missing")
     push.add_argument("--private", action="store_true", help="refuse a public repository; make a new one private")
-    pull = add_command("pull", "download a model of the Hugging Face hub")
+    pull = add_command(_pull, "download a model of the Hugging Face hub")
     pull.add_argument("id", help="owner/repository@revision; a commit always means the same files")
     pull.add_argument("name", nargs="?", help="name of a new entry of your own zoo, or of --root (default: none)")
-    for command in (listing, card, add, verify, refresh, push, pull):
-        command.add_argument("--root", type=Path, default=argparse.SUPPRESS, help=_ROOT)
     return parser
 
 
-def _list(chosen: argparse.Namespace) -> None:
+def _list(options: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ZooError
     from nmpm.zoo.card import lifecycle
     from nmpm.zoo.registry import Zoo
 
-    for name in Zoo.list(chosen.root):
-        own = "yours" if chosen.root is None and Zoo.folder(name).is_relative_to(user_zoo()) else ""
+    for name in Zoo.list(options.root):
+        own = "yours" if options.root is None and Zoo.folder(name).is_relative_to(user_zoo()) else ""
         try:
-            card = Zoo.card(name, chosen.root)
+            card = Zoo.card(name, options.root)
             state, text = str(lifecycle(card)), _summary(card)
         except ZooError as error:
             state, text = "", str(error)
@@ -119,29 +113,24 @@ def _summary(card: Mapping[str, Any]) -> str:
     return f"full-rollout MSE {error}   {one_line(card.get('dataset', 'data not stated'))}"
 
 
-def _card(chosen: argparse.Namespace) -> None:
+def _card(options: argparse.Namespace) -> None:
     from nmpm._support.bounded_files import to_yaml
     from nmpm.errors import ZooError
     from nmpm.zoo.entries import read_card
     from nmpm.zoo.pages import MALFORMED, entry_page
     from nmpm.zoo.registry import find_entry
 
-    card = read_card(find_entry(chosen.name, chosen.root))
-    if chosen.yaml:
+    card = read_card(find_entry(options.name, options.root))
+    if options.yaml:
         sys.stdout.write(to_yaml(card))
         return
     try:
         text = entry_page(card)
     except MALFORMED as error:
         raise ZooError(
-            f"The card of {chosen.name} is not complete ({error}): `nmpm zoo card {chosen.name} --yaml` shows what it"
+            f"The card of {options.name} is not complete ({error}): `nmpm zoo card {options.name} --yaml` shows what it"
             " has."
         ) from error
-    _show_markdown(text)
-
-
-def _show_markdown(text: str) -> None:
-    """Laid out for a terminal; as it is for a file or a pipe."""
     if not sys.stdout.isatty():
         sys.stdout.write(text)
         return
@@ -151,14 +140,14 @@ def _show_markdown(text: str) -> None:
     Console().print(Markdown(text))
 
 
-def _add(chosen: argparse.Namespace) -> None:
+def _add(options: argparse.Namespace) -> None:
     from nmpm.zoo.publish import add
 
-    folder = add(chosen.run, chosen.name, chosen.root, chosen.about)
+    folder = add(options.run, options.name, options.root, options.about)
     sys.stdout.write(f"added {folder}\n")
 
 
-def _verify(chosen: argparse.Namespace) -> int:
+def _verify(options: argparse.Namespace) -> int:
     """Verify a model, which must be possible; or all, of which those of recorded data may be left out.
 
     Of all, a damaged one counts as a figure that is not confirmed.
@@ -167,22 +156,22 @@ def _verify(chosen: argparse.Namespace) -> int:
     from nmpm.zoo.registry import Zoo, find_entry
     from nmpm.zoo.verification import verify_entry
 
-    _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
-    check_device(chosen.device)
+    _check_one("--data is the folder of one model's data", options.data, options.name)
+    check_device(options.device)
     failed, left_out = 0, []
-    for name in Zoo.list(chosen.root) if chosen.name is None else [chosen.name]:
+    for name in Zoo.list(options.root) if options.name is None else [options.name]:
         sys.stdout.write(f"{name}\n")
         try:
-            for check in verify_entry(find_entry(name, chosen.root), chosen.full, chosen.data, chosen.device):
+            for check in verify_entry(find_entry(name, options.root), options.full, options.data, options.device):
                 sys.stdout.write(f"  {check}\n")
                 failed += not check.passed
         except ConfigError as error:
-            if chosen.name is not None:
+            if options.name is not None:
                 raise
             sys.stdout.write(f"  not verified: {error}\n")
             left_out.append(name)
         except NmpmError as error:
-            if chosen.name is not None:
+            if options.name is not None:
                 raise
             sys.stdout.write(f"  FAIL  {error}\n")
             failed += 1
@@ -191,20 +180,20 @@ def _verify(chosen: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _refresh(chosen: argparse.Namespace) -> None:
+def _refresh(options: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.zoo.pages import write_index
     from nmpm.zoo.refresh import refresh
     from nmpm.zoo.registry import Zoo
 
-    _check_one("--data is the folder of one model's data", chosen.data, chosen.name)
-    _check_one("--failures is about one model", chosen.failures, chosen.name)
-    check_device(chosen.device)
-    root = user_zoo() if chosen.root is None else chosen.root
-    names = Zoo.list(root) if chosen.name is None else [chosen.name]
-    folders = [_find_writable(name, chosen.root) for name in names]
+    _check_one("--data is the folder of one model's data", options.data, options.name)
+    _check_one("--failures is about one model", options.failures, options.name)
+    check_device(options.device)
+    root = user_zoo() if options.root is None else options.root
+    names = Zoo.list(root) if options.name is None else [options.name]
+    folders = [_find_writable(name, options.root) for name in names]
     for folder in folders:
-        refresh(folder, chosen.measure, chosen.data, chosen.failures, chosen.device)
+        refresh(folder, options.measure, options.data, options.failures, options.device)
         sys.stdout.write(f"wrote {folder}\n")
     if all(folder.resolve().is_relative_to(root.resolve()) for folder in folders):
         sys.stdout.write(f"wrote {write_index(root, Zoo.list(root))}\n")
@@ -241,26 +230,26 @@ def _find_writable(model: str, root: Path | None) -> Path:
     return Zoo.folder(model, user_zoo())
 
 
-def _push(chosen: argparse.Namespace) -> None:
+def _push(options: argparse.Namespace) -> None:
     from nmpm.zoo.hub import push
     from nmpm.zoo.registry import find_entry
 
-    found = push(find_entry(chosen.name, chosen.root), chosen.repository, chosen.private)
-    sys.stdout.write(f"pushed {found}; load it by that id.\n")
+    commit = push(find_entry(options.name, options.root), options.repository, options.private)
+    sys.stdout.write(f"pushed {commit}; load it by that id.\n")
 
 
-def _pull(chosen: argparse.Namespace) -> None:
+def _pull(options: argparse.Namespace) -> None:
     from nmpm.errors import ConfigError
     from nmpm.zoo.entries import load_entry
     from nmpm.zoo.hub import HubId, download, pull
     from nmpm.zoo.publish import new_entry_folder
 
-    identifier = HubId.parse(chosen.id)
+    identifier = HubId.parse(options.id)
     if identifier is None:
-        raise ConfigError(f"{chosen.id} is not owner/repository@revision; the revision may be a commit, or main.")
-    if chosen.name is None:
+        raise ConfigError(f"{options.id} is not owner/repository@revision; the revision may be a commit, or main.")
+    if options.name is None:
         folder = download(identifier)
         load_entry(folder)
     else:
-        folder = pull(identifier, new_entry_folder(chosen.name, chosen.root), chosen.name)
+        folder = pull(identifier, new_entry_folder(options.name, options.root), options.name)
     sys.stdout.write(f"{identifier} is in {folder}\n")
