@@ -44,8 +44,9 @@ def test_a_pushed_model_is_loaded_by_its_id_rolled_out_and_pulled(hub, root, tmp
     assert main(["zoo", "pull", identifier, "small"]) == 0
     for name in ("small", "small/mine"):  # a variant stays where the model of that name comes later
         assert torch.equal(Zoo.load(name).rollout(state, 8), expected)
-    assert main(["zoo", "pull", identifier, "small/mine"]) == 1
-    assert "exists: choose another name" in capsys.readouterr().err
+    for taken in ("small/mine", "goop"):
+        assert main(["zoo", "pull", identifier, taken]) == 1
+        assert "exists: choose another name" in capsys.readouterr().err
 
 
 def test_a_revision_stays_what_it_was(hub, root, small, write_entry):
@@ -73,15 +74,6 @@ def test_a_cached_model_loads_offline_and_others_say_why_not(hub, root, monkeypa
     finally:
         monkeypatch.undo()
         _http.close_session()
-
-
-def test_a_download_that_is_cut_short_leaves_nothing_behind(hub, root):
-    identifier = push(root / "small", "lab/small")
-    hub.cut.add("model.safetensors")
-    with pytest.raises(ZooError):
-        load_model(str(identifier))
-    hub.cut.clear()
-    assert load_model(str(identifier)).name == "small"
 
 
 def test_weights_that_are_not_those_of_the_card_are_refused(hub, root):
@@ -117,13 +109,6 @@ def test_without_a_revision_nothing_is_fetched(hub):
     assert hub.requests == []
 
 
-def test_all_pictures_of_a_card_are_uploaded():
-    entry = shipped_folder("zoo") / "goop"
-    shown = re.findall(r"!\[.*?\]\((.*?)\)", (entry / "README.md").read_text(encoding="utf-8"))
-    assert shown
-    assert set(shown) <= set(FILES)
-
-
 def test_the_hub_is_told_library_licence_and_results(hub, root):
     card = {"name": "goop", "license": "MIT", "dataset": "goop, simulated by nmpm"}
     metadata = hub_metadata(card | {"test": {"mse": 0.1, "still/mse": 1.0}})
@@ -137,19 +122,6 @@ def test_the_hub_is_told_library_licence_and_results(hub, root):
     assert yaml.safe_load(readme.split("---")[1])["library_name"] == "nmpm"
 
 
-@pytest.fixture
-def offline(monkeypatch):
-    """Turns the hub's client offline."""
-
-    def switch():
-        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-        _http.close_session()
-
-    yield switch
-    monkeypatch.undo()
-    _http.close_session()
-
-
 def damage(cache, file):
     """Change a byte of a file in the hub's cache."""
     for path in cache.rglob(file):
@@ -159,34 +131,18 @@ def damage(cache, file):
 
 
 @pytest.mark.parametrize("file", ["model.safetensors", "card.yaml"])
-def test_a_damaged_file_of_the_cache_is_fetched_again(hub, root, tmp_path, file):
+def test_a_damaged_file_of_the_cache_is_fetched_again_or_named_with_what_to_delete(hub, root, tmp_path, file):
     identifier = push(root / "small", "lab/small")
     load_model(str(identifier))
     damage(tmp_path / "hub-cache", file)
-    assert load_model(str(identifier)).name == "small"
-    asked = len([line for line in hub.requests if line.startswith("GET") and "resolve" in line])
-    load_model(str(identifier))
-    assert asked == len([line for line in hub.requests if line.startswith("GET") and "resolve" in line])
-
-
-def test_offline_a_damaged_file_of_the_cache_is_named_with_what_to_delete(hub, root, tmp_path, offline):
-    identifier = push(root / "small", "lab/small")
-    load_model(str(identifier))
-    damage(tmp_path / "hub-cache", "model.safetensors")
-    offline()
+    hub.cut.add(file)  # a download that ends half-way
     with pytest.raises(ZooError, match=r"SHA-256 differs.*delete .*hub-cache/models--lab--small and load it again"):
-        load_model(str(identifier))
-
-
-def test_a_damaged_file_that_cannot_be_fetched_again_is_named_with_what_to_delete(hub, root, tmp_path):
-    identifier = push(root / "small", "lab/small")
-    load_model(str(identifier))
-    damage(tmp_path / "hub-cache", "model.safetensors")
-    hub.cut.add("model.safetensors")
-    with pytest.raises(ZooError, match=r"delete .*hub-cache/models--lab--small and load .* cannot be downloaded"):
         load_model(str(identifier))
     hub.cut.clear()
     assert load_model(str(identifier)).name == "small"
+    asked = len(hub.requests)
+    load_model(str(identifier))
+    assert not [line for line in hub.requests[asked:] if line.startswith("GET") and "resolve" in line]
 
 
 @pytest.fixture
@@ -213,13 +169,6 @@ def test_a_pulled_model_has_its_own_name_and_source_and_can_be_pushed_on(hub, go
     again = hub.commits["lab/again"][-1][1]["README.md"].decode()
     assert len([line for line in again.splitlines() if line == "---"]) == 2
     assert 'Zoo.load("lab/again@main")' in again
-
-
-def test_a_pulled_model_does_not_hide_a_shipped_one(hub, root, capsys):
-    push(root / "small", "lab/small")
-    assert main(["zoo", "pull", "lab/small@main", "goop"]) == 1
-    assert "goop exists: choose another name" in capsys.readouterr().err
-    assert Zoo.load("goop").card["dataset"].startswith("goop")
 
 
 def test_files_that_an_entry_no_longer_has_are_deleted_on_the_hub(hub, goop):

@@ -32,6 +32,7 @@ def fit(make_dataset, tmp_path, monkeypatch):
     return train
 
 
+@pytest.mark.slow
 def test_a_fine_tuned_model_is_added_loaded_and_exported(fit, home, tmp_path, capsys):
     fit("runs/first")
     assert main(["zoo", "add", "runs/first", "first", "--about", "Made up."]) == 0

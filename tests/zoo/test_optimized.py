@@ -59,22 +59,17 @@ def test_what_runs_here_is_taken_and_checked(model, caplog, monkeypatch):
     assert "openvino, float32: within" in caplog.text
     state = model.example(count=50)
     torch.testing.assert_close(quick.rollout(state, 8), model.rollout(state, 8), rtol=0, atol=1e-4)
+    assert model.optimized("eager", "bfloat16").emulator.network_precision == torch.bfloat16
+    with pytest.raises(ConfigError, match="float32 or bfloat16, not in 'float61'"):
+        model.optimized("openvino", "float61")
+    with pytest.raises(ConfigError, match="runs on CPUs; the model is on meta"):
+        model.to("meta").optimized("openvino")
     with pytest.raises(ConfigError, match="openvino has no gradients"):
         quick.differentiable_rollout(model.example(count=50).map(needs_gradients), 8)
 
 
 def needs_gradients(values):
     return values.clone().requires_grad_() if values.is_floating_point() else values
-
-
-@pytest.mark.filterwarnings("ignore:This processor has no bfloat16")
-def test_the_precision_is_that_asked_for(model):
-    if find_spec("openvino") is None:  # importing it would report to its makers
-        pytest.skip("openvino is not installed")
-    quick = model.optimized("openvino", "bfloat16")
-    assert quick.emulator.network_precision == torch.bfloat16
-    with pytest.raises(ConfigError, match="float32 or bfloat16, not in 'float61'"):
-        model.optimized("openvino", "float61")
 
 
 def test_without_a_faster_one_it_is_torch(model, monkeypatch):
@@ -93,10 +88,3 @@ def test_a_runtime_that_computes_something_else_is_refused(model, monkeypatch):
     with pytest.raises(ConfigError, match="openvino computes something else than torch: positions after one bundle"):
         model.optimized("openvino")
     assert isinstance(model.optimized().emulator.runtime, Eager)
-
-
-def test_a_model_on_another_device_says_that_openvino_is_of_the_cpu(model):
-    if find_spec("openvino") is None:  # importing it would report to its makers
-        pytest.skip("openvino is not installed")
-    with pytest.raises(ConfigError, match="runs on CPUs; the model is on meta"):
-        model.to("meta").optimized("openvino")
