@@ -1,6 +1,5 @@
 """Models on the hub, tried against a fake of it: pushed, pulled, loaded by id, offline, damaged, private, cut short."""
 
-
 import huggingface_hub
 import pytest
 import torch
