@@ -50,18 +50,6 @@ def with_unit(value: float) -> str:
     return f"{unit.show(value, 3)}{unit}"
 
 
-def figure_names(figures: Mapping[str, float]) -> list[str]:
-    """Names of the model's figures: MSE at horizons in order, the full rollout's after them, then the rest."""
-    names = [name for name in figures if "/" not in name]
-    return sorted(names, key=lambda name: (not name.startswith("mse"), "@" not in name, _horizon(name)))
-
-
-def predictor_figures(figures: Mapping[str, float], kind: str) -> list[float | None]:
-    """A predictor's figures in the order of `figure_names`; None where it has none."""
-    prefix = "" if kind == "model" else f"{kind}/"
-    return [figures.get(prefix + name) for name in figure_names(figures)]
-
-
 def figures_unit(figures: Mapping[str, float]) -> Unit:
     """The unit of the figures of a model and of the trivial predictors."""
     # By how far things move, if that is known: a model may be nearly perfect, or diverge.
@@ -70,15 +58,21 @@ def figures_unit(figures: Mapping[str, float]) -> Unit:
 
 
 def error_table(what: str, figures: Mapping[str, float]) -> Table:
-    """The errors of a model beside those of the trivial predictors, in one unit, which the title names."""
-    names, unit = figure_names(figures), figures_unit(figures)
+    """The errors of a model beside those of the trivial predictors, in one unit, which the title names.
+
+    MSE at horizons come in order, the full rollout's after them, then the rest.
+    """
+    names = [name for name in figures if "/" not in name]
+    names.sort(key=lambda name: (not name.startswith("mse"), "@" not in name, int(name.partition("@")[2] or 0)))
+    unit = figures_unit(figures)
     lengths = "MSE in length², EMD in length" if any(name.startswith("emd") for name in names) else "MSE in length²"
     table = Table(title=f"{what} error{unit} ({lengths})")
     table.add_column("predictor")
     for name in names:
         table.add_column(name, justify="right")
     for kind, label in PREDICTORS.items():
-        row = predictor_figures(figures, kind)
+        prefix = "" if kind == "model" else f"{kind}/"
+        row = [figures.get(prefix + name) for name in names]
         table.add_row(label, *("" if value is None else unit.show(value) for value in row))
     return table
 
@@ -93,7 +87,3 @@ def no_better_than_trivial(figures: Mapping[str, float]) -> str:
         f"The model is no better than a trivial predictor: its error is {with_unit(figures['mse'])}, that of"
         f" '{PREDICTORS[best]}' {with_unit(trivial[best])}. Train it longer, or on more data, before using it."
     )
-
-
-def _horizon(name: str) -> int:
-    return int(name.partition("@")[2] or 0)

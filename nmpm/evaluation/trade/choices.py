@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -224,28 +225,26 @@ class PredictorChoice(Choice):
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         state = scenes.window(indices, 0).initial
-        return lambda frames: _require_shape(self.name, self.predictor(state, frames), state, frames)
+        batch, count, dim = state.position.shape
+
+        def predict(frames: int) -> Tensor:
+            position, shape = self.predictor(state, frames), (batch, frames, count, dim)
+            if tuple(position.shape) != shape:
+                raise DataError(f"{self.name} returns {tuple(position.shape)} positions, not {shape}.")
+            return position
+
+        return predict
 
 
-def _require_shape(name: str, position: Tensor, state: Particles, frames: int) -> Tensor:
-    batch, count, dim = state.position.shape
-    if tuple(position.shape) != (batch, frames, count, dim):
-        raise DataError(f"{name} returns {tuple(position.shape)} positions, not {(batch, frames, count, dim)}.")
-    return position
-
-
-TRIVIAL: Mapping[str, Callable[[Scene], Callable[[Particles, int], Tensor]]] = MappingProxyType(
-    {
-        "nothing moves": lambda _: lambda state, frames: still(state, frames).contiguous(),
-        "free fall": lambda scene: lambda state, frames: free_fall(scene, state, frames),
-    }
+TRIVIAL: Mapping[str, Callable[[Scene, Particles, int], Tensor]] = MappingProxyType(
+    {"nothing moves": lambda _, state, frames: still(state, frames).contiguous(), "free fall": free_fall}
 )
-"""Trivial predictors of a scene, by name."""
+"""Trivial predictors, by name."""
 
 
 def trivial_choice(name: str, scene: Scene) -> PredictorChoice:
     """A predictor of `TRIVIAL`."""
-    return PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=TRIVIAL[name](scene))
+    return PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=partial(TRIVIAL[name], scene))
 
 
 def imported_choice(path: str, scene: Scene) -> PredictorChoice:

@@ -119,14 +119,13 @@ def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
     return read_scenes(name, folder, count)
 
 
-def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = None) -> Scenes:
+def read_scenes(name: str, folder: Path, count: int) -> Scenes:
     """The first `count` test trajectories of a dataset in native layout.
 
     Args:
         name: Of the dataset.
         folder: Holds `test.h5` and `metadata.json`.
         count: Fewer where the split has fewer.
-        preset: The simulator of the scenes, where the metadata do not name it; the trajectories must state their seeds.
 
     Raises:
         DataError: if files are missing or wrong.
@@ -134,8 +133,8 @@ def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = Non
     """
     metadata = read_metadata(folder)
     simulation = metadata.extra.get("simulation")
-    if preset is None and isinstance(simulation, dict) and "preset" in simulation:
-        preset = preset_from_dict(simulation["preset"])
+    plain = simulation.get("preset") if isinstance(simulation, dict) else None
+    preset = None if plain is None else preset_from_dict(plain)
     scene = infer_scene(folder) if preset is None else preset.scene
     split = Split(find_split(folder, "test"))
     recordings = SplitRecordings(split, metadata, scene)
@@ -143,7 +142,8 @@ def read_scenes(name: str, folder: Path, count: int, preset: Preset | None = Non
     indices = range(min(count, len(recordings)))
     seeds = tuple(_seed(split, index) for index in indices) if preset else ()
     scenes = Scenes(name, scene, tuple(recordings[index] for index in indices), preset, seeds)
-    _check_start(scenes)
+    if preset is not None:
+        _check_start(scenes, preset)
     return scenes
 
 
@@ -156,15 +156,13 @@ def _seed(split: Split, index: int) -> int:
     return int(seed)
 
 
-def _check_start(scenes: Scenes) -> None:
+def _check_start(scenes: Scenes, preset: Preset) -> None:
     """Make sure that the preset draws the initial state that the first trajectory has."""
-    if scenes.preset is None:
-        return
-    drawn = torch.from_numpy(scenes.preset.draw(scenes.seeds[0]).position).float()
+    drawn = torch.from_numpy(preset.draw(scenes.seeds[0]).position).float()
     recorded = scenes.recordings[0].frames[0]
     if drawn.shape != recorded.shape or not torch.allclose(drawn, recorded, atol=1e-5):
         raise ConfigError(
-            f"The simulator {scenes.preset.name} does not draw the initial states of {scenes.name}: they were made by"
+            f"The simulator {preset.name} does not draw the initial states of {scenes.name}: they were made by"
             " another version or preset. Simulate the dataset again, or measure without a simulator."
         )
 

@@ -41,7 +41,7 @@ def test_probability_of_the_slower_point_is_that_of_drawing_its_good_scene():
 
 def test_resampling_pairs_the_points_and_intervals_contain_the_mean():
     errors = np.random.default_rng(0).random((3, 8))
-    np.testing.assert_array_equal(resampled_means(errors, 1), resampled_means(errors, 1))
+    np.testing.assert_array_equal(resampled_means(errors), resampled_means(errors))
     twice = resampled_means(np.stack([errors[0], 2 * errors[0]]))
     np.testing.assert_allclose(twice[:, 1], 2 * twice[:, 0])
     bounds = intervals(np.stack([np.full(6, 3.0), np.arange(6.0)]))

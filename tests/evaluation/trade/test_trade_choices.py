@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from nmpm._support.digests import short_digest
-from nmpm.data.catalog import describe
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.trade import Kind, Sweep, find_wider_scenes, make_choices, read_sweep, shipped_sweep_text
 from nmpm.evaluation.trade.choices import follow_nearest
@@ -145,7 +144,7 @@ def test_predictors_that_cannot_be_used_are_named(path, message, scenes):
 def test_wider_scenes_are_simulated_once_over_a_wider_domain(tmp_path, monkeypatch):
     tiny = dataclasses.replace(load_preset("goop").coarsened(4).with_frames(4), substeps=6)
     monkeypatch.setenv("NMPM_HOME", str(tmp_path))
-    monkeypatch.setattr("nmpm.evaluation.trade.scenes.load_preset", lambda name: {describe("goop").preset: tiny}[name])
+    monkeypatch.setattr("nmpm.evaluation.trade.scenes.load_preset", {"goop": tiny}.get)
     wide = find_wider_scenes("goop", 1, 2)
     assert (wide.name, len(wide)) == ("goop-2-times-as-wide", 1)
     (left, right), _ = tiny.scene.domain
