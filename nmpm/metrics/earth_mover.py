@@ -48,8 +48,8 @@ class EarthMover(RolloutMetric):
             earth_mover_of_materials(ours[:, real], theirs[:, real], kinds[real])
             for ours, theirs, real, kinds in zip(*on_cpu, strict=True)
         ]
-        found = torch.tensor(means, dtype=torch.float32, device=predicted.device)
-        self.distances.append(found)  # type: ignore[union-attr]  # (a list until gathered)
+        distances = torch.tensor(means, dtype=torch.float32, device=predicted.device)
+        self.distances.append(distances)  # type: ignore[union-attr]  # (a list until gathered)
 
     def compute(self) -> dict[str, Tensor]:
         """The mean over trajectories, by the name "emd"; empty where no trajectory was added."""
@@ -91,8 +91,8 @@ def earth_mover_of_materials(ours: Tensor, theirs: Tensor, material: Tensor, mos
     """
     means = []
     for kind in material.unique():
-        chosen = (material == kind).nonzero().squeeze(1)
-        if most is not None and len(chosen) > most:
-            chosen = chosen[torch.randperm(len(chosen), generator=torch.Generator().manual_seed(0))[:most]]
-        means.append(earth_mover(ours[:, chosen], theirs[:, chosen]))
+        indices = (material == kind).nonzero().squeeze(1)
+        if most is not None and len(indices) > most:
+            indices = indices[torch.randperm(len(indices), generator=torch.Generator().manual_seed(0))[:most]]
+        means.append(earth_mover(ours[:, indices], theirs[:, indices]))
     return float(np.mean(means))

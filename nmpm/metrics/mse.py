@@ -1,7 +1,8 @@
-"""Mean squared position error of rollouts.
+"""Mean squared errors of rollouts.
 
 *MSE at h*: the mean over predicted frames 1 … h, particles that move and dimensions, of the squared position error, in
 domain length squared, from a rollout that starts with frames 0 and 1; *full* is h = T - 2. Averaged over trajectories.
+Evolving fields have an error of their own, over the full rollout.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from nmpm.metrics.base import RolloutMetric
@@ -27,8 +29,8 @@ def overall_error(errors: Mapping[str, Tensor], horizon: int) -> Tensor:
         horizon: Frames from which on a rollout is longer than what a model was trained for.
     """
     horizons = {int(name.removeprefix("mse@")): value for name, value in errors.items() if name.startswith("mse@")}
-    chosen = [errors["mse"], *(value for h, value in horizons.items() if h >= horizon)]
-    return torch.stack(chosen).log().mean().exp()
+    long = [errors["mse"], *(value for h, value in horizons.items() if h >= horizon)]
+    return torch.stack(long).log().mean().exp()
 
 
 class MSE(RolloutMetric):
@@ -78,3 +80,53 @@ class MSE(RolloutMetric):
     def _at_horizons(self, curve: Tensor) -> dict[str, float]:
         row = {f"mse@{h}": float(curve[:h].mean()) for h in self.horizons if h <= len(curve)}
         return row | {"mse": float(curve.mean())}
+
+
+class FieldMSE(Metric):
+    """Mean squared error of evolving fields, in the square of their units, beside that of values that stay.
+
+    Args:
+        names: Of the evolving fields.
+    """
+
+    full_state_update = False
+
+    squared: Tensor
+    constant: Tensor
+    trajectories: Tensor
+
+    def __init__(self, names: Sequence[str]) -> None:
+        super().__init__()
+        self.names = tuple(names)
+        for state in ("squared", "constant", "trajectories"):
+            self.add_state(state, default=torch.zeros(len(self.names)), dist_reduce_fx="sum")
+
+    def update(self, window: Window, predicted: Mapping[str, Tensor]) -> None:
+        """Add rollouts.
+
+        Args:
+            window: B recorded trajectories of T + 2 frames. Fields that they lack do not count.
+            predicted: (B, T, N) by name, from the window's first two frames.
+        """
+        start = window.initial.fields
+        for index, name in enumerate(self.names):
+            if name in predicted and name in window.fields:
+                target = window.field_target(name)
+                self.squared[index] += _squared(predicted[name] - target, window.mask)
+                self.constant[index] += _squared(start[name].unsqueeze(1) - target, window.mask)
+                self.trajectories[index] += len(target)
+
+    def compute(self) -> dict[str, Tensor]:
+        """By the names "mse_FIELD", and "still/mse_FIELD" if each particle keeps its value."""
+        errors: dict[str, Tensor] = {}
+        for index, name in enumerate(self.names):
+            if self.trajectories[index]:
+                errors[f"mse_{name}"] = self.squared[index] / self.trajectories[index]
+                errors[f"still/mse_{name}"] = self.constant[index] / self.trajectories[index]
+        return errors
+
+
+def _squared(difference: Tensor, mask: Tensor) -> Tensor:
+    """Sum over trajectories of the mean square of (B, T, N) differences over frames and real particles."""
+    squared = difference.square() * mask.unsqueeze(1)
+    return (squared.sum((1, 2)) / (mask.sum(1) * difference.shape[1])).sum()

@@ -9,8 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from nmpm.sim.config import check
-from nmpm.sim.state import Array
+from nmpm.sim.state import Array, check
 
 
 @dataclass(frozen=True)

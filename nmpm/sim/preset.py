@@ -14,8 +14,7 @@ from nmpm._support.messages import one_line
 from nmpm._support.plain_data import to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.config import check
-from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory
+from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory, check
 
 BOUNDARY = 3
 """Type id of particles that never move, as in DeepMind's scenes."""

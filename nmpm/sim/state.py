@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.errors import DataError
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval
 
 Array = NDArray[np.float64]
@@ -18,6 +18,12 @@ Array = NDArray[np.float64]
 
 Progress = Callable[[int], object]
 """Called after each frame with the number of frames done."""
+
+
+def check(condition: bool, message: str) -> None:
+    """Raise a ConfigError with the message unless the condition holds."""
+    if not condition:
+        raise ConfigError(message)
 
 
 class Obstacle(abc.ABC):

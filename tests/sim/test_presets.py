@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.sim import InitialState, load_preset, preset_from_dict, preset_names
-from nmpm.sim.mpm.ramps import Ramp, distance_to_ramps
+from nmpm.sim.mpm.layouts import Ramp, distance_to_ramps
 from nmpm.sim.preset import BOUNDARY
 from nmpm.sim.sph.boundary import PolygonObstacle
 from tests.data.fuzzing import FUZZ, VALUES, changed, places

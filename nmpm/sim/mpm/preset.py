@@ -15,13 +15,11 @@ from nmpm._support.plain_data import from_plain
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.blocks import draw_gravity
-from nmpm.sim.config import check
-from nmpm.sim.mpm.blocks import MpmBlockRanges
+from nmpm.sim.mpm.layouts import MpmBlockRanges, Ramp, RampRanges, distance_to_ramps
 from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
-from nmpm.sim.mpm.ramps import Ramp, RampRanges, distance_to_ramps
 from nmpm.sim.mpm.solids import Goop, Sand
 from nmpm.sim.mpm.stability import (
     CFL_LIMIT,
@@ -30,10 +28,10 @@ from nmpm.sim.mpm.stability import (
     longest_travel_substep,
     longest_wave_substep,
 )
-from nmpm.sim.mpm.stepper import REVISION, MpmGrid, MpmParticles, MpmStepper, Walls
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
 from nmpm.sim.mpm.water import Water
 from nmpm.sim.preset import BOUNDARY, Preset
-from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, record_frames
+from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, check, record_frames
 
 MATERIALS: dict[str, type[Material]] = {kind.name: kind for kind in (Water, Sand, Goop)}
 """The constitutive models by name; a new one is added here."""
@@ -46,14 +44,9 @@ _STEPPERS: dict[int, type[MpmStepper]] = {2: Stepper2d, 3: Stepper3d}
 class MpmPreset(Preset):
     """A family of scenes of the material point method; `presets/goop.yaml` comments every entry.
 
+    Box and domain have two or three axes, the second upright. Arguments beside those of `Preset`:
+
     Args:
-        name: Of the family.
-        frames: Simulated frames of a trajectory after its initial state.
-        frame_dt: Time between frames, in seconds.
-        substeps: Substeps of a frame.
-        box: Where particles may be, (lower, upper) along two or three axes, the second upright, in length; walls that
-            hold let them into a layer around it, see `reach`.
-        domain: What an emulator's grid covers, likewise.
         cells: Grid cells along x, from side to side of the box.
         spacing: Distance between particles in the initial lattice, in length.
         gravity: Acceleration, in length per second squared.
@@ -70,7 +63,7 @@ class MpmPreset(Preset):
 
     solver: ClassVar[str] = "mls_mpm"
     generator: ClassVar[str] = "MLS-MPM"
-    revision: ClassVar[int] = REVISION
+    revision: ClassVar[int] = 1
 
     cells: int
     spacing: float

@@ -27,9 +27,6 @@ from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.state import Array
 
-REVISION = 1
-"""Increased whenever the same preset and seed give other numbers."""
-
 # Distance from the box's sides, in cells, at which a particle is clamped. Float32 can still tell it from the side.
 _MARGIN = 1e-4
 

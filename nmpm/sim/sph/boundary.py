@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.config import check
-from nmpm.sim.state import Array, Obstacle
+from nmpm.sim.state import Array, Obstacle, check
 
 LAYERS = 3
 """Layers of dummy particles below a surface: the kernel's reach."""

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
 from nmpm.sim.blocks import BlockRanges, lattice
-from nmpm.sim.config import check
 from nmpm.sim.sph import sums
 from nmpm.sim.sph.boundary import PolygonObstacle, SolidBoundary
-from nmpm.sim.sph.neighbours import CellGrid, PairFinder
-from nmpm.sim.sph.sums import SUPPORT, Pairs, WallPairs
-from nmpm.sim.state import Array
+from nmpm.sim.sph.neighbours import PairLists, Pairs, WallPairs
+from nmpm.sim.sph.sums import SUPPORT
+from nmpm.sim.state import Array, check
 
 Box = tuple[Interval, Interval]
 
@@ -186,23 +185,16 @@ def relax(position: Array, box: tuple[tuple[float, float], tuple[float, float]],
         sweeps: How many.
     """
     boundary = SolidBoundary(box, (), spacing)
-    grid = CellGrid.covering(boundary.position.min(0), boundary.position.max(0), SUPPORT * spacing)
-    finder, wall_finder = PairFinder(grid), PairFinder(grid)
-    order, wall_starts = grid.sort_by_cell(*np.ascontiguousarray(boundary.position.T))
-    wall_x, wall_y = np.ascontiguousarray(boundary.position[order].T)
+    lists = PairLists(boundary.position, SUPPORT * spacing)
     x, y = np.ascontiguousarray(position.T)
     identity, still = np.arange(len(x)), np.zeros_like(x)
     for _ in range(sweeps):
         boundary.clamp(x, y, still, still)
-        order, starts = grid.sort_by_cell(x, y)
+        order, starts = lists.grid.sort_by_cell(x, y)
         x, y, identity = x[order], y[order], identity[order]
-        table = np.stack([x, y])
-        first, second = finder.pairs_within(x, y, starts)
-        pairs = Pairs(first, second, *np.empty((4, len(first))))
-        sums.pair_geometry(table, pairs, spacing)
-        wet, walls = wall_finder.pairs_between(x, y, wall_x, wall_y, wall_starts)
-        wall_pairs = WallPairs(wet, walls, *np.empty((4, len(wet))))
-        sums.wall_geometry(table, wall_x, wall_y, wall_pairs, spacing)
+        pairs, wall_pairs = lists.near(x, y, starts)
+        sums.pair_geometry(np.stack([x, y]), pairs, spacing)
+        sums.wall_geometry(np.stack([x, y]), lists.wall_x, lists.wall_y, wall_pairs, spacing)
         shift = _concentration_gradient(pairs, wall_pairs, len(x), spacing)
         shift *= -_STEP * spacing**2
         shift *= np.minimum(1.0, _LIMIT * spacing / np.maximum(np.hypot(*shift), 1e-30))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,37 @@ from nmpm._support.jit import jit
 from nmpm.sim.state import Array
 
 Indices = NDArray[np.uint32]
-Pairs = tuple[Indices, Indices]
-"""First and second particle of each pair, K each."""
+
+
+class Pairs(NamedTuple):
+    """K pairs of fluid particles, and what `pair_geometry` and `expansion` write of each; arrays of shape (K,).
+
+    Args:
+        first: Index of the first particle.
+        second: Index of the second one.
+        dx: Difference of position along x, first minus second.
+        dy: Likewise along y.
+        f: F.
+        drag: F v · x / (r² + 0.01 h²), which viscosity needs.
+    """
+
+    first: Indices
+    second: Indices
+    dx: Array
+    dy: Array
+    f: Array
+    drag: Array
+
+
+class WallPairs(NamedTuple):
+    """K pairs of a fluid and a wall particle, and what `wall_geometry` writes of each; as `Pairs`, W as `w`."""
+
+    first: Indices
+    second: Indices
+    dx: Array
+    dy: Array
+    f: Array
+    w: Array
 
 
 @dataclass(frozen=True)
@@ -57,38 +87,41 @@ class CellGrid:
         return order, starts[:-1]
 
 
-class PairFinder:
-    """Finds pairs within a grid's cell size, in memory that it reuses.
+class PairLists:
+    """Lists pairs of particles near each other and near the walls, in memory that it reuses.
 
     Args:
-        grid: Covers all particles.
+        walls: (M, 2) positions of the wall particles, which surround all others.
+        reach: Distance within which pairs are listed, in length.
     """
 
-    def __init__(self, grid: CellGrid) -> None:
-        self.grid = grid
-        self._memory = np.empty((2, 1024), np.uint32)
+    def __init__(self, walls: Array, reach: float) -> None:
+        self.grid = CellGrid.covering(walls.min(0), walls.max(0), reach)
+        order, self._wall_starts = self.grid.sort_by_cell(*np.ascontiguousarray(walls.T))
+        self.wall_x, self.wall_y = np.ascontiguousarray(walls[order].T)
+        """(M,) positions of the wall particles in the order that pairs refer to."""
+        self._memory, self._wall_memory = np.empty((2, 1024), np.uint32), np.empty((2, 1024), np.uint32)
 
-    def pairs_within(self, x: Array, y: Array, starts: NDArray[np.int64]) -> Pairs:
-        """Every pair of sorted particles once; valid until the next call."""
-        return self._fill_memory(lambda memory: _pairs_within(x, y, starts, *self._grid_arguments, memory))
-
-    def pairs_between(self, x: Array, y: Array, others_x: Array, others_y: Array, starts: NDArray[np.int64]) -> Pairs:
-        """Every pair of a particle and one of the others, which are sorted; valid until the next call."""
-        return self._fill_memory(
-            lambda memory: _pairs_between(x, y, others_x, others_y, starts, *self._grid_arguments, memory)
+    def near(self, x: Array, y: Array, starts: NDArray[np.int64]) -> tuple[Pairs, WallPairs]:
+        """Every pair of sorted particles once, and every pair of one and a wall particle; valid until the next call."""
+        low, grid = self.grid.low, self.grid
+        cells = float(low[0]), float(low[1]), grid.inverse, grid.size, grid.shape[0]
+        walls = self.wall_x, self.wall_y, self._wall_starts
+        self._memory, count = _fill(self._memory, lambda memory: _pairs_within(x, y, starts, *cells, memory))
+        self._wall_memory, wet = _fill(self._wall_memory, lambda memory: _pairs_between(x, y, *walls, *cells, memory))
+        return (
+            Pairs(*self._memory[:, :count], *np.empty((4, count))),
+            WallPairs(*self._wall_memory[:, :wet], *np.empty((4, wet))),
         )
 
-    @property
-    def _grid_arguments(self) -> tuple[float, float, float, float, int]:
-        grid = self.grid
-        return float(grid.low[0]), float(grid.low[1]), grid.inverse, grid.size, grid.shape[0]
 
-    def _fill_memory(self, fill: Callable[[Indices], int]) -> Pairs:
-        count = fill(self._memory)
-        if count >= self._memory.shape[1]:
-            self._memory = np.empty((2, count + count // 4 + 1), np.uint32)
-            fill(self._memory)
-        return self._memory[0, :count], self._memory[1, :count]
+def _fill(memory: Indices, fill: Callable[[Indices], int]) -> tuple[Indices, int]:
+    """The memory with the pairs, larger if they need more, and their number."""
+    count = fill(memory)
+    if count >= memory.shape[1]:
+        memory = np.empty((2, count + count // 4 + 1), np.uint32)
+        fill(memory)
+    return memory, count
 
 
 @jit

@@ -14,12 +14,11 @@ from nmpm._support.plain_data import from_plain
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.blocks import draw_gravity
-from nmpm.sim.config import check
 from nmpm.sim.preset import BOUNDARY, Preset
 from nmpm.sim.sph.boundary import ObstacleRanges, PolygonObstacle, SolidBoundary, box_particles
 from nmpm.sim.sph.layouts import Column, FluidBlocks, FluidLayout
-from nmpm.sim.sph.wcsph import REVISION, Fluid, SphParticles, SphStepper
-from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, record_frames
+from nmpm.sim.sph.wcsph import Fluid, SphParticles, SphStepper
+from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, check, record_frames
 
 WATER = 5
 """Type id of the particles that flow, as in DeepMind's scenes."""
@@ -36,13 +35,9 @@ at 0.42 too.
 class SphPreset(Preset):
     """A family of scenes of WCSPH; `presets/dambreak2d.yaml` and `presets/wbcsph.yaml` comment every entry.
 
+    Arguments beside those of `Preset`:
+
     Args:
-        name: Of the family.
-        frames: Simulated frames of a trajectory after its initial state.
-        frame_dt: Time between frames, in seconds.
-        substeps: Steps of a frame.
-        box: Where the fluid may be, (lower, upper) along x and y, in length.
-        domain: What an emulator's grid covers, likewise.
         spacing: Distance between particles at rest, in length.
         gravity: Acceleration, in length per second squared.
         gravity_turn: Largest angle by which a trajectory's gravity is turned either way, in degrees.
@@ -57,7 +52,7 @@ class SphPreset(Preset):
 
     solver: ClassVar[str] = "wcsph"
     generator: ClassVar[str] = "WCSPH"
-    revision: ClassVar[int] = REVISION
+    revision: ClassVar[int] = 1
 
     box: tuple[Interval, Interval]
     domain: tuple[Interval, Interval]

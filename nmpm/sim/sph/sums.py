@@ -12,10 +12,9 @@ particles' x, y, velocity along x and y, density, and acceleration along x and y
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from nmpm._support.jit import jit
-from nmpm.sim.sph.neighbours import Indices
+from nmpm.sim.sph.neighbours import Pairs, WallPairs
 from nmpm.sim.state import Array
 
 SUPPORT = 3.0
@@ -26,37 +25,6 @@ NORM = 7.0 / (478.0 * math.pi)
 
 # Particles on the same spot have no direction to push each other in: a tiny distance, squared, keeps F finite.
 _SAME_SPOT = 1e-24
-
-
-class Pairs(NamedTuple):
-    """K pairs of fluid particles, and what `pair_geometry` and `expansion` write of each; arrays of shape (K,).
-
-    Args:
-        first: Index of the first particle.
-        second: Index of the second one.
-        dx: Difference of position along x, first minus second.
-        dy: Likewise along y.
-        f: F.
-        drag: F v · x / (r² + 0.01 h²), which viscosity needs.
-    """
-
-    first: Indices
-    second: Indices
-    dx: Array
-    dy: Array
-    f: Array
-    drag: Array
-
-
-class WallPairs(NamedTuple):
-    """K pairs of a fluid and a wall particle, and what `wall_geometry` writes of each; as `Pairs`, with W as `w`."""
-
-    first: Indices
-    second: Indices
-    dx: Array
-    dy: Array
-    f: Array
-    w: Array
 
 
 @jit

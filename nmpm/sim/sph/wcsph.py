@@ -24,15 +24,11 @@ from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
 from nmpm.errors import UnstableError
-from nmpm.sim.config import check
 from nmpm.sim.sph import sums
 from nmpm.sim.sph.boundary import SolidBoundary
-from nmpm.sim.sph.neighbours import CellGrid, PairFinder
-from nmpm.sim.sph.sums import SUPPORT, Pairs, WallPairs
-from nmpm.sim.state import Array
-
-REVISION = 1
-"""Increased whenever the same preset and seed give other numbers."""
+from nmpm.sim.sph.neighbours import PairLists
+from nmpm.sim.sph.sums import SUPPORT
+from nmpm.sim.state import Array, check
 
 # Margin of the list of pairs, in spacings: a larger one lists more pairs, a smaller one lists them more often.
 _SKIN = 0.4
@@ -138,13 +134,9 @@ class SphStepper:
         self.mass = fluid.density * spacing**2
         self.held_back = 0
         """Particles clamped at surfaces so far."""
-        position = boundary.position
-        grid = CellGrid.covering(position.min(0), position.max(0), (SUPPORT + _SKIN) * spacing)
-        order, self._wall_starts = grid.sort_by_cell(*position.T)
-        self._wall_x, self._wall_y = (np.ascontiguousarray(axis) for axis in position[order].T)
-        self._grid, self._finder, self._wall_finder = grid, PairFinder(grid), PairFinder(grid)
-        self._wall = np.zeros((4, len(position)))
-        self._wall_density = np.full(len(position), fluid.density)
+        self._lists = PairLists(boundary.position, (SUPPORT + _SKIN) * spacing)
+        self._wall = np.zeros((4, len(boundary.position)))
+        self._wall_density = np.full(len(boundary.position), fluid.density)
         self._listed_at = np.empty((2, 0))
         self._spray = np.empty(0, np.int64)
 
@@ -207,15 +199,12 @@ class SphStepper:
         self.held_back += self.boundary.clamp(x, y, vx, vy)
 
     def _list_pairs(self, particles: SphParticles) -> None:
-        order, starts = self._grid.sort_by_cell(particles.table[0], particles.table[1])
+        order, starts = self._lists.grid.sort_by_cell(*particles.table[:2])
         particles.sort(order)
-        x, y = particles.table[:2]
         self._listed_at = particles.table[:2].copy()
-        first, second = self._finder.pairs_within(x, y, starts)
-        wet, walls = self._wall_finder.pairs_between(x, y, self._wall_x, self._wall_y, self._wall_starts)
-        self._pairs = Pairs(first, second, *np.empty((4, len(first))))
-        self._wall_pairs = WallPairs(wet, walls, *np.empty((4, len(wet))))
-        neighbours = sum(np.bincount(side, minlength=len(x)) for side in (first, second, wet))
+        self._pairs, self._wall_pairs = self._lists.near(*particles.table[:2], starts)
+        sides = (self._pairs.first, self._pairs.second, self._wall_pairs.first)
+        neighbours = sum(np.bincount(side, minlength=len(order)) for side in sides)
         self._spray = np.flatnonzero(neighbours < _SPRAY)
 
     def _update_forces(self, particles: SphParticles, dt: float) -> None:
@@ -225,7 +214,7 @@ class SphStepper:
         table, pairs, walls = particles.table, self._pairs, self._wall_pairs
         density = table[4]
         sums.pair_geometry(table, pairs, h)
-        sums.wall_geometry(table, self._wall_x, self._wall_y, walls, h)
+        sums.wall_geometry(table, self._lists.wall_x, self._lists.wall_y, walls, h)
         rate, diffusion = np.zeros_like(density), 2 * fluid.diffusion * h * sound / rest
         sums.expansion(pairs, table, self.mass, diffusion, rest / sound**2 * self.gravity, 0.01 * h * h, rate)
         sums.wall_expansion(walls, table, self.mass / self._wall_density, rate)

@@ -222,14 +222,14 @@ def test_one_in_the_way_of_a_model_without_walls_is_left_out():
 def test_made_up_scenes_are_not_weightless_where_gravity_varies(group, runs, monkeypatch):
     emulator = emulator_of(box(gravity=None, gravity_varies=True))
     emulator.input_std[[name.startswith("gravity") for name in emulator.scene.input_channels]] = 1.0
-    module, name = runs.split(".")
-    pulls, run = [], getattr(importlib.import_module(f"nmpm.evaluation.stress.{module}"), name)
+    module, name = importlib.import_module(f"nmpm.evaluation.stress.{runs.split('.')[0]}"), runs.split(".")[1]
+    pulls, run = [], getattr(module, name)
 
     def noting(model, state, *rest):
         pulls.append(state.gravity)
         return run(model, state, *rest)
 
-    monkeypatch.setattr(f"nmpm.evaluation.stress.{runs}", noting)
+    monkeypatch.setattr(module, name, noting)
     assert list(battery(ModelUnderTest("turned", emulator, 8), TINY, {group: GROUPS[group]}))
     assert pulls
     assert all((pull[:, 1] < 0).all() and (pull[:, 0] == 0).all() for pull in pulls)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
 from nmpm.sim import load_preset
-from nmpm.sim.mpm.ramps import Ramp, RampRanges, distance_to_ramps
+from nmpm.sim.mpm.layouts import Ramp, RampRanges, distance_to_ramps
 
 GOOP = load_preset("goop")
 

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
-from nmpm.sim.sph.neighbours import CellGrid, PairFinder
+from nmpm.sim.sph.neighbours import PairLists
 from nmpm.sim.sph.sums import NORM, SUPPORT, slope, weight
 
 LOW, HIGH = np.array([-0.3, 0.1]), np.array([0.9, 0.8])
@@ -34,45 +34,33 @@ def points(most=40):
     )
 
 
-def sorted_points(grid, position):
-    order, starts = grid.sort_by_cell(*np.ascontiguousarray(position.T))
+def near(position, walls, reach):
+    """The lists, the sorted positions, and the two sets of pairs."""
+    lists = PairLists(walls, reach)
+    order, starts = lists.grid.sort_by_cell(*np.ascontiguousarray(position.T))
+    assert sorted(order) == list(range(len(position)))
     x, y = np.ascontiguousarray(position[order].T)
-    return order, starts, x, y
+    return lists, x, y, *lists.near(x, y, starts)
 
 
 def as_set(pairs):
-    return {tuple(map(int, pair)) for pair in zip(*pairs, strict=True)}
+    return {tuple(map(int, pair)) for pair in zip(*pairs[:2], strict=True)}
 
 
-@settings(max_examples=50, deadline=None)
-@given(points(), st.floats(0.05, 0.5))
-def test_pairs_within_are_those_of_brute_force_each_once(position, reach):
-    grid = CellGrid.covering(LOW, HIGH, reach)
-    _, starts, x, y = sorted_points(grid, position)
-    first, second = PairFinder(grid).pairs_within(x, y, starts)
-    near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < reach * reach
-    assert as_set((first, second)) == as_set(np.nonzero(np.triu(near, 1)))
-    assert len(first) == len(as_set((first, second)))
-
-
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(points(), points(), st.floats(0.05, 0.5))
-def test_pairs_between_are_those_of_brute_force(position, others, reach):
-    grid = CellGrid.covering(LOW, HIGH, reach)
-    _, starts, other_x, other_y = sorted_points(grid, others)
-    x, y = np.ascontiguousarray(position.T)
-    pairs = PairFinder(grid).pairs_between(x, y, other_x, other_y, starts)
-    near = (x[:, None] - other_x) ** 2 + (y[:, None] - other_y) ** 2 < reach * reach
-    assert as_set(pairs) == as_set(np.nonzero(near))
+def test_pairs_are_those_of_brute_force_each_once(position, others, reach):
+    corners = np.array([[LOW[0], LOW[1]], [HIGH[0], HIGH[1]]])
+    lists, x, y, pairs, wall_pairs = near(position, np.concatenate([others, corners]), reach)
+    close = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < reach * reach
+    assert as_set(pairs) == as_set(np.nonzero(np.triu(close, 1)))
+    assert len(pairs.first) == len(as_set(pairs))
+    close = (x[:, None] - lists.wall_x) ** 2 + (y[:, None] - lists.wall_y) ** 2 < reach * reach
+    assert as_set(wall_pairs) == as_set(np.nonzero(close))
 
 
 def test_memory_grows_with_the_pairs():
-    grid = CellGrid.covering(LOW, HIGH, 0.1)
-    finder = PairFinder(grid)
-    rng = np.random.default_rng(0)
-    for count in (10, 2000, 100):
-        position = rng.uniform(LOW, HIGH, (count, 2))
-        _, starts, x, y = sorted_points(grid, position)
-        assert as_set(finder.pairs_within(x, y, starts)) == as_set(
-            cKDTree(np.stack([x, y], -1)).query_pairs(0.1, output_type="ndarray").T
-        )
+    position = np.random.default_rng(0).uniform(LOW, HIGH, (2000, 2))
+    _, x, y, pairs, _ = near(position, np.array([LOW, HIGH]), 0.1)
+    expected = cKDTree(np.stack([x, y], -1)).query_pairs(0.1, output_type="ndarray").T
+    assert as_set(pairs) == as_set(expected)

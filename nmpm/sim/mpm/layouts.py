@@ -1,0 +1,298 @@
+"""Initial states of the material point method: rectangular blocks of particles, and ramps.
+
+Each block has one velocity. Ramps are slanted bars in the box that do not move, after the setting of DeepMind's
+WaterRamps and SandRamps scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.errors import ConfigError
+from nmpm.scene import Interval
+from nmpm.sim.blocks import BlockRanges, lattice
+from nmpm.sim.state import Array, Obstacle, check
+
+_BLOCK_ATTEMPTS = 10_000
+_RESTARTS = 20
+_RAMP_ATTEMPTS = 500
+_OUTLINE = 96  # points on a bar's outline by which its distance from others is judged
+
+
+@dataclass(frozen=True)
+class DrawnBlocks:
+    """N particles in blocks, sorted by material.
+
+    Args:
+        position: (N, D) in length.
+        velocity: (N, D) in length per second.
+        counts: Particles of each of the preset's materials.
+        extents: Lower and upper corner of each block, (D,) each.
+    """
+
+    position: Array
+    velocity: Array
+    counts: tuple[int, ...]
+    extents: tuple[tuple[Array, Array], ...]
+
+
+@dataclass(frozen=True)
+class MpmBlockRanges(BlockRanges):
+    """How blocks are drawn: `BlockRanges`, and their height in the box.
+
+    Args:
+        height: Least and largest height of a block above the box's bottom, as far as the gap allows; anywhere if None.
+
+    Raises:
+        ConfigError: if a range is empty or a value is out of range.
+    """
+
+    height: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self.height or (0.0, 0.0)
+        check(0 <= low <= high, f"blocks.height = {self.height} needs two numbers, the lower first.")
+
+    def draw(self, box: tuple[Interval, ...], spacing: float, materials: int, rng: np.random.Generator) -> DrawnBlocks:
+        """Random blocks within a box.
+
+        Args:
+            box: (lower, upper) along each axis, in length.
+            spacing: Between the particles of a block, in length.
+            materials: How many there are; blocks take them in turn.
+            rng: To draw with.
+
+        Raises:
+            ConfigError: if no arrangement of blocks fits into the box.
+        """
+        # Drawn once: more blocks fit less often, and drawing anew would leave mostly single ones.
+        number = int(rng.integers(self.number[0], self.number[1] + 1))
+        for _ in range(_BLOCK_ATTEMPTS):
+            lattices = self._draw_lattices(number, len(box), rng)
+            lows = self._place(box, spacing, lattices, rng)
+            if lows is not None:
+                break
+        else:
+            raise ConfigError(
+                f"No room for {self.particles} particles in blocks within {box}: "
+                "take fewer particles, a smaller spacing or a smaller gap."
+            )
+        kinds = _draw_materials(number, materials, rng)
+        speeds = [rng.uniform(-self.speed, self.speed, len(box)) for _ in range(number)]
+        positions, velocities, extents, counts = [], [], [], [0] * materials
+        for block in sorted(range(number), key=kinds.__getitem__):
+            low, shape = lows[block], lattices[block]
+            shift = rng.uniform(-self.jitter, self.jitter, (math.prod(shape), len(shape)))
+            positions.append(lattice(low, shape, spacing, shift))
+            velocities.append(np.broadcast_to(speeds[block], shift.shape))
+            extents.append((low, low + spacing * np.array(shape)))
+            counts[kinds[block]] += len(shift)
+        return DrawnBlocks(np.concatenate(positions), np.concatenate(velocities), tuple(counts), tuple(extents))
+
+    def _draw_lattices(self, number: int, dim: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
+        """Particles of each block along each axis, drawn until their sum is within `particles`."""
+        low, high = self.particles
+        for _ in range(_BLOCK_ATTEMPTS):
+            shares = self.share + (1 - number * self.share) * rng.dirichlet(np.ones(number))
+            sizes = shares * rng.uniform(low, high)
+            lattices = _block_sides(sizes, self.aspect, dim, rng)
+            if low <= int(lattices.prod(axis=1).sum()) <= high:
+                return [tuple(map(int, shape)) for shape in lattices]
+        raise ConfigError(f"No blocks have {self.particles} particles together: widen blocks.particles.")
+
+    def _place(
+        self,
+        box: tuple[Interval, ...],
+        spacing: float,
+        lattices: list[tuple[int, ...]],
+        rng: np.random.Generator,
+    ) -> list[Array] | None:
+        """Lower corners of the blocks, or None if one does not fit or two come too close."""
+        gap = self.gap
+        box_low, box_high = np.array(box).T
+        placed: list[tuple[Array, Array]] = []
+        for shape in lattices:
+            side = spacing * np.array(shape)
+            first, last = box_low + gap, box_high - gap - side
+            if self.height is not None:
+                lowest, highest = self.height
+                first[1], last[1] = max(first[1], box_low[1] + lowest), min(last[1], box_low[1] + highest)
+            if np.any(last < first):
+                return None
+            low = rng.uniform(first, last)
+            if any(
+                np.all((low < other_high + gap) & (other_low < low + side + gap)) for other_low, other_high in placed
+            ):
+                return None
+            placed.append((low, low + side))
+        return [low for low, _ in placed]
+
+
+def _draw_materials(blocks: int, materials: int, rng: np.random.Generator) -> list[int]:
+    """The material of each block: all of them in turn, in random order."""
+    rounds = [rng.permutation(materials) for _ in range(-(-blocks // materials))]
+    return [int(kind) for kind in np.concatenate(rounds)[:blocks]]
+
+
+def _block_sides(sizes: Array, aspect: tuple[float, float], dim: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """(B, D) particles along each axis of blocks with about `sizes` (B,) particles: width, height and depth."""
+    # Height over width, and in three dimensions depth over width after it.
+    least, largest = np.log(aspect)
+    ratios = [np.exp(rng.uniform(least, largest, len(sizes))) for _ in range(dim - 1)]
+    width = np.maximum(1, np.rint((sizes / np.prod(ratios, axis=0)) ** (1 / dim)))
+    depth = [np.maximum(1, np.rint(width * ratio)) for ratio in ratios[1:]]
+    height = np.maximum(1, np.rint(sizes / np.prod([width, *depth], axis=0)))
+    return np.stack([width, height, *depth], axis=1).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Ramp(Obstacle):
+    """A bar: a turned rectangle.
+
+    Args:
+        centre: (x, y) in length.
+        length: Of its longer side.
+        thickness: Of its shorter side.
+        angle: Of the longer side from the x axis, in radians.
+    """
+
+    centre: tuple[float, float]
+    length: float
+    thickness: float
+    angle: float
+
+    @property
+    def _axes(self) -> Array:
+        """(2, 2) unit vectors along and across the bar, as rows."""
+        cos, sin = math.cos(self.angle), math.sin(self.angle)
+        return np.array([[cos, sin], [-sin, cos]])
+
+    @property
+    def _half(self) -> Array:
+        return np.array([self.length, self.thickness]) / 2
+
+    def distance(self, points: Array) -> Array:
+        """(K,) signed distance of points (K, 2) from the bar, negative inside."""
+        beyond = np.abs((points - np.array(self.centre)) @ self._axes.T) - self._half
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+        return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0.0))
+
+    def moved(self, shift: Array) -> Self:
+        """The same bar shifted by (2,), in length."""
+        x, y = self.centre
+        return replace(self, centre=(x + float(shift[0]), y + float(shift[1])))
+
+    def particles(self, spacing: float) -> Array:
+        """(M, 2) a lattice that fills the bar, parallel to its sides, about `spacing` apart."""
+        numbers = ((side, max(1, round(side / spacing))) for side in (self.length, self.thickness))
+        along, across = ((np.arange(number) + 0.5) / number * side - side / 2 for side, number in numbers)
+        local = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
+        return np.asarray(np.array(self.centre) + local @ self._axes)
+
+    def outline(self) -> Array:
+        """(K, 2) points all along the sides, corners included."""
+        corners = self._half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+        along = np.linspace(0, 4, _OUTLINE + 1)[:-1]
+        local = np.stack([np.interp(along, np.arange(5), corners[:, axis]) for axis in range(2)], axis=-1)
+        return np.asarray(np.array(self.centre) + local @ self._axes)
+
+
+@dataclass(frozen=True)
+class RampRanges:
+    """How the ramps of a scene are drawn; lengths in metres.
+
+    Args:
+        number: Least and most of them.
+        length: Least and largest length.
+        thickness: Of all.
+        angle: Least and largest slope, in degrees; to the left or to the right with equal chances.
+        gap: Least distance between them, from the box's sides, and from blocks.
+
+    Raises:
+        ConfigError: if a range is empty or a value is out of range.
+    """
+
+    number: tuple[int, int]
+    length: tuple[float, float]
+    thickness: float
+    angle: tuple[float, float]
+    gap: float
+
+    def __post_init__(self) -> None:
+        check(0 <= self.number[0] <= self.number[1], f"ramps.number = {list(self.number)} needs least and most.")
+        check(0 < self.length[0] <= self.length[1], f"ramps.length = {list(self.length)} needs least and largest.")
+        check(0 <= self.angle[0] <= self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
+        check(0 < self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is not 0 < … ≤ the length.")
+        check(self.gap >= 0, f"ramps.gap = {self.gap} must not be negative.")
+
+    def max_particles(self, spacing: float) -> int:
+        """Upper bound of the particles that the ramps of a scene are made of."""
+        return self.number[1] * max(1, round(self.length[1] / spacing)) * max(1, round(self.thickness / spacing))
+
+    def draw(
+        self, box: tuple[Interval, ...], occupied: Sequence[tuple[Array, Array]], rng: np.random.Generator
+    ) -> tuple[Ramp, ...]:
+        """Random ramps within a box.
+
+        Args:
+            box: (lower, upper) along x and y.
+            occupied: Lower and upper corners, (2,) each, of rectangles to keep clear of.
+            rng: To draw with.
+
+        Raises:
+            ConfigError: if no arrangement fits into the box.
+        """
+        number = int(rng.integers(self.number[0], self.number[1] + 1))
+        for _ in range(_RESTARTS):
+            placed = self._place(number, box, occupied, rng)
+            if placed is not None:
+                return placed
+        raise ConfigError(f"No room for {number} ramps of ramps.length = {list(self.length)} within {box}.")
+
+    def _place(
+        self,
+        number: int,
+        box: tuple[Interval, ...],
+        occupied: Sequence[tuple[Array, Array]],
+        rng: np.random.Generator,
+    ) -> tuple[Ramp, ...] | None:
+        """Bars placed one after the other, or None if the first ones leave no room for the others."""
+        low, high = np.array(box).T
+        placed: list[Ramp] = []
+        for _ in range(_RAMP_ATTEMPTS):
+            if len(placed) == number:
+                return tuple(placed)
+            angle = math.radians(rng.uniform(*self.angle)) * (1 if rng.random() < 0.5 else -1)
+            x, y = rng.uniform(low, high).tolist()
+            drawn = Ramp((x, y), float(rng.uniform(*self.length)), self.thickness, angle)
+            outline = drawn.outline()
+            inside = np.all((outline >= low + self.gap) & (outline <= high - self.gap))
+            clear = all(other.distance(outline).min() >= self.gap for other in placed)
+            if inside and clear and not any(_too_close(drawn, corners, self.gap) for corners in occupied):
+                placed.append(drawn)
+        return None
+
+
+def _too_close(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
+    """Whether a ramp comes closer to a rectangle than the gap."""
+    low, high = corners
+    beyond = np.maximum(np.maximum(low - ramp.outline(), ramp.outline() - high), 0.0)
+    nearest = np.linalg.norm(beyond, axis=1).min()
+    # Corners of the rectangle may come nearer than any point of the outline, or lie within the bar.
+    points = np.stack(np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij"), axis=-1).reshape(-1, 2)
+    return bool(min(nearest, ramp.distance(points).min()) < gap)
+
+
+def distance_to_ramps(ramps: tuple[Ramp, ...], points: Array) -> Array:
+    """(K,) signed distance of points (K, 2) from the nearest bar, negative inside; infinite where there is none."""
+    nearest = np.full(len(points), np.inf)
+    for ramp in ramps:
+        nearest = np.minimum(nearest, ramp.distance(points))
+    return nearest
