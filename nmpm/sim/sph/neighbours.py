@@ -106,9 +106,9 @@ class PairLists:
         """Every pair of sorted particles once, and every pair of one and a wall particle; valid until the next call."""
         low, grid = self.grid.low, self.grid
         cells = float(low[0]), float(low[1]), grid.inverse, grid.size, grid.shape[0]
-        walls = self.wall_x, self.wall_y, self._wall_starts
+        between = self.wall_x, self.wall_y, self._wall_starts, *cells
         self._memory, count = _fill(self._memory, lambda memory: _pairs_within(x, y, starts, *cells, memory))
-        self._wall_memory, wet = _fill(self._wall_memory, lambda memory: _pairs_between(x, y, *walls, *cells, memory))
+        self._wall_memory, wet = _fill(self._wall_memory, lambda memory: _pairs_between(x, y, *between, memory))
         return (
             Pairs(*self._memory[:, :count], *np.empty((4, count))),
             WallPairs(*self._wall_memory[:, :wet], *np.empty((4, wet))),

@@ -199,10 +199,11 @@ class SphStepper:
         self.held_back += self.boundary.clamp(x, y, vx, vy)
 
     def _list_pairs(self, particles: SphParticles) -> None:
-        order, starts = self._lists.grid.sort_by_cell(*particles.table[:2])
+        x, y = particles.table[:2]
+        order, starts = self._lists.grid.sort_by_cell(x, y)
         particles.sort(order)
         self._listed_at = particles.table[:2].copy()
-        self._pairs, self._wall_pairs = self._lists.near(*particles.table[:2], starts)
+        self._pairs, self._wall_pairs = self._lists.near(x, y, starts)
         sides = (self._pairs.first, self._pairs.second, self._wall_pairs.first)
         neighbours = sum(np.bincount(side, minlength=len(order)) for side in sides)
         self._spray = np.flatnonzero(neighbours < _SPRAY)
