@@ -77,7 +77,8 @@ def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = N
     trainer.fit(module, data, ckpt_path=ckpt_path, weights_only=True)
     trainer.save_checkpoint(last)
     weights = torch.cat([value.double().flatten() for value in module.emulator.state_dict().values()])
-    return vars(record) | {"weights": weights.tolist(), "rank": trainer.global_rank}
+    kept = {name: getattr(record, name) for name in ("windows", "losses", "rates", "seeds")}
+    return kept | {"weights": weights.tolist(), "rank": trainer.global_rank}
 
 
 if __name__ == "__main__":

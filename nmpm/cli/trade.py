@@ -29,7 +29,7 @@ _EXAMPLES = """\
 examples:
   nmpm trade goop                               the zoo's models of goop beside its simulator
   nmpm trade goop --models goop runs/a runs/b   models of your own beside it
-  nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) returns it
+  nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) gives it
   nmpm trade FOLDER --models runs/mine          recorded data in native layout: without a simulator
   nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
   nmpm trade goop --config sweep.yaml

@@ -16,13 +16,13 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 
-_SAME_PLACE = 0.25
+_TOLERANCE = 0.25
 """Cells by which a mirror image's walls may be off: bounds of recorded data are widened by single stray particles."""
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What training windows are changed by, at random and differently in each step.
+    """Random changes of training windows, different in each step.
 
     Args:
         mirror: Axes along which half of the windows are mirrored.
@@ -35,16 +35,12 @@ class Augmentation:
     position_noise: float = 0.0
 
     def check(self, scene: Scene, grid: Grid) -> None:
-        """Make sure that a scene and its grid allow the changes.
-
-        Raises:
-            ConfigError: as `check_mirrors` and `check_jitter`.
-        """
+        """Raise ConfigError if a scene and its grid do not allow the changes."""
         check_mirrors(scene, grid, self.mirror)
         check_jitter(scene, grid, self.jitter)
 
     def mirrored(self, window: Window, scene: Scene) -> Window:
-        """The windows, half of them mirrored along each axis; ranks draw for their own ones."""
+        """The windows, half of them mirrored along each axis; each rank draws for its windows."""
         device = window.frames.device
         for axis in self.mirror:
             draws = rank_slice(lambda rows: torch.rand(rows, device=device), len(window.frames))
@@ -52,8 +48,12 @@ class Augmentation:
         return window
 
     def start(self, window: Window) -> Particles:
-        """The state that predictions start from, with noise."""
-        return with_position_noise(window.initial, self.position_noise)
+        """The state that predictions start from, with Gaussian noise on its positions, different on each rank."""
+        initial = window.initial
+        if self.position_noise <= 0:
+            return initial
+        noise = self.position_noise * normal_like(initial.position)
+        return initial.with_motion(initial.position + noise, initial.velocity)
 
     def jittered(self, emulator: Emulator) -> Emulator:
         """The emulator with its grid at another place."""
@@ -61,12 +61,7 @@ class Augmentation:
 
 
 def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
-    """Make sure that a mirror image along each axis is a scene of the same family.
-
-    Raises:
-        ConfigError: if an axis does not exist, gravity acts along it and is not an input of the model, or the image's
-            walls are elsewhere.
-    """
+    """Raise ConfigError if a mirror image along an axis is no scene of the same family: by its gravity, or walls."""
     for axis in axes:
         if not 0 <= axis < scene.dim:
             raise ConfigError(f"mirror: there is no axis {axis} in a scene of {scene.dim}.")
@@ -77,7 +72,7 @@ def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
             )
         (low, high), (outer_low, outer_high) = scene.bounds[axis], scene.domain[axis]
         moved = abs(low + high - outer_low - outer_high) / grid.spacing[axis]
-        if moved > _SAME_PLACE and not scene.periodic[axis]:
+        if moved > _TOLERANCE and not scene.periodic[axis]:
             raise ConfigError(
                 f"mirror: along axis {axis} the bounds {(low, high)} do not lie in the middle of the domain"
                 f" {(outer_low, outer_high)}, about which windows are mirrored: walls of the images would be"
@@ -86,33 +81,22 @@ def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
             )
 
 
-def mirror_windows(window: Window, scene: Scene, axis: int, chosen: Tensor) -> Window:
-    """Replace some windows by their mirror image along an axis, about the domain's middle.
-
-    Args:
-        window: B windows.
-        scene: Gives the domain.
-        axis: Which axis to mirror.
-        chosen: (B,) bool, which windows to mirror.
-    """
+def mirror_windows(window: Window, scene: Scene, axis: int, mirrored: Tensor) -> Window:
+    """Replace those of B windows where `mirrored` (B,) is True by their mirror image about the domain's middle."""
     middle = sum(scene.domain[axis]) / 2
     return dataclasses.replace(
         window,
-        frames=_reflect(window.frames, axis, middle, chosen),
-        obstacle=_reflect(window.obstacle, axis, middle, chosen),
-        gravity=_reflect(window.gravity, axis, 0.0, chosen),
+        frames=_reflect(window.frames, axis, middle, mirrored),
+        obstacle=_reflect(window.obstacle, axis, middle, mirrored),
+        gravity=_reflect(window.gravity, axis, 0.0, mirrored),
     )
 
 
 def check_jitter(scene: Scene, grid: Grid, cells: float) -> None:
-    """Make sure that the grid can be moved.
-
-    Raises:
-        ConfigError: if `cells` is not from 0 to half a cell, or the scene has no wall layer, so that nothing can move.
-    """
+    """Raise ConfigError if `cells` is not from 0 to half a cell, or the scene has no wall layer to move the grid in."""
     if not 0 <= cells <= 0.5:
         raise ConfigError(f"model.jitter = {cells} must be from 0 to 0.5: half a cell to each side is all there is.")
-    if cells and not any(_room(scene, grid, cells)):
+    if cells and not any(_room_to_move(scene, grid, cells)):
         raise ConfigError(
             f"model.jitter = {cells} moves the grid within the wall layer, between bounds and domain, which this scene "
             "lacks: leave it 0, or give the data a larger domain."
@@ -129,11 +113,11 @@ def with_jitter(emulator: Emulator, cells: float) -> Emulator:
         return emulator
     grid = emulator.grid
     draws = (2 * torch.rand(grid.dim, dtype=torch.float64, device="cpu") - 1).tolist()
-    limits = zip(draws, _room(emulator.scene, grid, cells), grid.spacing, strict=True)
+    limits = zip(draws, _room_to_move(emulator.scene, grid, cells), grid.spacing, strict=True)
     return emulator.with_grid_moved([draw * room * spacing for draw, room, spacing in limits])
 
 
-def _room(scene: Scene, grid: Grid, cells: float) -> list[float]:
+def _room_to_move(scene: Scene, grid: Grid, cells: float) -> list[float]:
     """By how many cells the grid can be moved along each axis, at most `cells`."""
     rooms = []
     for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(scene.bounds, scene.domain, strict=True)):
@@ -143,19 +127,8 @@ def _room(scene: Scene, grid: Grid, cells: float) -> list[float]:
     return rooms
 
 
-def with_position_noise(particles: Particles, deviation: float) -> Particles:
-    """The same particles with Gaussian noise of this standard deviation, in domain lengths, on their positions.
-
-    Ranks draw different noise; see `normal_like`.
-    """
-    if deviation <= 0:
-        return particles
-    noise = deviation * normal_like(particles.position)
-    return particles.with_motion(particles.position + noise, particles.velocity)
-
-
-def _reflect(values: Tensor, axis: int, middle: float, chosen: Tensor) -> Tensor:
-    """Reflect one component of the chosen vectors (B, …, D) about `middle`."""
+def _reflect(values: Tensor, axis: int, middle: float, mirrored: Tensor) -> Tensor:
+    """Reflect one component of the vectors (B, …, D) about `middle`, where `mirrored` (B,) is True."""
     reflected = values.clone()
     reflected[..., axis] = 2 * middle - values[..., axis]
-    return torch.where(chosen.reshape(-1, *(1,) * (values.dim() - 1)), reflected, values)
+    return torch.where(mirrored.reshape(-1, *(1,) * (values.dim() - 1)), reflected, values)

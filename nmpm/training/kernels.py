@@ -46,14 +46,14 @@ class PositionErrors(torch.autograd.Function):
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """The gradient with respect to the predicted positions."""
         predicted, target, mask = ctx.saved_tensors
-        found, pull = np.empty(predicted.shape, np.float32), as_array(slope)
+        gradients, pull = np.empty(predicted.shape, np.float32), as_array(slope)
 
         def follow(b: int) -> None:
             arrays = as_array(predicted[b]), as_array(target[b]), as_array(mask[b])
-            square_gradients(*arrays, ctx.spacing, ctx.frames, pull[b], found[b])
+            square_gradients(*arrays, ctx.spacing, ctx.frames, pull[b], gradients[b])
 
-        for_each(follow, len(found), torch.get_num_threads())
-        return torch.from_numpy(found), None, None, None, None
+        for_each(follow, len(gradients), torch.get_num_threads())
+        return torch.from_numpy(gradients), None, None, None, None
 
 
 class Counts(torch.autograd.Function):
@@ -131,11 +131,11 @@ def sum_squares(predicted: Any, target: Any, mask: Any, spacing: Any, frames: An
 
 
 @jit
-def square_gradients(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, slope: Any, found: Any) -> Any:
-    """Fill in `found` (T, N, D), the gradient with respect to `predicted`, from `slope` (T / frames,); see above."""
+def square_gradients(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, slope: Any, out: Any) -> Any:
+    """Fill in `out` (T, N, D), the gradient with respect to `predicted`, from `slope` (T / frames,); see above."""
     scale = 2 / (frames * predicted.shape[2] * np.float64(mask.sum()))
     for frame in range(len(predicted)):
         for d in range(predicted.shape[2]):
             factor = np.float32(scale * slope[frame // frames] / (spacing[d] * spacing[d]))
             for p in range(len(mask)):
-                found[frame, p, d] = factor * (predicted[frame, p, d] - target[frame, p, d]) if mask[p] else ZERO
+                out[frame, p, d] = factor * (predicted[frame, p, d] - target[frame, p, d]) if mask[p] else ZERO

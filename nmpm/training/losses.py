@@ -1,8 +1,7 @@
-"""Training losses: the squared error of positions, and beside it those of the density that they make on the grid and
-of the fields that particles carry.
+"""Training losses: squared errors of positions, of the density that they make on the grid, and of particles' fields.
 
-Position errors may be tempered: those of each window and bundle raised to a power below 1, so that splashes, whose
-errors nothing can reduce much, do not drown what can be learnt elsewhere.
+The position errors of each window and bundle may be raised to a power below 1, so that splashes, whose errors nothing
+can reduce much, do not drown what can be learnt elsewhere.
 """
 
 from __future__ import annotations
@@ -26,15 +25,12 @@ _FLOOR = 1e-4
 
 @dataclass(frozen=True)
 class TrainingError:
-    """What a training minimises: the position error, with the density error at the last frame of each bundle.
+    """The position error, with the density error at the last frame of each bundle.
 
     Args:
         density_weight: Weight of the density error beside the position error in cells².
         power: In (0, 1]; below 1, the position error of each window and bundle is raised to it before the mean; the
             density error, which keeps the volume of splashes, is not.
-
-    Raises:
-        ConfigError: if the power is not in that range.
     """
 
     density_weight: float = 0.0
@@ -105,16 +101,13 @@ def field_errors(difference: Tensor, mask: Tensor, frames: int) -> Tensor:
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:
-    """Mean over frames, real particles and dimensions of the squared position error, in cells².
+    """Mean over frames, real particles and dimensions of the squared position error (), in cells².
 
     Args:
         predicted: (B, T, N, D) positions in domain length.
         target: (B, T, N, D), likewise.
-        mask: (B, N) bool, False for padding.
+        mask: (B, N) bool, False for padding. Without real particles, the error is NaN.
         grid: Gives the cells' size.
-
-    Returns:
-        (); NaN if there is no real particle. Readers refuse such recordings; a check here would synchronise the GPU.
 
     Raises:
         ValueError: if the shapes differ.
@@ -125,18 +118,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
 
 
 def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
-    """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames); NaN for empty ones.
-
-    Args:
-        predicted: (B, T, N, D) positions in domain length.
-        target: (B, T, N, D), likewise.
-        mask: (B, N) bool, False for padding.
-        grid: Gives the cells' size.
-        frames: m; T is a multiple of it.
-
-    Raises:
-        ValueError: if the shapes differ, or T is no multiple of `frames`.
-    """
+    """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames)."""
     check_comparable(predicted, target, frames)  # (kernels check no bounds)
     if _kernels_support(predicted, target, grid):
         from nmpm.training.kernels import PositionErrors
@@ -149,11 +131,7 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
 
 
 def check_comparable(predicted: Tensor, target: Tensor, frames: int) -> None:
-    """Reject predicted positions (B, T, N, D) that differ in shape from their target, or whose last bundle is cut.
-
-    Raises:
-        ValueError: naming both shapes, or the frames.
-    """
+    """Raise ValueError if predicted positions (B, T, N, D) differ in shape from their target, or a bundle is cut."""
     if predicted.shape != target.shape:
         raise ValueError(f"Predicted {tuple(predicted.shape)} and target {tuple(target.shape)} positions do not match.")
     if predicted.shape[1] % frames:
@@ -161,13 +139,7 @@ def check_comparable(predicted: Tensor, target: Tensor, frames: int) -> None:
 
 
 def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:
-    """Mean over real particles and bundles of (error + floor) ** power, the error that of a particle's window.
-
-    Args:
-        errors: (B, K) of each window and bundle, in cells².
-        mask: (B, N) bool, False for padding.
-        power: 0.5 for root mean squares.
-    """
+    """Mean over real particles and bundles of (error + floor) ** power, for errors (B, K) of windows and bundles."""
     count = mask.sum(1, keepdim=True)
     return ((errors + _FLOOR).pow(power) * count).sum() / (count.sum() * errors.shape[1])
 
@@ -184,16 +156,13 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
         window: Says which particles are real and of which material.
         scene: Gives the materials and a particle's volume.
         grid: Where densities are compared, by linear weights.
-
-    Returns:
-        A number; NaN if there is no real particle.
     """
     fraction = scene.particle_volume / grid.cell_volume
     count = _kernel_counts if _kernels_support(predicted, target, grid) else _counts
     cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
-    found, true = (fraction * count(of, window, scene, grid) for of in cells)
+    predicted_fraction, true_fraction = (fraction * count(of, window, scene, grid) for of in cells)
     particles = window.mask.sum() * predicted.shape[1]
-    return (found - true).square().sum() / (2 * fraction * particles)
+    return (predicted_fraction - true_fraction).square().sum() / (2 * fraction * particles)
 
 
 def _counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
