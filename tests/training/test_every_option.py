@@ -22,62 +22,57 @@ from nmpm.processors import UNet
 from nmpm.training import module as training_module
 from nmpm.training.optimization import Schedule
 from nmpm.transfer import Nearest
+from tests.trainings import QUIET, TINY
 
-TINY = UNet(width=4, depth=1, perceptron=(4,))
 MODEL = {"cells": 8, "frames": 2, "processor": TINY, "schedule": Schedule(warmup=2)}
-NOISY = {"position_noise": 1e-3}
-# What differs from MODEL on both sides, and what is changed.
-MODEL_OPTIONS: dict[str, tuple[dict[str, Any], Any]] = {
-    "unroll": ({}, 1),
-    "unroll_growth": ({}, 0.9),
-    "gradient_discount": ({}, 1.0),
-    "optimizer": ({}, SOAP),
-    "schedule": ({}, Schedule(warmup=1, start=0.5)),
-    "density_weight": ({}, 0.0),
-    "field_weight": ({}, 0.0),
-    "error_power": ({}, 1.0),
-    "position_noise": ({}, 1e-3),
-    "mirror": ({}, (0,)),
-    "jitter": ({}, 0.15),
-    "metrics": ({}, [MSE(horizons=(3,))]),
-    "recompute": ({}, True),
-    "compile": ({}, True),
-    "seed": (NOISY, 1),
-    "cells": ({}, 10),
-    "frames": ({}, 1),
-    "transfer": ({}, Nearest()),
-    "processor": ({}, UNet(width=6, depth=1, perceptron=(4,))),
-    "decoder": ({}, Absolute()),
-    "grid_noise": ({}, 0.1),
-    "constraints": ({}, Constraints(rest_speed=5.0)),
+CHANGED_MODEL: dict[str, Any] = {
+    "unroll": 1,
+    "unroll_growth": 0.9,
+    "gradient_discount": 1.0,
+    "optimizer": SOAP,
+    "schedule": Schedule(warmup=1, start=0.5),
+    "density_weight": 0.0,
+    "field_weight": 0.0,
+    "error_power": 1.0,
+    "position_noise": 1e-3,
+    "mirror": (0,),
+    "jitter": 0.15,
+    "metrics": [MSE(horizons=(3,))],
+    "recompute": True,
+    "compile": True,
+    "seed": 1,
+    "cells": 10,
+    "frames": 1,
+    "transfer": Nearest(),
+    "processor": UNet(width=6, depth=1, perceptron=(4,)),
+    "decoder": Absolute(),
+    "grid_noise": 0.1,
+    "constraints": Constraints(rest_speed=5.0),
 }
-CONSTRAINTS: dict[str, tuple[dict[str, Any], Any]] = {
-    "energy": ({}, True),
-    "rest_speed": ({}, 0.1),
-    "solids": ({}, False),
-    "bounds": ({}, "reflect"),
-    "density_cap": ({}, 0.2),
-}
+CHANGED_CONSTRAINTS = {"energy": True, "rest_speed": 0.1, "solids": False, "bounds": "reflect", "density_cap": 0.2}
 DATA = {"horizon": 4, "batch_size": 2, "buffer_size": 2, "passes": 1.0}
-DATA_OPTIONS: dict[str, tuple[dict[str, Any], Any]] = {
-    "horizon": ({}, 6),
-    "batch_size": ({}, 3),
-    "buffer_size": ({}, 1),
-    "passes": ({}, 3.0),
-    "emphasis": ({}, 1.0),
-    "openings": ({}, 1.0),
-    "bucket_batches": ({}, 4),
-    "seed": ({}, 1),
-    "boundary": ({}, ["periodic", "wall"]),
-    "bounds": ({}, [(0.05, 0.95), (0.05, 0.95)]),
-    "fields": ({}, []),
-    "limit_eval": ({}, 1),
-    "eval_batch_size": ({}, 1),
+CHANGED_DATA: dict[str, Any] = {
+    "horizon": 6,
+    "batch_size": 3,
+    "buffer_size": 1,
+    "passes": 3.0,
+    "emphasis": 1.0,
+    "openings": 1.0,
+    "bucket_batches": 4,
+    "seed": 1,
+    "boundary": ["periodic", "wall"],
+    "bounds": [(0.05, 0.95), (0.05, 0.95)],
+    "fields": [],
+    "limit_eval": 1,
+    "eval_batch_size": 1,
 }
-STATED = {"gravity": [0.0, -1.0], "family": "lagrangebench"}
-"""Facts that the metadata of the data here state otherwise."""
-SOURCES = ("path", "name", "source", "generate")
-"""Where data come from, see `test_sources`."""
+ELSEWHERE = {"gravity", "family", "path", "name", "source", "generate"}
+"""Options of data that tests of their own change."""
+IN_EACH_RUN = ("gradient_discount", "emphasis", "density_cap")
+
+
+def marked(options: dict[str, Any]) -> list[Any]:
+    return [pytest.param(name, marks=[] if name in IN_EACH_RUN else pytest.mark.slow) for name in options]
 
 
 @pytest.fixture
@@ -92,9 +87,9 @@ def names_of(kind: type) -> set[str]:
 
 def test_every_option_has_a_line():
     recipe = {field.name for field in dataclasses.fields(EmulatorRecipe)} - {"scene"}
-    assert set(MODEL_OPTIONS) == names_of(EmulatorModule) | recipe
-    assert set(CONSTRAINTS) == {field.name for field in dataclasses.fields(Constraints)}
-    assert {*DATA_OPTIONS, *STATED, *SOURCES} == names_of(TrajectoryDataModule)
+    assert set(CHANGED_MODEL) == names_of(EmulatorModule) | recipe
+    assert set(CHANGED_CONSTRAINTS) == {field.name for field in dataclasses.fields(Constraints)}
+    assert {*CHANGED_DATA, *ELSEWHERE} == names_of(TrajectoryDataModule)
 
 
 def train(folder, calls: list[str], **options) -> dict[str, Any]:
@@ -106,8 +101,7 @@ def train(folder, calls: list[str], **options) -> dict[str, Any]:
     model.emulator.processor.register_forward_hook(lambda *_: counted.append(1))
     trainer = lightning.Trainer(
         accelerator="cpu", max_steps=3, limit_val_batches=1, val_check_interval=3, check_val_every_n_epoch=None,
-        num_sanity_val_steps=0, logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False,
+        enable_checkpointing=False, **QUIET,
     )  # fmt: skip
     trainer.fit(model, data)
     errors = {name: float(value) for name, value in trainer.callback_metrics.items()}
@@ -115,37 +109,28 @@ def train(folder, calls: list[str], **options) -> dict[str, Any]:
     return {"weights": weights, "errors": errors, "calls": len(counted), "compiled": list(calls)}
 
 
-@pytest.fixture
-def compilations(monkeypatch) -> list[str]:
-    """Networks that were to be compiled, which is not done."""
-    found: list[str] = []
-    monkeypatch.setattr(training_module, "compile_network", lambda network, _: found.append(type(network).__name__))
-    return found
+@pytest.mark.parametrize("name", marked(CHANGED_MODEL))
+def test_model(name, folder, monkeypatch):
+    compiled: list[str] = []  # networks that were to be compiled, which is not done
+    monkeypatch.setattr(training_module, "compile_network", lambda network, _: compiled.append(type(network).__name__))
+    common = {"position_noise": 1e-3} if name == "seed" else {}
+    before = train(folder, compiled, **common)
+    assert before == train(folder, compiled, **common)
+    assert before != train(folder, compiled, **(common | {name: CHANGED_MODEL[name]}))
 
 
-@pytest.mark.parametrize("name", sorted(MODEL_OPTIONS))
-def test_model(name, folder, compilations):
-    common, value = MODEL_OPTIONS[name]
-    before = train(folder, compilations, **common)
-    assert before == train(folder, compilations, **common)
-    assert before != train(folder, compilations, **(common | {name: value}))
-
-
-@pytest.mark.parametrize("name", sorted(CONSTRAINTS))
+@pytest.mark.parametrize("name", marked(CHANGED_CONSTRAINTS))
 def test_constraints(name, folder):
-    common, value = CONSTRAINTS[name]
     data = TrajectoryDataModule(path=str(folder), **DATA)
     torch.manual_seed(0)
-    emulator = EmulatorModule(data.scene, **MODEL, constraints=Constraints(**common)).emulator.eval()
+    emulator = EmulatorModule(data.scene, **MODEL).emulator.eval()
     emulator.output_scale.fill_(0.02)
     emulator.calibrated.fill_(True)
     data.setup("fit")
     state = next(iter(data.val_dataloader())).initial
+    changed = {name: CHANGED_CONSTRAINTS[name]}
     with torch.no_grad():
-        rollouts = [
-            rollout(emulator.with_constraints(Constraints(**(common | changed))), state, 24)
-            for changed in ({}, {}, {name: value})
-        ]
+        rollouts = [rollout(emulator.with_constraints(Constraints(**given)), state, 24) for given in ({}, {}, changed)]
     assert torch.equal(rollouts[0], rollouts[1])
     assert not torch.equal(rollouts[0], rollouts[2])
 
@@ -162,16 +147,21 @@ def windows(folder, **options) -> Iterator[Any]:
         yield batch.frames.shape, batch.frames.double().sum().item()
 
 
-def test_a_gravity_that_contradicts_the_data_is_refused(folder):
+@pytest.mark.parametrize("name", marked(CHANGED_DATA))
+def test_data(name, folder):
+    before = list(windows(folder))
+    assert before == list(windows(folder))
+    assert before != list(windows(folder, **{name: CHANGED_DATA[name]}))
+
+
+def test_facts_that_contradict_the_data_are_refused_or_not_used(folder):
     with pytest.raises((ConfigError, DataError), match="gravity"):
-        list(windows(folder, gravity=STATED["gravity"]))
-
-
-def test_a_family_that_contradicts_the_data_is_not_used_and_named(folder):
+        list(windows(folder, gravity=[0.0, -1.0]))
     with pytest.warns(UserWarning, match="3 = boundary, not rigid.*the family lagrangebench is not used"):
-        assert list(windows(folder, family=STATED["family"])) == list(windows(folder))
+        assert list(windows(folder, family="lagrangebench")) == list(windows(folder))
 
 
+@pytest.mark.slow
 def test_sources(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     few = {"counts": {"train": 1, "valid": 1, "test": 1}, "frames": 8}
@@ -187,14 +177,6 @@ def test_sources(folder, tmp_path, monkeypatch):
         )
     ]
     assert all(one != other for index, one in enumerate(seen) for other in seen[:index])
-
-
-@pytest.mark.parametrize("name", sorted(DATA_OPTIONS))
-def test_data(name, folder):
-    common, value = DATA_OPTIONS[name]
-    before = list(windows(folder, **common))
-    assert before == list(windows(folder, **common))
-    assert before != list(windows(folder, **(common | {name: value})))
 
 
 @pytest.mark.parametrize("option", ["--model.unrol=3", "--data.batchsize=3", "--trainer.steps=3", "--modl.unroll=3"])
