@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from nmpm._support.numbers import is_number
 from nmpm.evaluation.bootstrap import interval
@@ -12,8 +12,7 @@ from nmpm.evaluation.bootstrap import interval
 CARD = "card.yaml"
 FORMAT = 1
 """Version of the layout of `card.yaml` and of the files beside it."""
-Lifecycle = Literal["active", "preview", "superseded"]
-STATES: tuple[Lifecycle, ...] = get_args(Lifecycle)
+Lifecycle = Literal["active", "preview"]
 FACTOR = 4.0
 """How much lower than the better trivial predictor's a model's full-rollout MSE must be, to be more than a preview."""
 SIMULATED = ", simulated by nmpm"
@@ -30,12 +29,10 @@ def preset_of(card: Mapping[str, Any]) -> str | None:
 
 
 def lifecycle(card: Mapping[str, Any]) -> Lifecycle:
-    """The state of a model: superseded by another, active, or a preview.
+    """The state of a model: active, or a preview.
 
     A preview's full-rollout error is not `FACTOR` times lower than a trivial predictor's, or not measured beside one.
     """
-    if card.get("superseded_by"):
-        return "superseded"
     test = card.get("test")
     figures = test if isinstance(test, Mapping) else {}
     mse, trivial = figures.get("mse"), [figures.get(f"{kind}/mse") for kind in ("still", "free_fall")]
@@ -68,7 +65,7 @@ class TableRow:
 
     Args:
         name: Of the model.
-        state: Of `STATES`.
+        state: "active" or "preview".
         dataset: In words.
         mse_100, mse: Errors.
         interval_100, interval: 95% intervals of these means over test scenes.

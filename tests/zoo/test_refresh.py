@@ -274,7 +274,6 @@ def test_shipped_cards_are_short_and_make_rows_of_the_table(name):
         ({"test": {"mse": 0.1}}, "preview"),
         ({"test": {"mse": float("nan"), "still/mse": 0.5}}, "preview"),
         ({}, "preview"),
-        ({"test": {"mse": 0.1, "still/mse": 0.5}, "superseded_by": "other"}, "superseded"),
     ],
 )
 def test_the_lifecycle_follows_from_the_figures(card, state):
