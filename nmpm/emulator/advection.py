@@ -38,20 +38,14 @@ class MovingParticles:
     """Particles on their way through a bundle.
 
     Args:
-        cells: (B, N, D) positions at the start.
-        velocity: (B, N, D) the particles' own velocities.
+        start: Where they are at its start.
         carried: (B, N, D) velocities that the decoder lets particles keep.
-        gravity: (B, 1, D), what a frame adds to a velocity.
-        material: (B, N) indices into the scene's materials.
         fields: (B, m, materials * D, *S), what the network predicts.
         share: (B, N, 1) each particle's share of its scene's mass, 0 for padding.
     """
 
-    cells: Tensor
-    velocity: Tensor
+    start: BundleStart
     carried: Tensor
-    gravity: Tensor
-    material: Tensor
     fields: Tensor
     share: Tensor
 
@@ -139,11 +133,11 @@ class Advection:
         smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
         carried = self.decoder.carried_velocity(start.velocity, smoothed)
         share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
-        return MovingParticles(start.cells, start.velocity, carried, start.gravity, start.material, fields, share)
+        return MovingParticles(start, carried, fields, share)
 
     def _free_path(self, moving: MovingParticles) -> Tensor:
         """(B, m, N, D) positions, frame by frame."""
-        cells, velocity, path = moving.cells, moving.carried, []
+        cells, velocity, path = moving.start.cells, moving.carried, []
         fields = moving.fields.unbind(1)  # indexing would cost a zero-fill each, backwards
         for frame, field in enumerate(fields, start=1):
             arrived = self._advance(moving, field, cells, velocity, frame)
@@ -153,8 +147,8 @@ class Advection:
 
     def _advance(self, moving: MovingParticles, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
         """(B, N, D) positions after a frame, from cells (B, N, D) and the velocity (B, N, D) of the frame before."""
-        known = self.decoder.known_velocity(moving.carried, velocity, moving.gravity, frame)
-        return self._confine(cells + (known + self.gather(field, cells, moving.material)))
+        known = self.decoder.known_velocity(moving.carried, velocity, moving.start.gravity, frame)
+        return self._confine(cells + (known + self.gather(field, cells, moving.start.material)))
 
     def _within_energy(self, moving: MovingParticles, budget: Tensor) -> Tensor:
         """(B, m, N, D) positions of which no frame exceeds an energy (B,).
@@ -162,9 +156,9 @@ class Advection:
         On a CPU the free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
         """
         if not is_eager_cpu(budget):
-            return self._limit_energy(moving, budget, moving.cells.unsqueeze(1)[:, :0])
+            return self._limit_energy(moving, budget, moving.start.cells.unsqueeze(1)[:, :0])
         path = self._free_path(moving)
-        energies = self._energies(moving.cells, moving.gravity, moving.share, path)
+        energies = self._energies(moving.start.cells, moving.start.gravity, moving.share, path)
         exceeds = (energies > budget.unsqueeze(1)).any(0)
         if not bool(exceeds.any()):
             return path
@@ -178,15 +172,15 @@ class Advection:
 
     def _limit_energy(self, moving: MovingParticles, budget: Tensor, begun: Tensor) -> Tensor:
         """(B, m, N, D) positions, each frame within an energy (B,), after the first frames (B, f, N, D), which are."""
-        path = [moving.cells, *begun.unbind(1)]
-        velocity, before = moving.carried, moving.velocity
+        path = [moving.start.cells, *begun.unbind(1)]
+        velocity, before = moving.carried, moving.start.velocity
         if len(path) > 1:
             velocity = before = path[-1] - path[-2]
         for frame, field in enumerate(moving.fields.unbind(1)[len(path) - 1 :], start=len(path)):
             cells = path[-1]
             proposed = self._advance(moving, field, cells, velocity, frame)
             step = proposed - cells
-            units, steps, last, gravity = self.grid.isotropic_units(cells, step, before, moving.gravity)
+            units, steps, last, gravity = self.grid.isotropic_units(cells, step, before, moving.start.gravity)
             factor = affordable(units, steps, last, gravity, moving.share, budget)
             arrived = torch.where(factor < 1, self._confine(cells + factor * step), proposed)
             velocity = before = arrived - cells

@@ -76,7 +76,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class RolloutContext:
-    """What stays the same from bundle to bundle of a rollout, computed once from its first state.
+    """The part of a call that stays the same through a rollout, computed once from its first state.
 
     Args:
         solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.

@@ -39,7 +39,7 @@ class _Inputs:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """What the decoder leaves of one material's true velocities or fields: (m, V) mean square over particles."""
+    """Mean square (m, V) over a material's particles of what the network has to predict: velocities, or rates."""
 
     particles: int
     square: Tensor
@@ -151,8 +151,8 @@ def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
 
 def _mean_square(parts: Sequence[Tensor], index: int, windows: Sequence[Window]) -> _Unknowns:
     """Of values (B, m, N, V) in each window, over the particles of a material."""
-    chosen = [window.mask & (window.material == index) for window in windows]
-    values = torch.cat([part.transpose(1, 2)[of] for part, of in zip(parts, chosen, strict=True)])
+    of_material = [window.mask & (window.material == index) for window in windows]
+    values = torch.cat([part.transpose(1, 2)[real] for part, real in zip(parts, of_material, strict=True)])
     return _Unknowns(len(values), _shareable(values.square().mean(0)))
 
 

@@ -108,13 +108,13 @@ class Contact:
         touches, rows = [], []
         for part in parts:
             begin, mine = start[:, part].flatten(0, 1), path[:, :, part].transpose(1, 2).flatten(0, 1)
-            own = _spread(pieces, len(begin))
-            touch = _touch(self._depth_of_all, begin, mine, own, _MAX_PIECES)
+            counts = _spread(pieces, len(begin))
+            touch = _touch(self._depth_of_all, begin, mine, counts, _MAX_PIECES)
             inside = (self._depth_of_all(begin.unsqueeze(1)) > SURFACE).squeeze(1)
             if mask is not None:
                 real = mask[:, part].flatten()
                 inside, touch = inside & real, dataclasses.replace(touch, hits=touch.hits & real)
-            rows.append((begin, mine, own, inside))
+            rows.append((begin, mine, counts, inside))
             touches.append(touch)
         lengths = [
             torch.where(inside | touch.hits, _length(touch.along), 0.0).view(batch, -1).amax(1, keepdim=True)
@@ -122,8 +122,8 @@ class Contact:
         ]
         finer = _pieces(torch.cat(lengths, dim=1))
         paths = []
-        for (begin, mine, own, inside), touch in zip(rows, touches, strict=True):
-            held = _slid(self._depth_of_all, mine, touch, own, _spread(finer, len(begin)), _MAX_PIECES)
+        for (begin, mine, counts, inside), touch in zip(rows, touches, strict=True):
+            held = _slid(self._depth_of_all, mine, touch, counts, _spread(finer, len(begin)), _MAX_PIECES)
             out = _pushed_out(self._depth_of_all, begin, frames)
             held = torch.where(inside[:, None, None], out, torch.where(touch.hits[:, None, None], held, mine))
             paths.append(held.unflatten(0, (batch, -1)).transpose(1, 2))
@@ -244,11 +244,11 @@ def _spread(values: Tensor, count: int) -> Tensor:
     return values.unsqueeze(1).expand(-1, count // len(values)).flatten()
 
 
-def _first(found: Tensor) -> Tensor:
+def _first(marks: Tensor) -> Tensor:
     """(n,): index of the first True in each row (n, K), K where there is none. Deterministic on every device."""
-    size = found.shape[1]
-    order = torch.arange(size, device=found.device)
-    return torch.where(found, order, size).amin(1)
+    size = marks.shape[1]
+    order = torch.arange(size, device=marks.device)
+    return torch.where(marks, order, size).amin(1)
 
 
 def _largest(pieces: Tensor) -> int:

@@ -89,7 +89,7 @@ class Emulator(nn.Module):
 
     @property
     def scene(self) -> Scene:
-        """What the scenes have in common."""
+        """Materials, bounds, time step and gravity of the scenes."""
         return self.recipe.scene
 
     @property
@@ -104,7 +104,7 @@ class Emulator(nn.Module):
 
     @property
     def decoder(self) -> Decoder:
-        """What the network's output means."""
+        """Meaning of the network's output."""
         return self.recipe.decoder
 
     @property

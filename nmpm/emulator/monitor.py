@@ -25,7 +25,7 @@ _AT_WALLS, _CROWDING_LIMIT, _RESTING = "particles at the walls", "crowding limit
 
 
 class Policy(Enum):
-    """What a monitor does when a limit is passed."""
+    """Reaction of a monitor to a limit that is passed."""
 
     WARN = "warn"
     STOP = "stop"
@@ -205,7 +205,7 @@ class Monitor:
             warnings.warn(f"The rollout passed a limit: {incident}.", stacklevel=6)
 
     def report(self) -> str:
-        """What was seen, in a sentence or two."""
+        """A summary of the rollout in a sentence or two."""
         seen = ", ".join(f"{what} {value:.3g}" for what, value in self.peaks.items() if what != "not finite")
         passed = "; ".join(map(str, self.incidents)) or "none"
         still = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"

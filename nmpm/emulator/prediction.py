@@ -156,16 +156,17 @@ def steps_for(emulator: Emulator, particles: Particles, solid: Tensor) -> Steps:
     mode those without.
     Graphs that `torch.compile` traces take tensor operations.
     """
-    own = (particles.position, particles.velocity)
-    fixed = (particles.gravity, solid)
+    motion, fixed = (particles.position, particles.velocity), (particles.gravity, solid)
     parameters, is_float32 = emulator.kernel_parameters, emulator.precision == torch.float32
-    if parameters is None or not is_float32 or not kernels_take(*own, particles.gravity):
+    if parameters is None or not is_float32 or not kernels_take(*motion, particles.gravity):
         return TensorSteps(emulator)
     if torch.compiler.is_compiling() or _needs_gradients(*fixed):
         return TensorSteps(emulator)
     if emulator.training:
         return TrainingSteps(emulator, parameters) if parameters.trains else TensorSteps(emulator)
-    return TensorSteps(emulator) if _needs_gradients(*own, *emulator.parameters()) else FusedSteps(emulator, parameters)
+    if _needs_gradients(*motion, *emulator.parameters()):
+        return TensorSteps(emulator)
+    return FusedSteps(emulator, parameters)
 
 
 def _needs_gradients(*tensors: Tensor) -> bool:

@@ -126,14 +126,14 @@ class EmulatorRecipe:
         return from_plain(cls, values, "The recipe of an emulator")
 
 
-def check_format(found: object, what: str) -> None:
+def check_format(version: object, what: str) -> None:
     """Make sure that this version can read a file's format.
 
     Raises:
         ConfigError: if the format is newer, or not a number.
     """
-    if not isinstance(found, int) or found > FORMAT:
-        raise ConfigError(f"{what} has format {found}; this nmpm reads up to {FORMAT}: pip install --upgrade nmpm.")
+    if not isinstance(version, int) or version > FORMAT:
+        raise ConfigError(f"{what} has format {version}; this nmpm reads up to {FORMAT}: pip install --upgrade nmpm.")
 
 
 def _plain(value: Any) -> Any:

@@ -52,7 +52,7 @@ def floor_rows(scene: Scene, grid: Grid) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class Support:
-    """What holds the material of B scenes up.
+    """Which cells of B scenes hold their material up.
 
     Args:
         filled: (B, 1, *S) volume fraction of all materials.
@@ -69,8 +69,8 @@ class Support:
     def holds(self, cells: Tensor, gravity: Tensor) -> Tensor:
         """(B, N) bool: whether the cells of particles (B, N, D) are supported against gravity (B, 1, D)."""
         node = torch.zeros_like(cells[..., 0], dtype=torch.long)
-        for place, extent, wraps in zip(cells.unbind(-1), self.grid.shape, self.grid.periodic, strict=True):
-            row = place.nan_to_num(0.0, 0.0, 0.0).floor().long()
+        for column, extent, wraps in zip(cells.unbind(-1), self.grid.shape, self.grid.periodic, strict=True):
+            row = column.nan_to_num(0.0, 0.0, 0.0).floor().long()
             node = node * extent + (row.remainder(extent) if wraps else row.clamp(0, extent - 1))
         return self.supported_cells(gravity).flatten(1).gather(1, node)
 

@@ -88,8 +88,8 @@ class Affine(Quadratic):
         stencil, places = self.scatter_stencil(cells, grid), quadratic_places(cells, grid)
         centre = torch.einsum("bnj,bnjd->bnd", stencil.weight, places)
         offset = places - centre.unsqueeze(2)
-        place = inside(cells, grid).unsqueeze(2) - places
-        slope, count = self._slopes(velocity, membership, stencil, place, grid)
+        apart = inside(cells, grid).unsqueeze(2) - places
+        slope, count = self._slopes(velocity, membership, stencil, apart, grid)
         gradient = _own(slope, count, membership, stencil)
         at_nodes = velocity.unsqueeze(2) + torch.einsum("bnde,bnje->bnjd", gradient, offset)
         values = torch.einsum("bnm,bnjd->bnjmd", membership, at_nodes).flatten(-2)
@@ -97,19 +97,19 @@ class Affine(Quadratic):
         return _on_grid(momentum, grid), _on_grid(count, grid)
 
     def _slopes(
-        self, velocity: Tensor, membership: Tensor, stencil: Stencil, place: Tensor, grid: Grid
+        self, velocity: Tensor, membership: Tensor, stencil: Stencil, apart: Tensor, grid: Grid
     ) -> tuple[Tensor, Tensor]:
         """At each node the slopes (B, S, M, D, D) of the velocity, fitted over particles, and their number (B, S, M).
 
-        The fit's variables are the particles' places (B, N, J, D) from each node, so that nothing large cancels.
+        The fit's variables are the particles' offsets `apart` (B, N, J, D) from each node, so that nothing large cancels.
         """
         dim, materials = velocity.shape[-1], membership.shape[-1]
-        touches = place.shape[2]
-        one = torch.ones_like(place[..., :1])
+        touches = apart.shape[2]
+        one = torch.ones_like(apart[..., :1])
         moved = velocity.unsqueeze(2).expand(-1, -1, touches, -1)
-        squares = (place.unsqueeze(-1) * place.unsqueeze(-2)).flatten(-2)
-        products = (moved.unsqueeze(-1) * place.unsqueeze(-2)).flatten(-2)
-        terms = torch.cat([one, place, moved, squares, products], dim=-1)
+        squares = (apart.unsqueeze(-1) * apart.unsqueeze(-2)).flatten(-2)
+        products = (moved.unsqueeze(-1) * apart.unsqueeze(-2)).flatten(-2)
+        terms = torch.cat([one, apart, moved, squares, products], dim=-1)
         values = (membership[:, :, None, :, None] * terms.unsqueeze(-2)).flatten(-2)
         sums = _scattered(stencil, values, grid.size).unflatten(-1, (materials, -1))
         count, place_sum, moved_sum, square_sum, product_sum = sums.split([1, dim, dim, dim**2, dim**2], dim=-1)
@@ -117,7 +117,7 @@ class Affine(Quadratic):
         mean, flow = place_sum / total, moved_sum / total
         variance = (square_sum / total).unflatten(-1, (dim, dim)) - mean.unsqueeze(-1) * mean.unsqueeze(-2)
         covariance = (product_sum / total).unflatten(-1, (dim, dim)) - flow.unsqueeze(-1) * mean.unsqueeze(-2)
-        # Rounding must not make a variance singular where all particles are in one place.
+        # Rounding must not make a variance singular where all particles are in one apart.
         floor = max(self.damping, 16 * torch.finfo(velocity.dtype).eps)
         inverse = torch.linalg.inv_ex(variance + floor * torch.eye(dim, dtype=variance.dtype, device=variance.device))[
             0
@@ -130,8 +130,8 @@ def _own(slope: Tensor, count: Tensor, membership: Tensor, stencil: Stencil) -> 
     batch, size, materials, dim, _ = slope.shape
     weighted = torch.cat([count.unsqueeze(-1) * slope.flatten(-2), count.unsqueeze(-1)], dim=-1)
     gathered = gather(stencil, weighted.reshape(batch, size, -1)).unflatten(-1, (materials, -1))
-    own: Tensor = (gathered * membership.unsqueeze(-1)).sum(dim=-2)
-    summed, mass = own.split([dim**2, 1], dim=-1)
+    weighted_sum: Tensor = (gathered * membership.unsqueeze(-1)).sum(dim=-2)
+    summed, mass = weighted_sum.split([dim**2, 1], dim=-1)
     mean: Tensor = (summed / torch.where(mass > 0, mass, torch.ones_like(mass))).unflatten(-1, (dim, dim))
     return mean
 

@@ -5,7 +5,7 @@ A runtime is added by one file and one line here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from nmpm._support.messages import one_line, suggestion
@@ -39,17 +39,16 @@ def find_runtime(name: str) -> Runtime:
     Raises:
         ConfigError: if there is none of that name.
     """
-    check_runtime(name, RUNTIMES)
+    check_runtime(name, list(RUNTIMES))
     return RUNTIMES[name]()
 
 
-def check_runtime(name: str, known: Iterable[str]) -> None:
+def check_runtime(name: str, names: Sequence[str]) -> None:
     """Check the name of a runtime.
 
     Raises:
-        ConfigError: if it is not among those that are known, which are listed.
+        ConfigError: if it is not one of these names, which are listed.
     """
-    names = list(known)
     if name not in names:
         raise ConfigError(
             f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(names)}."

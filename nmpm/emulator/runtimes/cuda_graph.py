@@ -63,9 +63,9 @@ class CudaGraph(Runtime):
 
         def predict(copies: Sequence[Tensor]) -> Bundle:
             values: dict[str, Any] = dict(zip(state, copies, strict=False))
-            own = dataclasses.replace(particles, **values)
+            copied = dataclasses.replace(particles, **values)
             budget = None if context.budget is None else copies[-1]
-            return self.predict(emulator, own, dataclasses.replace(context, solid=copies[len(state)], budget=budget))
+            return self.predict(emulator, copied, dataclasses.replace(context, solid=copies[len(state)], budget=budget))
 
         shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
         recorded = self._programs.find(emulator, shapes, lambda: Recorded(predict, inputs))
@@ -125,8 +125,8 @@ class Recorded:
 
     def __call__(self, inputs: Sequence[Tensor]) -> Bundle:
         """The bundle for inputs of these shapes, in fresh memory."""
-        for own, tensor in zip(self._inputs, inputs, strict=True):
-            own.copy_(tensor)
+        for copied, tensor in zip(self._inputs, inputs, strict=True):
+            copied.copy_(tensor)
         self._replay()
         made = self._bundle
         return dataclasses.replace(made, position=made.position.clone(), velocity=made.velocity.clone())

@@ -104,12 +104,17 @@ def _compile(network: GridProcessor, grid: Tensor, precision: torch.dtype, threa
         ConfigError: if OpenVINO is not installed, or lacks an operation of the network here.
     """
     openvino = _import_openvino()
-    options = _options(_precision_here(openvino, precision), threads)
+    options = {
+        "INFERENCE_PRECISION_HINT": _HINTS[_precision_here(openvino, precision)],
+        "INFERENCE_NUM_THREADS": threads,
+        "NUM_STREAMS": 1,
+        "ENABLE_CPU_PINNING": False,
+    }
     try:
         with kept_signal_stack(), _without_telemetry(), torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch.export, about torch's own code
-            own, rows = _ChannelsLast(copy.deepcopy(network).float()), grid.float().movedim(1, -1).contiguous()
-            model = openvino.convert_model(torch.export.export(own, (rows,)))
+            module, rows = _ChannelsLast(copy.deepcopy(network).float()), grid.float().movedim(1, -1).contiguous()
+            model = openvino.convert_model(torch.export.export(module, (rows,)))
             model.reshape(list(rows.shape))
             request = _core(openvino).compile_model(model, "CPU", options).create_infer_request()
     except Exception as error:  # (neither documents its exceptions)
@@ -118,15 +123,6 @@ def _compile(network: GridProcessor, grid: Tensor, precision: torch.dtype, threa
             f" {one_line(error, 200)})."
         ) from error
     return _Program(request, openvino.Tensor, tuple(model.output(0).shape))
-
-
-def _options(precision: torch.dtype, threads: int) -> dict[str, object]:
-    return {
-        "INFERENCE_PRECISION_HINT": _HINTS[precision],
-        "INFERENCE_NUM_THREADS": threads,
-        "NUM_STREAMS": 1,
-        "ENABLE_CPU_PINNING": False,
-    }
 
 
 def _precision_here(openvino: Any, precision: torch.dtype) -> torch.dtype:
