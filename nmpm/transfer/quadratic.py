@@ -101,7 +101,7 @@ class Affine(Quadratic):
     ) -> tuple[Tensor, Tensor]:
         """At each node the slopes (B, S, M, D, D) of the velocity, fitted over particles, and their number (B, S, M).
 
-        The fit's variables are the particles' offsets `apart` (B, N, J, D) from each node, so that nothing large cancels.
+        The fit's variables are the particles' offsets (B, N, J, D) from each node, so that nothing large cancels.
         """
         dim, materials = velocity.shape[-1], membership.shape[-1]
         touches = apart.shape[2]
