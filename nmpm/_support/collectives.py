@@ -46,12 +46,7 @@ def gather_to_rank0(value: T) -> list[T]:
 
 
 def broadcast_from_rank0(value: float, device: torch.device) -> float:
-    """Rank 0's value, on every rank; reads it back from the device.
-
-    Args:
-        value: This rank's own.
-        device: Where the process group exchanges tensors.
-    """
+    """Rank 0's value, on every rank; exchanged on `device`, and read back from it."""
     if rank_and_world_size()[1] == 1:
         return value
     message = torch.tensor(value, dtype=torch.float32, device=device)
@@ -60,12 +55,7 @@ def broadcast_from_rank0(value: float, device: torch.device) -> float:
 
 
 def any_rank(condition: bool, device: torch.device) -> bool:
-    """Whether the condition holds on any rank (`all_reduce`); reads the answer back from the device.
-
-    Args:
-        condition: This rank's own.
-        device: Where the process group exchanges tensors.
-    """
+    """Whether the condition holds on any rank (`all_reduce`); exchanged on `device`, and read back from it."""
     if rank_and_world_size()[1] == 1:
         return condition
     count = torch.tensor(int(condition), device=device)
@@ -97,12 +87,7 @@ def global_mean(mean: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
 def rank_slice(draw: Callable[[int], Tensor], rows: int) -> Tensor:
     """This rank's rows of random numbers that are drawn for all ranks, which share a random state and a batch size.
 
-    Every rank draws the numbers of all, which costs little beside a step, so that one process with all rows would draw
-    the same.
-
-    Args:
-        draw: Draws so many rows.
-        rows: Rows of one rank.
+    One process with all rows would draw the same.
     """
     rank, world = rank_and_world_size()
     return draw(world * rows)[rank * rows : (rank + 1) * rows]

@@ -19,7 +19,7 @@ def weights_digest(weights: Mapping[str, Tensor]) -> str:
 
 
 def float32_digest(weights: Mapping[str, Tensor]) -> str:
-    """That of the weights in float32, which a test in another precision than the training's leaves as it is."""
+    """`weights_digest` in float32: the same after a test in another precision than the training's."""
     return weights_digest({k: v.float() if v.is_floating_point() else v for k, v in weights.items()})
 
 

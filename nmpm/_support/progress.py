@@ -17,7 +17,7 @@ LINE_SECONDS = 30.0
 
 
 class Step(Protocol):
-    """Takes in that steps are done, and what is done now, if that has changed."""
+    """Counts finished steps; `what` is done now, if that has changed."""
 
     def __call__(self, what: str = "", by: int = 1) -> object: ...
 
@@ -32,7 +32,7 @@ def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
         done: Steps that are done already.
 
     Yields:
-        What to call after each step.
+        A function to call after each step.
     """
     console = Console(stderr=True)
     # Without ipywidgets rich would warn at every bar of a notebook.

@@ -40,7 +40,7 @@ def _splits(train: int, valid: int, test: int) -> Mapping[str, int]:
 
 
 _USUAL = CatalogEntry(counts=_splits(200, 10, 30), paper=_splits(1000, 100, 100))
-"""What is simulated within minutes; what the paper has (arXiv 2408.15753)."""
+"""Numbers that are simulated within minutes; numbers of the paper (arXiv 2408.15753)."""
 
 _OTHERS = {
     "goop": CatalogEntry(_USUAL.counts, _splits(1000, 30, 30)),
@@ -75,11 +75,7 @@ def describe(name: str) -> CatalogEntry:
 
 
 def scene(name: str) -> Scene:
-    """The scene of an embedded dataset; simulates nothing.
-
-    Raises:
-        DataError: if there is no dataset of that name.
-    """
+    """The scene of an embedded dataset; simulates nothing."""
     describe(name)
     return load_preset(name).scene
 
@@ -87,12 +83,7 @@ def scene(name: str) -> Scene:
 def simulation_request(
     name: str, counts: Mapping[str, int] | None = None, frames: int | None = None, seed: int | None = None
 ) -> SimulationRequest:
-    """The request that `ensure` simulates for the same arguments.
-
-    Raises:
-        DataError: if there is no dataset of that name.
-        ConfigError: if counts or frames are invalid.
-    """
+    """The request that `ensure` simulates for the same arguments."""
     entry, preset = describe(name), load_preset(name)
     preset = preset if frames is None else preset.with_frames(frames)
     return SimulationRequest(preset, entry.counts if counts is None else counts, seed or 0)
@@ -105,11 +96,7 @@ def dataset_folder(name: str, request: SimulationRequest) -> Path:
 
 
 def find_simulated(name: str, test: int) -> Path | None:
-    """A complete folder of an embedded dataset with at least `test` test trajectories, for whatever it was simulated.
-
-    Raises:
-        DataError: if there is no dataset of that name.
-    """
+    """A complete folder of an embedded dataset with at least `test` test trajectories, if there is one."""
     folders = _complete_folders(name, simulation_request(name))
     return next((folder for folder, counts in folders if counts.get("test", 0) >= test), None)
 

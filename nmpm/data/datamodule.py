@@ -118,12 +118,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     @property
     def scene(self) -> Scene:
-        """The scene of the dataset; for an embedded dataset nothing is simulated.
-
-        Raises:
-            DataError: if recorded files are missing or wrong.
-            ConfigError: if there is no such embedded dataset.
-        """
+        """The scene of the dataset; for an embedded dataset nothing is simulated."""
         return self.data_source.scene
 
     @property
@@ -207,7 +202,7 @@ class TrajectoryDataModule(LightningDataModule):
         return self.trainer.strategy.root_device if self.trainer is not None else torch.device("cpu")
 
     def transfer_batch_to_device(self, batch: Window, device: torch.device, dataloader_idx: int) -> Window:  # noqa: ARG002
-        """Copies a batch to a device; copies from pinned memory to a GPU do not block the host."""
+        """Copies a batch to a device; copies to a GPU do not block the host."""
         return batch.to(device, non_blocking=device.type == "cuda")
 
     def teardown(self, stage: str) -> None:  # noqa: ARG002

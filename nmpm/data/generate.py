@@ -54,7 +54,7 @@ def generate(
     counts: Mapping[str, int],
     seed: int = 0,
     workers: int | None = None,
-    known: Path | None = None,
+    copy_from: Path | None = None,
 ) -> None:
     """Simulates a dataset into a folder, unless it is complete already.
 
@@ -67,11 +67,11 @@ def generate(
         seed: The seeds of all trajectories are derived from it.
         workers: Trajectories simulated at a time; one per processor core when left out. Where there is much to
             simulate, each is a process, of about 200 MB.
-        known: A complete dataset of the same preset, revision of its simulator and seed, whose trajectories are copied.
+        copy_from: A complete dataset of the same preset and seed, whose trajectories are copied.
 
     Raises:
         ConfigError: if preset or counts are invalid.
-        DataError: if the folder has other data than requested, or cannot be written, or `known` cannot be read.
+        DataError: if the folder has other data than requested, or cannot be written, or `copy_from` cannot be read.
     """
     request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
@@ -85,8 +85,8 @@ def generate(
                 pass
         for stale in temporary_files(folder):
             stale.unlink(missing_ok=True)
-        if known is not None:
-            _copy_parts(request, folder, known)
+        if copy_from is not None:
+            _copy_parts(request, folder, copy_from)
         _simulate_parts(request, folder, request.trajectories, workers)
         for split in request.splits:
             _assemble(request, folder, split)
@@ -172,15 +172,15 @@ def _missing(folder: Path, wanted: Sequence[tuple[str, int]]) -> list[tuple[str,
     return [(s, i) for s, i in wanted if not (folder / f"{s}.h5").is_file() and not _part_path(folder, s, i).is_file()]
 
 
-def _copy_parts(request: SimulationRequest, folder: Path, known: Path) -> None:
+def _copy_parts(request: SimulationRequest, folder: Path, source: Path) -> None:
     """Writes the missing parts of trajectories that another dataset has."""
-    files = {split: known / f"{split}.h5" for split in request.splits}
+    files = {split: source / f"{split}.h5" for split in request.splits}
     splits = {split: Split(path) for split, path in files.items() if path.is_file()}
     missing = [(s, i) for s, i in _missing(folder, request.trajectories) if s in splits and i < len(splits[s])]
     if not missing:
         return
-    _log.info("Copying %d trajectories of %s from %s.", len(missing), request.preset.name, known)
-    with progress_bar(f"Copying trajectories of {known.name}", len(missing)) as advance:
+    _log.info("Copying %d trajectories of %s from %s.", len(missing), request.preset.name, source)
+    with progress_bar(f"Copying trajectories of {source.name}", len(missing)) as advance:
         for split, index in missing:
             _write_part(_part_path(folder, split, index), splits[split].read(index))
             advance()

@@ -60,9 +60,7 @@ def _fetch(repository: str, folder: str) -> Path:
 
     wanted = f"{repository}/{folder}" if folder else repository
     try:
-        found = Path(
-            snapshot_download(repository, repo_type="dataset", allow_patterns=f"{folder}/*" if folder else None)
-        )
+        snapshot = snapshot_download(repository, repo_type="dataset", allow_patterns=f"{folder}/*" if folder else None)
     except RepositoryNotFoundError as error:
         raise DataError(f"{wanted}: the hub has no dataset {repository}.") from error
     except (LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
@@ -72,9 +70,10 @@ def _fetch(repository: str, folder: str) -> Path:
             f"{f' --include {folder}/*' if folder else ''} --local-dir data`, unpack archives, copy"
             " the folder here, and give it as the path."
         ) from error
-    if not (found / folder).is_dir():
+    downloaded = Path(snapshot) / folder
+    if not downloaded.is_dir():
         raise DataError(f"{wanted}: the dataset {repository} has no folder {folder}.")
-    return found / folder
+    return downloaded
 
 
 def _first_line(error: BaseException) -> str:
@@ -89,9 +88,9 @@ def _unpack(downloaded: Path, archives: list[Path], target: Path) -> None:
                 _unpack_one(archive, new / archive.parent.relative_to(downloaded))
             for file in downloaded.rglob("*"):
                 if file.suffix in _DATA:
-                    place = new / file.relative_to(downloaded)
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copyfile(file, place)
+                    copy = new / file.relative_to(downloaded)
+                    copy.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(file, copy)
             if not any(new.iterdir()):
                 raise DataError(f"{target}: cannot be unpacked (no data files in {downloaded}).")
     except ZIP_ERRORS as error:
@@ -109,9 +108,9 @@ def _unpack_one(archive: Path, target: Path) -> None:
                 continue
             if path.is_absolute() or not all(FILE_NAME.fullmatch(part) for part in path.parts):
                 raise DataError(f"{archive}: does not unpack {item.filename!r}, as the path may leave the folder.")
-            place = target.joinpath(*path.parts)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            with file.open(item) as packed, place.open("wb") as out:
+            unpacked_file = target.joinpath(*path.parts)
+            unpacked_file.parent.mkdir(parents=True, exist_ok=True)
+            with file.open(item) as packed, unpacked_file.open("wb") as out:
                 shutil.copyfileobj(packed, out)
 
 

@@ -109,12 +109,12 @@ def _simulate_in_processes(
 ) -> Generator[tuple[int, SimulatedTrajectory], None, None]:
     resource_tracker.ensure_running()  # its start would end `_blocked_interrupts`
     executor = ProcessPoolExecutor(processes, initializer=_end_with, initargs=(os.getpid(),), env=_ENVIRONMENT)
-    left, waiting = deque(enumerate(entropies)), dict[Future[tuple[SimulatedTrajectory, list[str]]], int]()
+    queue, waiting = deque(enumerate(entropies)), dict[Future[tuple[SimulatedTrajectory, list[str]]], int]()
     try:
-        while left or waiting:
+        while queue or waiting:
             with _blocked_interrupts():
-                while left and len(waiting) <= processes:  # one more, so that no process waits
-                    index, entropy = left.popleft()
+                while queue and len(waiting) <= processes:  # one more, so that no process waits
+                    index, entropy = queue.popleft()
                     waiting[executor.submit(_simulate, preset, entropy)] = index
             check()
             if process_executor._global_shutdown:  # the program ends, and would wait for all that is submitted

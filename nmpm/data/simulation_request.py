@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -69,16 +69,10 @@ class SimulationRequest:
         return seed_of_draw(self.entropy(split, index), self.redrawn.get(split, {}).get(str(index), 0))
 
     def check_same(self, stored: object, folder: Path) -> None:
-        """Compare it with the request that a folder's data were simulated by, as read from its JSON.
-
-        Raises:
-            DataError: naming what differs.
-        """
+        """Raises a DataError if a folder's data were simulated by another request, as read from its JSON."""
         asked = json.loads(json.dumps(self.to_dict()))
-        found = stored if isinstance(stored, dict) else {}
-        differing = [key for key in asked if found.get(key) != asked[key]]
-        if differing:
-            what = "; ".join(_difference(key, found.get(key), asked[key]) for key in differing)
+        there = stored if isinstance(stored, dict) else {}
+        if what := "; ".join(_differences("", there, asked)):
             raise DataError(
                 f"{folder}: has other data than requested: {what}. Choose another folder, or delete this one."
             )
@@ -108,11 +102,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Reads "I/N".
-
-        Raises:
-            ConfigError: if it cannot be read, or I is not from 1 to N.
-        """
+        """Reads "I/N"; raises a ConfigError if it cannot be read, or I is not from 1 to N."""
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if match is None:
             raise ConfigError(f"shard {text}: give I/N, as in 1/8, 2/8, …, 8/8.")
@@ -142,8 +132,10 @@ def _is_valid_counts(counts: object) -> bool:
     return all(isinstance(number, int) and number >= 0 for number in counts.values())
 
 
-def _difference(key: str, found: Any, asked: Any) -> str:
-    if isinstance(asked, dict) and isinstance(found, dict):
-        inner = [name for name in asked if found.get(name) != asked[name]]
-        return ", ".join(_difference(f"{key}.{name}", found.get(name), asked[name]) for name in inner)
-    return f"{key} is {found}, requested {asked}"
+def _differences(path: str, stored: Mapping[str, Any], asked: Mapping[str, Any]) -> Iterator[str]:
+    for key, value in asked.items():
+        other = stored.get(key)
+        if isinstance(value, dict) and isinstance(other, dict):
+            yield from _differences(f"{path}{key}.", other, value)
+        elif value != other:
+            yield f"{path}{key} is {other}, requested {value}"

@@ -78,7 +78,7 @@ def test_a_dataset_grows_from_a_smaller_one_by_the_same_bytes(made, tmp_path, mo
     simulated: list[int] = []
     simulate = MpmPreset.simulate
     monkeypatch.setattr(MpmPreset, "simulate", lambda *all_: simulated.append(all_[1]) or simulate(*all_))
-    generate(TINY, tmp_path / "grown", counts, seed=5, known=made)
+    generate(TINY, tmp_path / "grown", counts, seed=5, copy_from=made)
     assert len(simulated) == 2
     assert fingerprints(tmp_path / "grown") == fingerprints(tmp_path / "whole")
 

@@ -24,7 +24,7 @@ from nmpm.scene import Scene
 
 
 class RecordingProvider(Protocol):
-    """What a buffer needs of recorded or simulated trajectories."""
+    """Recorded or simulated trajectories, as a buffer needs them."""
 
     scene: Scene
 

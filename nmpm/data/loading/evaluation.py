@@ -15,8 +15,8 @@ from nmpm.particles import Window
 class EvaluationLoader:
     """Whole trajectories in batches of equal length; each trajectory goes to exactly one rank.
 
-    Those of similar numbers of particles share a batch, so that few are padded much. `batches` holds the indices of
-    each batch's trajectories. A rank without any has one batch of none, so that it takes part in all collectives.
+    Similar numbers of particles share a batch, so that few are padded much. `batches` holds the indices of each batch's
+    trajectories. A rank without any has one batch of none, so that it takes part in all collectives.
 
     Args:
         recordings: The trajectories.

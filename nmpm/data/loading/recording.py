@@ -54,11 +54,7 @@ class RecordingReader:
     scene: Scene
 
     def recording(self, trajectory: Trajectory, where: str) -> Recording:
-        """Converts a trajectory to tensors.
-
-        Args:
-            trajectory: A trajectory of the scene, with its fields as `read_fields` gives them.
-            where: File and trajectory, for error messages.
+        """Converts a trajectory, with its fields as `read_fields` gives them; `where` names it in errors.
 
         Raises:
             DataError: if a particle leaves the scene's domain, its material is not in the scene, a static particle
@@ -76,18 +72,10 @@ class RecordingReader:
         )
 
     def check(self, trajectory: Trajectory, where: str, first_frame: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Checks the types of a trajectory's particles, and where they are.
-
-        Args:
-            trajectory: Some frames of it suffice.
-            where: File and trajectory, for error messages.
-            first_frame: Of those.
+        """Checks types and positions of a trajectory's frames, counted from `first_frame`; raises as `recording`.
 
         Returns:
             (N,) whether each particle moves, and whether it is static.
-
-        Raises:
-            DataError: as `recording`.
         """
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
@@ -179,11 +167,6 @@ class SplitRecordings(Sequence[Recording]):
         return len(self.split)
 
     def __getitem__(self, index: int) -> Recording:  # type: ignore[override]  # (no slices)
-        """Reads one trajectory.
-
-        Raises:
-            DataError: if it cannot be read, leaves the scene's domain or has a material that is not in the scene.
-        """
         names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
         fields = read_fields(self.split, index, names) if names else {}
         return self.reader.recording(replace(self.split.read(index), fields=fields), self.split.where(index))
@@ -195,11 +178,7 @@ class SplitRecordings(Sequence[Recording]):
         return max(4 * split.frames(index) * split.particles(index) * numbers for index in range(len(self)))
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
-        """Reads several trajectories.
-
-        Raises:
-            DataError: as for a single one.
-        """
+        """Reads several trajectories, until the task is cancelled."""
         recordings = []
         for index in indices:
             raise_if_abandoned()
@@ -207,22 +186,14 @@ class SplitRecordings(Sequence[Recording]):
         return recordings
 
     def check_ends(self) -> None:
-        """Checks the first and the last frame of each trajectory, as reading all of them would: a quick look.
-
-        Raises:
-            DataError: as for a single one; or if a trajectory lacks a field.
-        """
+        """Checks the first and the last frame of each trajectory, and that it has the fields, as reading all would."""
         require_fields(self.split, self.reader.metadata.fields)
         for index in range(len(self)):
             for frame in sorted({0, self.split.frames(index) - 1}):
                 self.reader.check(self.split.read(index, frame, frame + 1), self.split.where(index), frame)
 
     def require_frames(self, frames: int, purpose: str) -> None:
-        """Raises an error if a trajectory is too short.
-
-        Raises:
-            DataError: names the first that has fewer frames.
-        """
+        """Raises a DataError that names the first trajectory with fewer frames."""
         for index in range(len(self)):
             if self.split.frames(index) < frames:
                 raise DataError(

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -120,30 +120,22 @@ class SimulatedRecordings:
         return 4 * (self.preset.frames + 1) * self.preset.max_particles * self.scene.dim
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
-        """Simulates several trajectories in parallel; the results of the last two requests are cached.
-
-        Raises:
-            ConfigError: if no initial state fits into the box; names preset and seed.
-            UnstableError: if the simulation is unstable for several seeds in a row.
-        """
+        """Simulates several trajectories, see `simulate_all`; the results of the last two requests are cached."""
         key = tuple(indices)
         with self._lock:
             if key in self._requests and self._requests[key].failed:
                 del self._requests[key]
             first = not self._requests
             if key not in self._requests:
-                self._requests[key] = Task(lambda: self._simulate_first(key) if first else self._simulate(key))
+                simulate = self._simulate_first if first else self._simulate
+                self._requests[key] = Task(partial(simulate, key))
             while len(self._requests) > _CACHED_REQUESTS:
                 self._requests.popitem(last=False)
             request = self._requests[key]
         return request.result()
 
     def require_frames(self, frames: int, purpose: str) -> None:
-        """Raises an error if the trajectories are too short.
-
-        Raises:
-            ConfigError: if they have fewer frames.
-        """
+        """Raises a ConfigError if the trajectories have fewer frames."""
         if self.preset.frames + 1 < frames:
             raise ConfigError(
                 f"{self.preset.name}: its trajectories have {self.preset.frames + 1} frames, {purpose} needs {frames}."

@@ -27,7 +27,7 @@ _OPEN = "???"  # OmegaConf's for a value that is still to be given
 
 @dataclass(frozen=True)
 class StatedFacts:
-    """What a user states about recorded data where the files are silent or wrong; arguments of `infer_scene`."""
+    """Facts about recorded data that the user states where files are silent or wrong; arguments of `infer_scene`."""
 
     family: str | None = None
     gravity: Sequence[float] | None = None
@@ -71,11 +71,7 @@ class DataSource(abc.ABC):
         return read_metadata(self.folder)
 
     def recordings(self, name: str) -> SplitRecordings:
-        """The trajectories of the split "train", "valid" or "test".
-
-        Raises:
-            DataError: if the split is missing or its file is damaged.
-        """
+        """The trajectories of the split "train", "valid" or "test"; raises a DataError if its file is missing."""
         return SplitRecordings(Split(find_split(self.folder, name)), self.metadata, self.scene)
 
     def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
@@ -92,12 +88,7 @@ class DataSource(abc.ABC):
 
 @dataclass(frozen=True)
 class FolderSource(DataSource):
-    """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads.
-
-    Args:
-        path: The dataset.
-        stated: What its files do not state.
-    """
+    """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads."""
 
     path: Path
     stated: StatedFacts = field(default_factory=StatedFacts)
@@ -125,11 +116,7 @@ class FolderSource(DataSource):
 
 @dataclass(frozen=True)
 class HubSource(FolderSource):
-    """A dataset on the Hugging Face hub, downloaded on first use.
-
-    Args:
-        path: Its name, e.g. "WaterRamps" of `iSach/NeuralMPM`.
-    """
+    """A dataset on the Hugging Face hub, downloaded on first use; `path` is its name."""
 
     @property
     def description(self) -> str:

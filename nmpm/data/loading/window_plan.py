@@ -115,10 +115,10 @@ class WindowPlan:
         """Index of the buffer that a batch is drawn from, and the number of its windows drawn before."""
         stride, per_buffer = self._stride(world), self.batches_per_buffer(world)
         since = index - self.start.batch
-        left = max(0, per_buffer - self.start.drawn // stride)
-        if since < left:
+        first_buffer = max(0, per_buffer - self.start.drawn // stride)
+        if since < first_buffer:
             return self.start.buffer, self.start.drawn + since * stride
-        buffers, turn = divmod(since - left, per_buffer)
+        buffers, turn = divmod(since - first_buffer, per_buffer)
         return self.start.buffer + 1 + buffers, turn * stride
 
     def batch(self, index: int, rank: int, world: int) -> list[Drawn]:
@@ -239,7 +239,7 @@ class EndlessWindowPlan(WindowPlan):
         return tuple(range(first, first + self.buffer_size))
 
     def resume_after(self, batches: int, batch_size: int, earlier: int, world: int) -> Self:
-        """As for a finite dataset, but continues with the first buffer that no rank has started."""
+        """Continues with the first buffer that no rank has started."""
         if (batch_size, earlier) == (self.batch_size, world):
             return self
         buffer, drawn = replace(self, batch_size=batch_size).locate(batches, earlier)
