@@ -29,11 +29,6 @@ def straight(start: list[float], step: list[float], frames: int = 4) -> tuple[to
     return begin, begin.unsqueeze(1) + torch.arange(1, frames + 1)[:, None, None] * torch.tensor(step)
 
 
-def test_a_path_clear_of_obstacles_is_the_same_tensor():
-    begin, path = straight([5.0, 15.0], [0.3, -0.2])
-    assert floor().hold(begin, path) is path
-
-
 def test_a_fall_onto_the_floor_ends_at_its_surface():
     begin, path = straight([5.0, 12.0], [0.0, -0.7])
     held = floor().hold(begin, path)
@@ -62,7 +57,7 @@ def test_what_is_inside_is_pushed_out():
     speed=st.floats(0.01, 12), angle=st.floats(-3.1, 3.1), x=st.floats(1, 19), y=st.floats(10.6, 19),
     offset=st.floats(0, 1),
 )  # fmt: skip
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_nobody_gets_through_one_cell_however_it_lies_and_however_fast(speed, angle, x, y, offset):
     solid = torch.zeros(1, 1, 20, 20)
     solid[..., 8], solid[..., 9] = 1 - offset, offset  # a wall of one cell, its lower face at 8 + offset
@@ -71,14 +66,6 @@ def test_nobody_gets_through_one_cell_however_it_lies_and_however_fast(speed, an
     held = Contact(solid, GRID).hold(begin, path)
     assert held.isfinite().all()
     assert (held[..., 1] > 8 + offset).all()
-
-
-def test_scenes_of_a_batch_have_their_own_obstacles():
-    solid = torch.cat([floor().solid, torch.zeros(1, 1, 20, 20)])
-    begin, path = straight([5.0, 12.0], [0.0, -0.7])
-    held = Contact(solid, GRID).hold(begin.repeat(2, 1, 1), path.repeat(2, 1, 1, 1))
-    assert torch.equal(held[1], path[0])
-    torch.testing.assert_close(held[:1], floor().hold(begin, path))
 
 
 def wall(offset: float = 0.3) -> Contact:
@@ -96,7 +83,7 @@ def block() -> Contact:
 
 
 @pytest.mark.parametrize("obstacle", [floor, wall, block])
-@pytest.mark.parametrize("speed", [0.0, 0.05, 0.9, 7.0, 32.0])
+@pytest.mark.parametrize("speed", [0.0, 0.9, 32.0])
 def test_both_forms_agree(obstacle, speed):
     generator = torch.Generator().manual_seed(int(10 * speed))
     one = obstacle()
@@ -110,6 +97,8 @@ def test_both_forms_agree(obstacle, speed):
     assert not torch.equal(dense, path)
     torch.testing.assert_close(dense, by_branching, rtol=0, atol=2e-4)
     assert torch.equal(dense[1], path[1])
+    torch.testing.assert_close(by_branching[2:], one.hold_touching(start[2:], path[2:]))  # whatever others' speed
+    assert contact.hold_all(start[:, :0], path[:, :, :0]).shape == path[:, :, :0].shape
 
 
 def test_the_dense_form_in_chunks_is_the_same(monkeypatch):
@@ -120,15 +109,6 @@ def test_the_dense_form_in_chunks_is_the_same(monkeypatch):
     in_sevens = lambda count, device, values=1: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
     monkeypatch.setattr("nmpm.emulator.contact.chunks", in_sevens)
     torch.testing.assert_close(block().hold_all(start, path), whole, rtol=0, atol=1e-5)
-
-
-def test_a_scene_does_not_feel_how_fast_another_is():
-    begin, slow = straight([5.0, 10.6], [0.5, -0.5])
-    fast = straight([5.0, 10.6], [0.1, -15.0])[1]
-    contact = Contact(floor().solid.repeat(2, 1, 1, 1), GRID)
-    for hold in (contact.hold_touching, contact.hold_all):
-        together = hold(begin.repeat(2, 1, 1), torch.cat([slow, fast]))
-        torch.testing.assert_close(together[:1], floor().hold(begin, slow), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
@@ -145,7 +125,7 @@ def test_padding_is_left_as_it_is_and_changes_no_other_path(hold):
     assert not torch.equal(held, path)
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
 def test_a_step_that_is_not_finite_stays_so_and_disturbs_nobody(value, hold):
     begin, path = straight([5.0, 12.0], [0.0, -0.7])
@@ -153,13 +133,7 @@ def test_a_step_that_is_not_finite_stays_so_and_disturbs_nobody(value, hold):
     broken[0, 2:, 0, 1] = value
     held = getattr(floor(), hold)(begin.repeat(1, 2, 1), torch.cat([path, broken], dim=2))
     torch.testing.assert_close(held[:, :, :1], getattr(floor(), hold)(begin, path))
-    assert not held[:, 2:, 1].isfinite().all() or value == -float("inf")  # that leads onto the floor
-
-
-def test_nobody_to_hold():
-    begin, path = torch.zeros(2, 0, 2), torch.zeros(2, 4, 0, 2)
-    contact = Contact(floor().solid.repeat(2, 1, 1, 1), GRID)
-    assert contact.hold_touching(begin, path).shape == contact.hold_all(begin, path).shape == path.shape
+    assert not held[:, 2:, 1].isfinite().all()
 
 
 def test_in_three_dimensions():
@@ -176,32 +150,14 @@ def falling(solids: bool) -> torch.Tensor:
     """Lowest particle, after a block fell onto a slab, under a network that knows nothing."""
     scene = box(obstacles=True, particle_volume=0.01**2)
     torch.manual_seed(0)
-    emulator = (
-        EmulatorRecipe(scene, 32, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=solids))
-        .build()
-        .eval()
-    )
+    recipe = EmulatorRecipe(scene, 32, 4, processor=Pointwise(), constraints=Constraints(solids=solids))
+    emulator = recipe.build().eval()
     emulator.output_scale.fill_(1e-3)
-    particles = cloud(scene)
     slab = lattice(((0.08, 0.92), (0.1, 0.2)), 0.01)[None]
-    state = dataclasses.replace(particles, obstacle=slab, obstacle_mask=torch.ones(1, slab.shape[1], dtype=torch.bool))
-    return rollout(emulator, state, 200)[..., 1].min()
+    mask = torch.ones(1, slab.shape[1], dtype=torch.bool)
+    return rollout(emulator, dataclasses.replace(cloud(scene), obstacle=slab, obstacle_mask=mask), 200)[..., 1].min()
 
 
 def test_a_rollout_does_not_sink_into_an_obstacle():
     assert falling(solids=False) < 0.12
     assert falling(solids=True) > 0.19
-
-
-def test_a_model_without_obstacles_pays_nothing_and_is_the_same():
-    scene = box()
-    particles = cloud(scene)
-    torch.manual_seed(0)
-    with_, without = (
-        EmulatorRecipe(scene, 16, 4, processor=Pointwise(hidden=(4,)), constraints=Constraints(solids=on))
-        .build()
-        .eval()
-        for on in (True, False)
-    )
-    without.load_state_dict(with_.state_dict())
-    assert torch.equal(rollout(with_, particles, 8), rollout(without, particles, 8))

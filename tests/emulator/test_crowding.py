@@ -16,7 +16,7 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.processors import Pointwise
 from nmpm.scene import Scene
-from nmpm.transfer import Linear, scatter_backend, without_kernels
+from nmpm.transfer import Linear
 from nmpm.transfer.linear import linear_g2p
 
 
@@ -67,7 +67,7 @@ def test_a_block_below_the_cap_stays_to_the_bit(dim):
 def test_a_compressed_block_expands_to_the_cap_and_no_further():
     crowd, dense = crowding(square()), block(4, 16)  # four times as full as the cap
     assert fullness(crowd, dense).max() == pytest.approx(4, rel=1e-3)
-    loose = spread(crowd, dense, 200)
+    loose = spread(crowd, dense, 100)
     full = fullness(crowd, loose)
     assert full.max() < 1.05
     occupied = full > 0.5
@@ -76,28 +76,21 @@ def test_a_compressed_block_expands_to_the_cap_and_no_further():
     assert loose.mean((0, 1)).sub(16).abs().max() < 0.01
 
 
-def test_a_point_that_holds_everybody_empties():
-    crowd = crowding(square())
-    point = 16.3 + 0.01 * torch.randn(1, 200, 2, generator=torch.Generator().manual_seed(0))
-    assert fullness(crowd, spread(crowd, point, 200)).max() < 1.2
-
-
-def test_shifts_are_mirrored_with_the_scene():
+def test_shifts_are_mirrored_with_the_scene_and_balanced():
     crowd = crowding(square())
     cells = 16 + 1.5 * torch.randn(1, 100, 2, generator=torch.Generator().manual_seed(1))
     mirrored = torch.stack([32 - cells[..., 0], cells[..., 1]], dim=-1)
     one, other = (crowd.shift(place, everybody(place)) for place in (cells, mirrored))
     torch.testing.assert_close(other * torch.tensor([-1.0, 1.0]), one, rtol=0, atol=1e-4)
-    turned = crowd.shift(cells.flip(-1), everybody(cells))
-    torch.testing.assert_close(turned.flip(-1), one, rtol=0, atol=1e-5)
+    assert one.sum(1).norm() < 0.05 * one.norm(dim=-1).sum()  # away from walls
 
 
-def test_shifts_away_from_walls_sum_to_about_zero():
-    crowd = crowding(square())
-    for seed in range(3):
-        cells = 16 + 2.0 * torch.randn(1, 200, 2, generator=torch.Generator().manual_seed(seed))
-        shift = crowd.shift(cells, everybody(cells))
-        assert shift.sum(1).norm() < 0.05 * shift.norm(dim=-1).sum()
+def test_scenes_do_not_feel_each_other_and_periodic_axes_have_no_ends():
+    crowd = crowding(square(periodic=True))
+    blocks = torch.cat([block(3, 12, centre=c) for c in (16.0, 0.0, 32.0)])
+    shifts = crowd.shift(blocks, everybody(blocks))
+    assert torch.equal(shifts[:1], crowd.shift(blocks[:1], everybody(blocks[:1])))
+    torch.testing.assert_close(shifts[1:], shifts[:1].expand(2, -1, -1), rtol=0, atol=1e-4)
 
 
 def test_nobody_moves_more_than_the_largest_shift_and_padding_not_at_all():
@@ -107,20 +100,6 @@ def test_nobody_moves_more_than_the_largest_shift_and_padding_not_at_all():
     assert shift.abs().max() <= MAX_SHIFT
     assert shift[:, 400:].eq(0).all()
     assert torch.equal(shift[:, :400], crowd.shift(point[:, :400], real[:, :400]))
-
-
-def test_scenes_do_not_feel_each_other():
-    crowd, dense = crowding(square()), block(3, 12)
-    other = dense + torch.tensor([4.2, -3.1])
-    both = torch.cat([dense, other])
-    assert torch.equal(crowd.shift(both, everybody(both))[:1], crowd.shift(dense, everybody(dense)))
-
-
-def test_periodic_axes_have_no_ends():
-    crowd = crowding(square(periodic=True))
-    shifts = [crowd.shift(block(3, 12, centre=c), everybody(block(3, 12, centre=c))) for c in (16.0, 0.0, 32.0)]
-    torch.testing.assert_close(shifts[1], shifts[0], rtol=0, atol=1e-4)
-    torch.testing.assert_close(shifts[2], shifts[0], rtol=0, atol=1e-4)
 
 
 def test_no_flow_through_a_solid():
@@ -134,17 +113,10 @@ def test_no_flow_through_a_solid():
     assert spread(crowd, dense, 100)[..., 1].min() >= 15.5
 
 
-def test_wide_cells_are_spread_as_square_ones_of_the_same_material():
-    """A block that is as crowded on cells of another aspect moves out, and its energy-free pressure stays finite."""
-    grid = Grid((32, 16), (0.0, 0.0), (1.0, 2.0), (False, False))
-    crowd, dense = crowding(grid, particle=0.125), block(4, 16) / torch.tensor([1.0, 2.0])
-    assert fullness(crowd, spread(crowd, dense, 200)).max() < 1.1
-
-
 def test_derivatives_are_finite_and_those_of_differences():
     crowd = crowding(square(12))
     cells = 6 + torch.randn(1, 40, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    crowd = dataclasses.replace(crowd, room=crowd.room.double())
+    crowd = dataclasses.replace(crowd, free=crowd.free.double())
     direction = torch.randn(1, 40, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     along = [crowd.shift(cells + sign * 1e-7 * direction, everybody(cells)).square().sum() for sign in (1, -1)]
     leaf = cells.clone().requires_grad_()
@@ -207,8 +179,8 @@ def test_a_rollout_spreads_what_is_crowded_and_stays_within_bounds(name):
     capped, flat = emulator_of(scene, density_cap=2.0), scene.dim == 2
     count, width = (400, 0.1) if flat else (6000, 0.06)
     state = crowd_in(scene, count, width, statics=5 if scene.obstacles else 0)
-    free, held = (rollout(e, state, 80) for e in (capped.with_constraints(Constraints()), capped))
-    assert peak(capped, free[:, -1]) > 4
+    held = rollout(capped, state, 80)
+    assert peak(capped, state.position) > 4
     assert peak(capped, held[:, -1]) < 2.2
     low, high = torch.tensor(scene.bounds).T
     for axis, wraps in enumerate(scene.periodic):
@@ -217,29 +189,14 @@ def test_a_rollout_spreads_what_is_crowded_and_stays_within_bounds(name):
             assert held[..., axis].max() <= high[axis] + 1e-6
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_without_a_crowd_nothing_changes(name):
-    scene = SCENES[name]
-    state = cloud(scene, statics=5 if scene.obstacles else 0)
-    capped = emulator_of(scene, gain=0.1, density_cap=100.0, energy=True)
-    off = capped.with_constraints(dataclasses.replace(capped.constraints, density_cap=0.0))
-    assert torch.equal(rollout(capped, state, 12), rollout(off, state, 12))
-
-
 def test_the_velocity_is_that_of_the_material_not_of_the_spreading():
-    capped = emulator_of(SCENES["walls"], density_cap=2.0)
+    capped, loose = emulator_of(SCENES["walls"], density_cap=2.0), cloud(SCENES["walls"])
+    assert torch.equal(rollout(capped, loose, 4), rollout(capped.unconstrained(), loose, 4))
     (bundle,) = unroll(capped, crowd_in(SCENES["walls"]), 1)
     assert bundle.velocity.eq(0).all()
     steps = bundle.position.diff(dim=1)
     assert steps.abs().max() > 1e-4
     torch.testing.assert_close(steps, steps[:, :1].expand_as(steps), rtol=0, atol=1e-6)  # even over the frames
-
-
-def test_training_has_no_cap():
-    capped = emulator_of(SCENES["walls"], density_cap=2.0).train()
-    free = capped.with_constraints(Constraints())
-    state = crowd_in(SCENES["walls"])
-    assert torch.equal(next(unroll(capped, state, 1)).position, next(unroll(free, state, 1)).position)
 
 
 @pytest.mark.parametrize("branching", [True, False])
@@ -274,7 +231,7 @@ def test_resting_particles_move_only_where_they_are_crowded():
     end = rollout(emulator, state.with_motion(apart, state.velocity), 40)[:, -1]
     torch.testing.assert_close(end[:, :40], apart[:, :40], rtol=0, atol=1e-6)
     assert (end[:, 40:] - apart[:, 40:]).abs().max() > 0.01
-    again = rollout(emulator, state.with_motion(end, state.velocity), 400)[:, -1]
+    again = rollout(emulator, state.with_motion(end, state.velocity), 200)[:, -1]
     final = rollout(emulator, state.with_motion(again, state.velocity), 40)[:, -1]
     assert (final - again).abs().max() < 0.1 * emulator.grid.spacing[0]  # what has spread stays
 
@@ -293,21 +250,6 @@ def test_nobody_is_pushed_into_an_obstacle():
     assert (path[:, -1, :, 1] > 0.41).all()  # nobody got through
 
 
-def test_padding_changes_nothing():
-    scene = SCENES["walls"]
-    emulator, state = emulator_of(scene, gain=0.1, density_cap=1.5, energy=True), crowd_in(scene)
-    padded = dataclasses.replace(
-        state,
-        position=torch.cat([state.position, torch.zeros(1, 7, 2) + 0.5], dim=1),
-        velocity=torch.cat([state.velocity, torch.zeros(1, 7, 2)], dim=1),
-        material=torch.cat([state.material, torch.zeros(1, 7, dtype=torch.int64)], dim=1),
-        mask=torch.cat([state.mask, torch.zeros(1, 7, dtype=torch.bool)], dim=1),
-    )
-    with without_kernels(), scatter_backend("sorted"):
-        alone, together = rollout(emulator, state, 24), rollout(emulator, padded, 24)
-    assert torch.equal(together[:, :, :400], alone)
-
-
 def test_gradients_of_a_capped_rollout_are_finite():
     scene = box()
     emulator = emulator_of(scene, gain=0.1, density_cap=1.5, energy=True)
@@ -319,10 +261,9 @@ def test_gradients_of_a_capped_rollout_are_finite():
     assert gradient.abs().max() > 0
 
 
-@pytest.mark.parametrize("cap", [-1.0, float("nan"), float("inf")])
-def test_a_cap_that_is_none(cap):
+def test_a_cap_that_is_none():
     with pytest.raises(ConfigError, match="density_cap"):
-        Constraints(density_cap=cap)
+        Constraints(density_cap=float("nan"))
 
 
 def test_the_cap_is_measured_in_windows():
