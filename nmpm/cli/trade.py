@@ -103,12 +103,13 @@ def measure_and_report(command: str, chosen: argparse.Namespace, dataset: str) -
     else:
         sweep = trade.read_sweep(read_text(chosen.config), str(chosen.config))
     sweep = sweep if chosen.scenes is None else sweep.with_scenes(chosen.scenes)
+    predictors = [trade.find_factory(path) for path in chosen.predictors]
     models = _models_of(Path(dataset).name) if chosen.models is None else _load_models(chosen.models)
     if chosen.wider:
         scenes = trade.find_wider_scenes(dataset, sweep.scenes, chosen.wider)
     else:
         scenes = trade.find_scenes(dataset, sweep.scenes)
-    choices = trade.make_choices(sweep, scenes, models, find_device(chosen.device), chosen.predictors)
+    choices = trade.make_choices(sweep, scenes, models, find_device(chosen.device), predictors)
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     points = trade.measure(choices, scenes, sweep, trade.Store(out), command)

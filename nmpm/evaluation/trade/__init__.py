@@ -1,6 +1,6 @@
 """The trade between speed and accuracy: models, the simulator and trivial predictors, measured on the same scenes."""
 
-from nmpm.evaluation.trade.choices import Kind, Predictor
+from nmpm.evaluation.trade.choices import Kind, Predictor, find_factory
 from nmpm.evaluation.trade.measurement import Store, measure
 from nmpm.evaluation.trade.ranking import Point
 from nmpm.evaluation.trade.scenes import Scenes, find_scenes, find_wider_scenes, read_scenes
@@ -13,6 +13,7 @@ __all__ = [
     "Scenes",
     "Store",
     "Sweep",
+    "find_factory",
     "find_scenes",
     "find_wider_scenes",
     "make_choices",

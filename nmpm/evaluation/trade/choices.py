@@ -247,16 +247,14 @@ def trivial_choice(name: str, scene: Scene) -> PredictorChoice:
     return PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=partial(TRIVIAL[name], scene))
 
 
-def imported_choice(path: str, scene: Scene) -> PredictorChoice:
-    """The predictor that a factory makes for a scene.
+def find_factory(path: str) -> Callable[[Scene], Predictor]:
+    """Import what makes a predictor for a scene; the code in its module runs.
 
     Args:
-        path: `module:factory`, called with the scene, or `module:factory:argument`, called with that text too. The
-            module is imported, and the code in it runs.
-        scene: Facts of the scenes.
+        path: `module:factory`, called with the scene, or `module:factory:argument`, called with that text too.
 
     Raises:
-        ConfigError: if there is no such factory, or it returns no `Predictor`.
+        ConfigError: if there is no such factory.
     """
     module, _, rest = path.partition(":")
     factory, *argument = rest.split(":", 1)
@@ -264,8 +262,17 @@ def imported_choice(path: str, scene: Scene) -> PredictorChoice:
         make = getattr(import_module(module), factory)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"--predictors {path}: {one_line(error)}. Give module:factory[:argument].") from error
-    predictor = make(scene, *argument)
+    return lambda scene: make(scene, *argument)
+
+
+def foreign_choice(make: Callable[[Scene], Predictor], scene: Scene) -> PredictorChoice:
+    """A predictor of another package as a choice.
+
+    Raises:
+        ConfigError: if it is no `Predictor`.
+    """
+    predictor = make(scene)
     if not callable(predictor) or not isinstance(getattr(predictor, "name", None), str):
-        raise ConfigError(f"--predictors {path}: the factory should return a callable with a name.")
+        raise ConfigError(f"The factory of a predictor returned {predictor!r}, no callable with a name.")
     settings = {"model": predictor.name}
     return PredictorChoice(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Literal
@@ -17,9 +17,19 @@ from nmpm._support.plain_data import from_plain
 from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError
 from nmpm.evaluation.prediction_errors import Measures
-from nmpm.evaluation.trade.choices import CPU, Choice, Kind, SimulatorChoice, digest, imported_choice, trivial_choice
+from nmpm.evaluation.trade.choices import (
+    CPU,
+    Choice,
+    Kind,
+    Predictor,
+    SimulatorChoice,
+    digest,
+    foreign_choice,
+    trivial_choice,
+)
 from nmpm.evaluation.trade.models import ModelSettings, model_choices
 from nmpm.evaluation.trade.scenes import Scenes
+from nmpm.scene import Scene
 from nmpm.sim import Preset
 from nmpm.sim.predictability import twin_of
 
@@ -136,7 +146,7 @@ def make_choices(
     scenes: Scenes,
     models: Mapping[str, Emulator],
     device: torch.device = CPU,
-    predictors: Sequence[str] = (),
+    predictors: Sequence[Callable[[Scene], Predictor]] = (),
 ) -> list[Choice]:
     """All choices of a sweep; the first is the reference that times are compared with.
 
@@ -145,7 +155,7 @@ def make_choices(
         scenes: What is predicted; without simulator there are no choices of it, and no floors.
         models: Trained emulators on the CPU, by name; those of other scenes are rebuilt for these.
         device: Where they compute.
-        predictors: Of other packages, by Python path, see `imported_choice`.
+        predictors: Make those of other packages.
 
     Raises:
         ConfigError: if a model cannot take the scenes, there is no such setting, or two choices have one name.
@@ -156,7 +166,7 @@ def make_choices(
         choices += _floors(sweep.floors, scenes.preset)
     for name, emulator in models.items():
         choices += _without_repetitions(model_choices(sweep.models, name, emulator, scenes, device))
-    choices += [imported_choice(path, scenes.scene) for path in predictors]
+    choices += [foreign_choice(make, scenes.scene) for make in predictors]
     choices += [trivial_choice(name, scenes.scene) for name in sweep.trivial]
     names = [choice.name for choice in choices]
     if repeated := next((name for name in names if names.count(name) > 1), None):
