@@ -96,8 +96,7 @@ def _load(arguments: argparse.Namespace) -> ModelUnderTest:
 
     model = load_model(arguments.model, arguments.device, arguments.root).optimized(arguments.runtime)
     choose_threads(model, arguments.threads)
-    known = model.preset if model.preset in preset_names() else None
-    preset = arguments.preset or known
+    preset = arguments.preset or (model.preset if model.preset in preset_names() else None)
     emulator = model.emulator.unconstrained() if arguments.free else model.emulator
     return ModelUnderTest(
         arguments.model, emulator, model.horizon, load_preset(preset) if preset else None, arguments.seed

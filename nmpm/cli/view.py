@@ -33,21 +33,21 @@ def run(words: list[str]) -> None:
     parser.add_argument("--every", type=int, default=1, help="show every so many frames (default: 1, all)")
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
     parser.add_argument("--out", type=Path, help="page to write (default: FILE with the suffix .html)")
-    chosen = parser.parse_args(words[1:])
-    check_at_least("--every", chosen.every, 1)
-    for name, path in (("FILE", chosen.file), ("TRUTH", chosen.truth)):
+    arguments = parser.parse_args(words[1:])
+    check_at_least("--every", arguments.every, 1)
+    for name, path in (("FILE", arguments.file), ("TRUTH", arguments.truth)):
         if path is not None:
             check_input(name, path)
     from nmpm.viz.output import check_output, check_suffix
 
-    out = chosen.out or chosen.file.with_suffix(".html")
+    out = arguments.out or arguments.file.with_suffix(".html")
     check_suffix(out, (".html",), "a page")
     check_output(out)
     from nmpm.viz.viewer import page_of_files
 
-    truth_index = chosen.trajectory if chosen.truth_trajectory is None else chosen.truth_trajectory
-    truth = (chosen.truth, truth_index) if chosen.truth else None
-    page = page_of_files((chosen.file, chosen.trajectory), truth, chosen.every, chosen.family)
+    truth_index = arguments.trajectory if arguments.truth_trajectory is None else arguments.truth_trajectory
+    truth = (arguments.truth, truth_index) if arguments.truth else None
+    page = page_of_files((arguments.file, arguments.trajectory), truth, arguments.every, arguments.family)
     page.write(out)
     size = out.stat().st_size / 1e6
     sys.stdout.write(f"wrote {out} ({size:.1f} MB): open it in a browser\n")

@@ -150,6 +150,16 @@ class Preset(abc.ABC):
             ConfigError: if the preset's resolution cannot be divided so.
         """
 
+    def _widened_sides(self, times: int, step: float) -> tuple[Interval, Interval, int]:
+        """Box and domain along x in a domain so many times as wide, and how many steps of a length fill that box.
+
+        The box is as wide as whole steps allow, its wall layer on the right at least what it was.
+        """
+        (left, right), (low, high) = self.domain[0], self.box[0]
+        edge = left + times * (right - left)
+        steps = math.floor((edge - (right - high) - low) / step + 1e-9)
+        return (low, low + steps * step), (left, edge), steps
+
     def with_frames(self, frames: int) -> Self:
         """The same with another number of frames.
 

@@ -155,8 +155,8 @@ def filled_volume(emulator: Emulator, start: Particles, position: Tensor) -> Ten
     grid, scene = emulator.grid, emulator.scene
     cells = grid.to_cells(torch.where(start.mask.unsqueeze(-1), position, position.new_tensor(scene.domain).mean(1)))
     fraction = volume_fraction(scene, grid, emulator.transfer, start.mask, cells)
-    own = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
-    return fraction.clamp(max=1.0).flatten(1).sum(1) / own
+    volume = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
+    return fraction.clamp(max=1.0).flatten(1).sum(1) / volume
 
 
 def _largest(values: Tensor, real: Tensor) -> Tensor:

@@ -58,9 +58,9 @@ class Stepper3d(MpmStepper):
 
 
 @jit
-def _weights(place: float) -> tuple[float, float, float]:
-    """Quadratic B-spline weights of three nodes; the particle is `place` cells from the first."""
-    return 0.5 * (1.5 - place) ** 2, 0.75 - (place - 1.0) ** 2, 0.5 * (place - 0.5) ** 2
+def _weights(offset: float) -> tuple[float, float, float]:
+    """Quadratic B-spline weights of three nodes; the particle is `offset` cells from the first."""
+    return 0.5 * (1.5 - offset) ** 2, 0.75 - (offset - 1.0) ** 2, 0.5 * (offset - 0.5) ** 2
 
 
 @jit

@@ -85,10 +85,10 @@ class MpmPreset(Preset):
         check(bool(self.materials), f"materials is empty; known are {', '.join(MATERIALS)}.")
         self._check_axes()
         self._check_dimension()
-        least = self._wave_substeps
+        least, fastest = self._wave_substeps, max(material.wave_speed for material in self.materials)
         check(
             self.substeps >= least,
-            f"substeps = {self.substeps} are too few: at {self.wave_speed:.1f} m/s an elastic wave crosses more than "
+            f"substeps = {self.substeps} are too few: at {fastest:.1f} m/s an elastic wave crosses more than "
             f"{CFL_LIMIT} cells in one. Take at least {least}, or a softer material.",
         )
 
@@ -133,16 +133,6 @@ class MpmPreset(Preset):
         return tuple(_snap(pair, edges) for pair, edges in zip(ends, self.domain, strict=True))
 
     @property
-    def particle_volume(self) -> float:
-        """Area of one particle, or volume in three dimensions."""
-        return self.spacing**self.dim
-
-    @property
-    def wave_speed(self) -> float:
-        """Of the fastest elastic wave at rest, in length per second."""
-        return max(material.wave_speed for material in self.materials)
-
-    @property
     def _wave_substeps(self) -> int:
         """Fewest substeps of a frame that keep elastic waves at rest within `CFL_LIMIT`: necessary, not sufficient."""
         longest = min(longest_wave_substep(material, self.cell_size) for material in self.materials)
@@ -185,18 +175,12 @@ class MpmPreset(Preset):
         return many._with_stable_substeps(1)
 
     def widened(self, times: int) -> MpmPreset:
-        """Scenes in a domain so many times as wide, with up to as many times as many particles and blocks.
-
-        The box is as wide as whole cells of the simulator allow, its wall layer on the right at least what it was.
-        """
-        (left, right), *others = self.domain
-        low, high = self.box[0]
-        edge = left + times * (right - left)
-        cells = math.floor((edge - (right - high) - low) / self.cell_size + 1e-9)
+        """Scenes in a domain so many times as wide, with up to as many times as many particles and blocks."""
+        box, domain, cells = self._widened_sides(times, self.cell_size)
         return dataclasses.replace(
             self,
-            box=((low, low + cells * self.cell_size), *self.box[1:]),
-            domain=((left, edge), *others),
+            box=(box, *self.box[1:]),
+            domain=(domain, *self.domain[1:]),
             cells=cells,
             blocks=self.blocks.multiplied(times),
         )
@@ -219,7 +203,7 @@ class MpmPreset(Preset):
         counts, ramps = self._counts_of(start), _ramps_of(start)
         gravity = self.gravity if start.gravity is None else start.gravity
         groups = tuple(zip(self.materials, counts, strict=True))
-        particles = MpmParticles(start.position, start.velocity, groups, self.particle_volume)
+        particles = MpmParticles(start.position, start.velocity, groups, self.spacing**self.dim)
         stepper = _STEPPERS[self.dim](self._grid(gravity, ramps), self.frame_dt / self.substeps)
         stepper.enclose(particles)
 
@@ -263,7 +247,7 @@ class MpmPreset(Preset):
             domain=self.domain,
             dt=self.frame_dt,
             materials=tuple(material.name for material in self.materials),
-            particle_volume=self.particle_volume,
+            particle_volume=self.spacing**self.dim,
             gravity=None if self.gravity_turn else self.gravity,
             gravity_varies=self.gravity_turn > 0,
             obstacles=self.ramps is not None,

@@ -116,17 +116,9 @@ class SphPreset(Preset):
         return dataclasses.replace(many, substeps=max(self.substeps, many.stable_substeps))
 
     def widened(self, times: int) -> SphPreset:
-        """Scenes in a domain so many times as wide; a column becomes as many times as wide, too.
-
-        The box is as wide as whole spacings allow, its wall layer on the right at least what it was.
-        """
-        (left, right), vertical = self.domain
-        low, high = self.box[0]
-        edge = left + times * (right - left)
-        spacings = math.floor((edge - (right - high) - low) / self.spacing + 1e-9)
-        wide = dataclasses.replace(
-            self, box=((low, low + spacings * self.spacing), self.box[1]), domain=((left, edge), vertical)
-        )
+        """Scenes in a domain so many times as wide; a column becomes as many times as wide, too."""
+        box, domain, _ = self._widened_sides(times, self.spacing)
+        wide = dataclasses.replace(self, box=(box, self.box[1]), domain=(domain, self.domain[1]))
         return wide._with_layout(self.layout.multiplied(times))
 
     def coarsened(self, factor: int) -> SphPreset:
@@ -145,11 +137,6 @@ class SphPreset(Preset):
     def _with_layout(self, layout: FluidLayout) -> SphPreset:
         changed: dict[str, Any] = {"blocks" if self.column is None else "column": layout}
         return dataclasses.replace(self, **changed)
-
-    @property
-    def particle_volume(self) -> float:
-        """Area of one particle at rest."""
-        return self.spacing**2
 
     def draw(self, seed: int) -> InitialState:
         rng = np.random.default_rng(seed)
@@ -188,7 +175,7 @@ class SphPreset(Preset):
             domain=self.domain,
             dt=self.frame_dt,
             materials=("water",),
-            particle_volume=self.particle_volume,
+            particle_volume=self.spacing**2,
             gravity=None if self.gravity_turn else self.gravity,
             gravity_varies=self.gravity_turn > 0,
             obstacles=True,
