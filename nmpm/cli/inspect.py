@@ -85,14 +85,11 @@ def _open(path: Path, format_name: str | None, options: Options, native: Path) -
     """
     from nmpm.data.convert import convert
     from nmpm.data.format import split_paths
-    from nmpm.data.loading.sources import FolderSource, StatedFacts
+    from nmpm.data.loading.sources import FolderSource
 
     path = _dataset_of(path)
-    changed = options.types or options.static is not None or options.dt is not None
-    if split_paths(path) and not changed and format_name is None:
-        boundary = options.periodic and ["periodic" if flag else "wall" for flag in options.periodic]
-        facts = StatedFacts(options.family, options.gravity, boundary, options.bounds, options.fields)  # type: ignore[arg-type]  # (argparse gives plain lists)
-        return FolderSource(path, facts), []
+    if split_paths(path) and format_name is None:
+        return FolderSource(path, options), []
     problems: list[str] = []
     if format_name is None:
         try:

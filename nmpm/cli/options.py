@@ -154,7 +154,7 @@ def data_options(options: argparse.Namespace) -> Options:
         bounds=_parse("--bounds", options.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
         dt=options.dt,
         gravity=gravity_option(options.gravity),
-        periodic=_parse("--boundary", options.boundary, _kinds, '"wall" or "periodic" for each axis'),
+        boundary=_parse("--boundary", options.boundary, _kinds, '"wall" or "periodic" for each axis'),
         fields=_parse("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
     )
 
@@ -217,8 +217,8 @@ def _field_names(text: str) -> tuple[str, ...]:
     return names
 
 
-def _kinds(text: str) -> tuple[bool, ...]:
-    kinds = text.split(",")
+def _kinds(text: str) -> tuple[str, ...]:
+    kinds = tuple(text.split(","))
     if not set(kinds) <= {"wall", "periodic"}:
         raise ValueError(text)
-    return tuple(kind == "periodic" for kind in kinds)
+    return kinds

@@ -10,11 +10,12 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 
+from nmpm.data.convert import Options
 from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import pin_for
-from nmpm.data.loading.sources import SourceName, StatedFacts, make_source
+from nmpm.data.loading.sources import SourceName, make_source
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
@@ -99,8 +100,8 @@ class TrajectoryDataModule(LightningDataModule):
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        stated = StatedFacts(family, gravity, boundary, bounds, fields)
-        self.data_source = make_source(path, name, source, stated, generate)
+        options = Options(family, bounds=bounds, gravity=gravity, boundary=boundary, fields=fields)
+        self.data_source = make_source(path, name, source, options, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")

@@ -6,7 +6,7 @@ float32 attribute beside the metadata's float64 is no other gravity.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,17 +55,18 @@ def _same(one: Gravity, other: Gravity) -> bool:
     return len(one) == len(other) and np.allclose(one, other, atol=1e-6)
 
 
-def check_gravity(given: Gravity, stated: Gravity | None, path: Path) -> None:
+def check_gravity(given: Sequence[float], stated: Gravity | None, path: Path) -> None:
     """Compares a user's gravity with that of a file, if it states one.
 
     Raises:
         ConfigError: naming both, if they differ.
     """
-    if stated is not None and not _same(given, stated):
+    values = tuple(map(float, given))
+    if stated is not None and not _same(values, stated):
         raise ConfigError(
-            f"gravity = {list(given)} contradicts {path}, which states gravity {list(stated)}. Leave the option"
+            f"gravity = {list(values)} contradicts {path}, which states gravity {list(stated)}. Leave the option"
             " out to use the file's; if the file is wrong, write a corrected copy with nmpm convert FOLDER NEW"
-            f" --gravity={','.join(f'{value:g}' for value in given)}."
+            f" --gravity={','.join(f'{value:g}' for value in values)}."
         )
 
 

@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from nmpm.data.convert.base import Options
 from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
 from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
-from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Boundary, Interval, Scene, check_field_names
+from nmpm.errors import DataError
+from nmpm.scene import Interval, Scene, check_field_names
 
 _WALL_LAYER = 0.025  # of the extent; DeepMind's 0.1-0.9 becomes the paper's 0.08-0.92
 _SAMPLE_BYTES = 2**27
 _SPACING_TRAJECTORIES = 8
 
 
-def infer_scene(
-    folder: Path,
-    family: str | None = None,
-    gravity: Sequence[float] | None = None,
-    boundary: Sequence[Boundary] | None = None,
-    bounds: Sequence[Interval] | None = None,
-    fields: Sequence[str] | None = None,
-) -> Scene:
+def infer_scene(folder: Path, options: Options | None = None) -> Scene:
     """Infers the scene of a dataset.
 
     Bounds are the metadata's, widened to contain all sampled positions of moving particles. The domain is the
@@ -42,11 +36,7 @@ def infer_scene(
 
     Args:
         folder: The dataset's folder.
-        family: Meaning of the type ids where the metadata does not state it.
-        gravity: Acceleration in length/s², where the files do not state it.
-        boundary: "wall" or "periodic" per axis, instead of the metadata's.
-        bounds: (lower, upper) per axis, instead of the metadata's.
-        fields: Names, instead of the metadata's.
+        options: What the user states beside the metadata.
 
     Raises:
         DataError: if files are missing or wrong, a trajectory lacks a field, a position lies outside the domain that
@@ -54,11 +44,11 @@ def infer_scene(
             metadata's gravity.
         ConfigError: if an argument does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
-    folder = Path(folder)
-    stated = read_metadata(folder, family)
-    metadata = _override(stated, gravity, boundary, bounds)
-    if metadata.gravity is not None and gravity is not None:
-        check_gravity(metadata.gravity, stated.gravity, folder / METADATA_FILE)
+    folder, options = Path(folder), options or Options()
+    stated = read_metadata(folder, options.family)
+    metadata = options.apply_to(stated)
+    if options.gravity is not None:
+        check_gravity(options.gravity, stated.gravity, folder / METADATA_FILE)
     split = Split(find_split(folder, *SPLITS))
     if split.dim != metadata.dim:
         raise DataError(
@@ -70,11 +60,11 @@ def infer_scene(
     gravities = distinct_gravities(
         trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in range(len(split))
     )
-    if metadata.gravity is not None and gravity is not None:
+    if options.gravity is not None:
         for other in gravities:
-            check_gravity(metadata.gravity, other, split.path)
+            check_gravity(options.gravity, other, split.path)
     materials = _materials(types, metadata, split)
-    kinds = _kinds_of_fields(split, metadata, metadata.fields if fields is None else tuple(fields))
+    kinds = _kinds_of_fields(split, metadata, metadata.fields)
     return Scene(
         bounds=widened,
         domain=domain,
@@ -100,26 +90,6 @@ def _kinds_of_fields(split: Split, metadata: Metadata, names: Sequence[str]) -> 
     for index in _sample(split) if names else ():
         add_fields(facts, split, index, metadata, names)
     return {name: facts[name].kind for name in names}
-
-
-def _override(
-    metadata: Metadata,
-    gravity: Sequence[float] | None,
-    boundary: Sequence[Boundary] | None,
-    bounds: Sequence[Interval] | None,
-) -> Metadata:
-    for name, value in (("gravity", gravity), ("boundary", boundary), ("bounds", bounds)):
-        if value is not None and len(value) != metadata.dim:
-            raise ConfigError(f"{name} = {list(value)} needs one entry for each of the data's {metadata.dim} axes.")
-    if gravity is not None:
-        metadata = replace(metadata, gravity=tuple(map(float, gravity)))
-    if boundary is not None:
-        if not set(boundary) <= {"wall", "periodic"}:
-            raise ConfigError(f'boundary = {list(boundary)} must be "wall" or "periodic" per axis.')
-        metadata = replace(metadata, periodic=tuple(kind == "periodic" for kind in boundary))
-    if bounds is not None:
-        metadata = replace(metadata, bounds=tuple((float(low), float(high)) for low, high in bounds), domain=None)
-    return metadata
 
 
 def _types(split: Split, metadata: Metadata) -> frozenset[int]:

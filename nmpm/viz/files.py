@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from nmpm.data.convert import Options
 from nmpm.data.fields import read_fields
 from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
 from nmpm.data.gravity import trajectory_gravity
@@ -127,7 +128,7 @@ def _describe(
         return *_read_facts(trajectory.attributes, split.path), "prediction"
     metadata = read_metadata(split.path.parent, family)
     label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
-    return infer_scene(split.path.parent, family), dict(metadata.particle_types), metadata.static_types, label
+    return infer_scene(split.path.parent, Options(family)), dict(metadata.particle_types), metadata.static_types, label
 
 
 def _read_facts(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[int, str], frozenset[int]]:

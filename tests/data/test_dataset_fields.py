@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from nmpm.data.arrays import write_trajectories
+from nmpm.data.convert import Options
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.inspection import inspect
 from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.sources import FolderSource, StatedFacts
+from nmpm.data.loading.sources import FolderSource
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.made_up import made_up_metadata, made_up_trajectory
@@ -54,18 +55,18 @@ def test_the_kinds_follow_from_the_data(folder):
 def test_a_configuration_declares_other_fields_than_the_metadata(folder):
     assert data_of(folder, fields=["still"]).scene.properties == ("still",)
     assert data_of(folder, fields=[]).scene.fields == ()
-    source = FolderSource(folder, StatedFacts(fields=["force"]))
+    source = FolderSource(folder, Options(fields=["force"]))
     assert source.metadata.fields == ("force",)
     assert source.recordings("test")[0].fields.keys() == {"force"}
 
 
 def test_a_declared_field_that_is_missing_or_no_field_is_named(folder):
     with pytest.raises(DataError, match=r"trajectory 00000: it has no field temprature.*it has: force, friction"):
-        infer_scene(folder, fields=["temprature"])
+        infer_scene(folder, Options(fields=["temprature"]))
     with pytest.raises(DataError, match=r"wind is float64 of shape \(12, 2\); a field is \(T, N\)"):
-        infer_scene(folder, fields=["wind"])
+        infer_scene(folder, Options(fields=["wind"]))
     with pytest.raises(ConfigError, match="cannot be called 'gravity'"):
-        infer_scene(folder, fields=["gravity"])
+        infer_scene(folder, Options(fields=["gravity"]))
     with pytest.raises(ConfigError, match="fields cannot be combined with the simulated dataset goop"):
         TrajectoryDataModule(name="goop", fields=["temperature"])
 
@@ -132,7 +133,7 @@ def test_an_inspection_says_what_varies_and_which_channels_that_makes(folder):
 
 
 def test_arrays_are_written_with_the_fields_of_their_scene(folder, tmp_path):
-    scene = infer_scene(folder, fields=["temperature"])
+    scene = infer_scene(folder, Options(fields=["temperature"]))
     run = made_up_trajectory(12, 4, fields=("temperature",))
     types = np.zeros(4, dtype=int)
     path = tmp_path / "new" / "train.h5"

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nmpm.data.convert import Options
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
@@ -33,7 +34,7 @@ def scene_of(tmp_path_factory):
         folder = tmp_path_factory.mktemp("dataset")
         write_metadata(folder, metadata)
         write_split(folder / f"{split}.h5", runs)
-        return infer_scene(folder, **arguments)
+        return infer_scene(folder, Options(**arguments))
 
     return infer
 
@@ -168,7 +169,7 @@ class TestGravity:
 
 class TestRecorded:
     def test_waterdrop(self, recorded):
-        scene = infer_scene(recorded / "deepmind-waterdrop", family="deepmind", gravity=(0, -9.81))
+        scene = infer_scene(recorded / "deepmind-waterdrop", Options("deepmind", gravity=(0, -9.81)))
         assert scene.dim == 2
         assert scene.dt == 0.0025
         assert scene.materials == ("water",)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from nmpm.data.families import STATIC_NAMES
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Interval
+from nmpm.scene import Boundary, Interval
 
 UNKNOWN_LENGTH = 0
 """`Metadata.sequence_length` where the files do not state it; the conversion sets the length that it finds."""
@@ -30,18 +30,25 @@ class Options:
         bounds: Where particles may be, (lower, upper) per axis, in domain length.
         dt: Time between stored frames, in seconds.
         gravity: Acceleration in length/s² per axis.
-        periodic: Whether each axis is periodic.
+        boundary: "wall" or "periodic" per axis.
         fields: Names of the fields that are inputs of models.
+
+    Raises:
+        ConfigError: for another boundary.
     """
 
     family: str | None = None
     types: Mapping[int, str] | None = None
     static: frozenset[int] | None = None
-    bounds: tuple[Interval, ...] | None = None
+    bounds: Sequence[Interval] | None = None
     dt: float | None = None
-    gravity: tuple[float, ...] | None = None
-    periodic: tuple[bool, ...] | None = None
-    fields: tuple[str, ...] | None = None
+    gravity: Sequence[float] | None = None
+    boundary: Sequence[Boundary] | None = None
+    fields: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.boundary is not None and not set(self.boundary) <= {"wall", "periodic"}:
+            raise ConfigError(f'boundary = {list(self.boundary)} must be "wall" or "periodic" per axis.')
 
     def apply_to(self, metadata: Metadata) -> Metadata:
         """The metadata with the user's corrections; the family is applied where the type ids are read.
@@ -49,20 +56,26 @@ class Options:
         Raises:
             ConfigError: if a value does not match the number of axes, or is invalid.
         """
-        for name in ("bounds", "gravity", "periodic"):
+        for name in ("bounds", "gravity", "boundary"):
             value = getattr(self, name)
             if value is not None and len(value) != metadata.dim:
-                raise ConfigError(f"{name} = {value} needs one entry for each of the data's {metadata.dim} axes.")
+                raise ConfigError(f"{name} = {list(value)} needs one entry for each of the data's {metadata.dim} axes.")
         if self.dt is not None and not self.dt > 0:
             raise ConfigError(f"dt = {self.dt} must be positive: seconds between stored frames.")
-        if self.bounds is not None:
-            metadata = replace(metadata, domain=None, bounds=self.bounds)
         if self.types:
             walls = frozenset(i for i, name in self.types.items() if name in STATIC_NAMES)
             static = (metadata.static_types - frozenset(self.types)) | walls
             metadata = replace(metadata, particle_types=metadata.particle_types | dict(self.types), static_types=static)
-        changes: dict[str, Any] = {"static_types": self.static}
-        changes |= {name: getattr(self, name) for name in ("dt", "gravity", "periodic", "fields")}
+        changes: dict[str, Any] = {"static_types": self.static, "dt": self.dt}
+        if self.bounds is not None:
+            changes |= {"bounds": tuple((float(low), float(high)) for low, high in self.bounds)}
+            metadata = replace(metadata, domain=None)
+        if self.gravity is not None:
+            changes["gravity"] = tuple(map(float, self.gravity))
+        if self.boundary is not None:
+            changes["periodic"] = tuple(kind == "periodic" for kind in self.boundary)
+        if self.fields is not None:
+            changes["fields"] = tuple(self.fields)
         return replace(metadata, **{name: value for name, value in changes.items() if value is not None})
 
 

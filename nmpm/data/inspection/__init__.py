@@ -203,8 +203,8 @@ def _describe_channels(name: str, field: FieldFacts, metadata: Metadata, materia
 
 
 def _notes(stated: FolderSource, source: FolderSource, measured: Measurements, metadata: Metadata) -> Iterator[str]:
-    family = source.stated.family
-    if family != stated.stated.family:
+    family = source.options.family
+    if family != stated.options.family:
         yield (
             f"The metadata do not state what the particle types mean; they are read as those of the {family} family, by"
             f" the ids that occur. If that is right, add --family {family}; nmpm fit needs --data.family {family}."

@@ -13,7 +13,7 @@ from nmpm.data.families import FAMILIES
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import load_json, parse_metadata
-from nmpm.errors import DataError
+from nmpm.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,19 @@ def open_dataset(source: FolderSource) -> OpenedDataset:
         plain = None
         problems.append(str(error))
     ids = sorted({i for split in splits.values() for n in range(len(split)) for i in split.particle_type(n).tolist()})
-    if source.stated.family is None and (plain or {}).get("particle_types") is None:
-        source = FolderSource(folder, replace(source.stated, family=guess_family(ids, plain or {})))
+    if source.options.family is None and (plain or {}).get("particle_types") is None:
+        source = FolderSource(folder, replace(source.options, family=guess_family(ids, plain or {})))
     metadata, wrong = _read_metadata(source, plain, next(iter(splits.values())), ids)
+    try:
+        metadata = source.options.apply_to(metadata)
+    except ConfigError as error:
+        wrong.append(str(error))
     if unknown := metadata.unknown_types(np.array(ids)):
         metadata = replace(metadata, particle_types=metadata.particle_types | {i: f"type {i}" for i in unknown})
         problems.append(
             f"Particle type {', '.join(map(str, unknown))} is not in the metadata; it is taken for a moving material"
             f" here. To train on it, name it: nmpm convert FOLDER NEW --types {unknown[0]}=sand."
         )
-    if source.stated.fields is not None:
-        metadata = replace(metadata, fields=tuple(source.stated.fields))
     return OpenedDataset(source, splits, metadata, problems + wrong, bool(wrong or unknown))
 
 
@@ -106,7 +108,7 @@ def _read_metadata(
         "particle_types": {i: f"type {i}" for i in ids},
     }
     # Of a file that cannot be read, no key needs to be named.
-    metadata = parse_metadata(plain, path, source.stated.family, [] if stated is None else problems, substitutes)
+    metadata = parse_metadata(plain, path, source.options.family, [] if stated is None else problems, substitutes)
     if missing := [key for key in ("bounds", "dt") if key not in plain]:
         problems.append(f"{path}: without {' and '.join(missing)}, lengths and times here are the file's own units.")
     return metadata, problems

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -18,33 +18,11 @@ from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError
-from nmpm.scene import Boundary, Interval, Scene
+from nmpm.scene import Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
 
 _OPEN = "???"  # OmegaConf's for a value that is still to be given
-
-
-@dataclass(frozen=True)
-class StatedFacts:
-    """Facts about recorded data that the user states where files are silent or wrong; arguments of `infer_scene`."""
-
-    family: str | None = None
-    gravity: Sequence[float] | None = None
-    boundary: Sequence[Boundary] | None = None
-    bounds: Sequence[Interval] | None = None
-    fields: Sequence[str] | None = None
-
-    @property
-    def options(self) -> Options:
-        """The same as options for the conversion of a foreign format."""
-        return Options(
-            family=self.family,
-            gravity=None if self.gravity is None else tuple(map(float, self.gravity)),
-            periodic=None if self.boundary is None else tuple(kind == "periodic" for kind in self.boundary),
-            bounds=None if self.bounds is None else tuple((float(low), float(high)) for low, high in self.bounds),
-            fields=None if self.fields is None else tuple(self.fields),
-        )
 
 
 class DataSource(abc.ABC):
@@ -91,7 +69,7 @@ class FolderSource(DataSource):
     """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads."""
 
     path: Path
-    stated: StatedFacts = field(default_factory=StatedFacts)
+    options: Options = field(default_factory=Options)
 
     @property
     def description(self) -> str:
@@ -101,17 +79,15 @@ class FolderSource(DataSource):
     def folder(self) -> Path:
         if not self.path.exists() or split_paths(self.path):
             return self.path
-        return native_folder(self.path, self.stated.options)
+        return native_folder(self.path, self.options)
 
     @cached_property
     def metadata(self) -> Metadata:
-        metadata, fields = read_metadata(self.folder, self.stated.family), self.stated.fields
-        return metadata if fields is None else replace(metadata, fields=tuple(fields))
+        return self.options.apply_to(read_metadata(self.folder, self.options.family))
 
     @cached_property
     def scene(self) -> Scene:
-        stated = self.stated
-        return infer_scene(self.folder, stated.family, stated.gravity, stated.boundary, stated.bounds, stated.fields)
+        return infer_scene(self.folder, self.options)
 
 
 @dataclass(frozen=True)
@@ -124,11 +100,11 @@ class HubSource(FolderSource):
 
     @cached_property
     def folder(self) -> Path:
-        return native_folder(hub_folder(str(self.path)), self.stated.options)
+        return native_folder(hub_folder(str(self.path)), self.options)
 
 
 def make_source(
-    path: str | None, name: str | None, source: SourceName, stated: StatedFacts, generate: Mapping[str, Any] | None
+    path: str | None, name: str | None, source: SourceName, options: Options, generate: Mapping[str, Any] | None
 ) -> DataSource:
     """The source that the arguments of `TrajectoryDataModule` mean.
 
@@ -150,11 +126,11 @@ def make_source(
                 f"source = {source} needs the `name` of a dataset, not the path {path}; for the path, --data.source"
                 " disk."
             )
-        return FolderSource(Path(path), stated)
+        return FolderSource(Path(path), options)
     if source == "hub":
         _refuse({"generate": generate}, f"the published dataset {name}")
-        return HubSource(Path(str(name)), stated)
-    _refuse({key.name: getattr(stated, key.name) for key in fields(stated)}, f"the simulated dataset {name}")
+        return HubSource(Path(str(name)), options)
+    _refuse(vars(options), f"the simulated dataset {name}")
     from nmpm.data.loading.simulated import EmbeddedSource, SimulatedSource
 
     kind = SimulatedSource if source == "simulate" else EmbeddedSource

@@ -130,7 +130,7 @@ def test_recorded_fields_and_periodic_axes_survive(recorded, tmp_path):
     (tmp_path / "old").mkdir()
     for name in ("test.h5", "metadata.json"):
         (tmp_path / "old" / name).symlink_to(recorded / "jaxsph-heated-channel-2d" / name)
-    convert(tmp_path / "old", tmp_path / "new", options=Options("jax-sph", periodic=(True, False), dt=0.04545))
+    convert(tmp_path / "old", tmp_path / "new", options=Options("jax-sph", boundary=("periodic", "wall"), dt=0.04545))
     new = Split(tmp_path / "new" / "test.h5")
     with h5py.File(tmp_path / "old" / "test.h5") as file:
         for index, group in enumerate(file.values()):

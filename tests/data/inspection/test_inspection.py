@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from nmpm.cli import main
+from nmpm.data.convert import Options
 from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.data.generate import generate
 from nmpm.data.inspection import Inspection, inspect
 from nmpm.data.inspection.reading import guess_family
-from nmpm.data.loading.sources import FolderSource, StatedFacts
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import DataError
 from nmpm.sim import load_preset
 from tests.data.convert import records
@@ -146,7 +147,7 @@ def folder(tmp_path):
 
 def look_at(folder: Path, plain: object, **stated: object) -> Inspection:
     (folder / "metadata.json").write_text(plain if isinstance(plain, str) else json.dumps(plain))
-    return inspect(FolderSource(folder, StatedFacts(**stated)))
+    return inspect(FolderSource(folder, Options(**stated)))
 
 
 def test_the_family_is_guessed_where_nothing_states_it(folder):
@@ -211,7 +212,7 @@ def test_nothing_is_odd_about_simulated_data(name, tmp_path):
 
 
 def test_recorded_waterdrop(recorded):
-    source = FolderSource(recorded / "deepmind-waterdrop", StatedFacts("deepmind", (0.0, -9.81)))
+    source = FolderSource(recorded / "deepmind-waterdrop", Options("deepmind", gravity=(0.0, -9.81)))
     found = inspect(source, trajectories=1)
     assert found.observed[1][0] == pytest.approx(0.0914, abs=0.002)
     assert any("Along y positions reach from 0.09" in note for note in found.notes)
@@ -221,7 +222,7 @@ def test_recorded_waterdrop(recorded):
 
 @pytest.mark.slow
 def test_recorded_channel_wraps(recorded):
-    stated = StatedFacts("jax-sph", None, ("periodic", "wall"))
+    stated = Options("jax-sph", boundary=("periodic", "wall"))
     found = inspect(FolderSource(recorded / "jaxsph-heated-channel-2d", stated), trajectories=1)
     assert found.fields == {"temperature": (130, 950)}
     assert not any("jumps" in finding for finding in found.findings)

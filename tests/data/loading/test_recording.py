@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nmpm.data.convert import Options
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.loading.padded_batch import PaddedRecordings, unwrap
 from nmpm.data.loading.recording import SplitRecordings
@@ -15,7 +16,7 @@ from nmpm.scene import Scene
 
 def recordings_of(folder, name="train", **arguments) -> SplitRecordings:
     family = arguments.get("family")
-    scene = infer_scene(folder, **arguments)
+    scene = infer_scene(folder, Options(**arguments))
     return SplitRecordings(Split(folder / f"{name}.h5"), read_metadata(folder, family), scene)
 
 
