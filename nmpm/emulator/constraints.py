@@ -53,13 +53,9 @@ BOUNDS: Mapping[str, BoundsRule] = MappingProxyType({"stop": stop, "reflect": re
 
 
 def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, periodic: Sequence[bool]) -> None:
-    """Reject paths (B, m, N, D) in cells that lead more than a cell beyond the bounds; reads one value back.
+    """Reject paths (B, m, N, D) of real particles (B, N), in cells, more than a cell beyond the bounds (2, D).
 
-    Args:
-        path: Of which padding may be anywhere.
-        mask: (B, N) bool, False for padding.
-        bounds: (2, D) lowest and highest positions.
-        periodic: Whether each axis wraps, and so has no bounds.
+    Axes that wrap have none. One value is read back.
 
     Raises:
         DataError: naming scene, particle and frame of the first such position.
@@ -83,8 +79,8 @@ class Constraints:
     """The constraints of an emulator's rollouts.
 
     Args:
-        energy: Kinetic and potential energy never exceed those of the rollout's first state: nothing feeds the scene,
-            neither moving walls nor inlets, and its gravity is known.
+        energy: Kinetic and potential energy never exceed those of the rollout's first state: for scenes of known
+            gravity that nothing feeds, neither moving walls nor inlets.
         rest_speed: Particles that move fewer cells per frame than this, on average over a bundle, and do not fall
             freely, stay where they are if something holds them up (`nmpm.emulator.support`), and fall otherwise. Set it
             to the speed that the model predicts in material that is at rest.
@@ -184,8 +180,7 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
 def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
     """(B,) the part of the way between two paths that each scene can afford, as energy is convex in it.
 
-    From energies (B, F) of the frames of both paths and the energy (B,) that is allowed; exactly 1 where the end is
-    within it.
+    From energies (B, F) of both paths' frames and the allowed energy (B,); exactly 1 where the end is within it.
     """
     exceeds = after > budget.unsqueeze(1)
     rise = torch.where(exceeds, after - before, 1.0)
@@ -195,10 +190,8 @@ def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
 
 
 def _gains(cells: Tensor, step: Tensor, before: Tensor, work: Tensor) -> Tensor:
-    """(B, N): whether a particle gains energy by a step, beyond the rounding of positions that steps come from.
-
-    Without the large terms that cancel: v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
-    """
+    """(B, N): whether a particle gains energy by a step, beyond the rounding of positions that steps come from."""
+    # Without the large terms that cancel: v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
     rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs()
     return _over_axes((step - before) * (step + before) / 2 - work - rounding) > 0
 

@@ -2,12 +2,11 @@
 
 An obstacle is where the solid fraction of the grid, interpolated linearly, exceeds `SURFACE`. A path stops before it
 gets deeper than that, and goes on straight along the surface as far as it can; particles that an obstacle has moved
-over are pushed out. Frames are sampled in pieces of at most half a cell, so that nothing jumps over a wall of one cell.
-Only steps of more than 32 cells, and slides of more in a bundle, fall into longer pieces, which bounds time and memory.
+over are pushed out. Frames are sampled in pieces of at most half a cell, so that nothing jumps over a wall of one cell;
+steps and slides of more than 32 cells fall into longer pieces, which bounds time and memory.
 
-There are two forms of the same arithmetic. On a CPU only particles that touch an obstacle are treated, in as many
-pieces as the fastest needs. Elsewhere branching on values would halt the device: all particles are treated, in the
-largest number of pieces, with masks. In both, a scene's result does not depend on the others of the batch.
+On a CPU only particles that touch an obstacle are treated, in as many pieces as the fastest needs. Elsewhere branching
+on values would halt the device: all particles are treated, in the largest number of pieces, with masks.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ class Contact:
         pieces = _pieces(_longest_steps(steps, mask))
         inside = self.inside(start)
         touching = inside.clone()
-        for piece in range(_largest(pieces)):
+        for piece in range(int(pieces.max())):
             share = (piece / pieces).clamp(max=1).view(-1, 1, 1, 1)
             places = (path - steps * share).flatten(1, 2)
             touching |= (self._scene_depth(places).unflatten(1, path.shape[1:3]) > SURFACE).any(1)
@@ -88,10 +87,10 @@ class Contact:
         scene, particle = touching.nonzero().unbind(1)
         depth, count = partial(self._depth, scene), pieces[scene]
         mine, begin, stuck = path[scene, :, particle], start[scene, particle], inside[scene, particle]
-        touch = _touch(depth, begin, mine, count, _largest(pieces))
+        touch = _touch(depth, begin, mine, count, int(pieces.max()))
         longest = path.new_zeros(len(path)).scatter_reduce(0, scene, _length(touch.along), "amax")
         finer = _pieces(longest.unsqueeze(1))[scene]
-        held = _slid(depth, mine, touch, count, finer, _largest(finer))
+        held = _slid(depth, mine, touch, count, finer, int(finer.max()))
         if bool(stuck.any()):
             held[stuck] = _pushed_out(partial(self._depth, scene[stuck]), begin[stuck], path.shape[1])
         path = path.clone()
@@ -147,7 +146,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class _Touch:
-    """Where n particles first get too deep into an obstacle in a bundle.
+    """Where n particles first get too deep into an obstacle in a bundle, if they do.
 
     Args:
         hits: (n,) bool, whether they do.
@@ -249,8 +248,3 @@ def _first(marks: Tensor) -> Tensor:
     size = marks.shape[1]
     order = torch.arange(size, device=marks.device)
     return torch.where(marks, order, size).amin(1)
-
-
-def _largest(pieces: Tensor) -> int:
-    """The largest of (n,) numbers of pieces, read back."""
-    return int(pieces.max())

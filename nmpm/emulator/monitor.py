@@ -64,10 +64,7 @@ class _Reference:
 
 @dataclass
 class Monitor:
-    """Limits that a rollout is watched for, once per bundle.
-
-    On a CPU each bundle's measures are read at once. On other devices, which reading halts, they stay there and are
-    read every 16 bundles and at the rollout's end, in one transfer: warnings and stops come so much later.
+    """Limits that a rollout is watched for, once per bundle; on other devices than a CPU read every 16 bundles.
 
     Args:
         policy: To warn, once for each kind of incident, to stop, or only to record.
@@ -100,7 +97,7 @@ class Monitor:
     _unread: list[tuple[int, dict[str, Tensor]]] = field(default_factory=list)
 
     def start(self, emulator: Emulator, particles: Particles, frames: int | None = None) -> None:
-        """Reset, and take a state as the one that a rollout of so many frames starts from; of whole bundles if None."""
+        """Reset, for a rollout of so many frames, or of whole bundles, from a state."""
         self._last_frame = math.inf if frames is None else frames
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
         self.rest_share, self._judged = 0.0, 0
@@ -132,11 +129,7 @@ class Monitor:
             self.read()
 
     def read(self) -> None:
-        """Read the measures that are still on the device, in one transfer; `unroll` calls this at a rollout's end.
-
-        Raises:
-            RolloutStoppedError: under the policy "stop", if a limit is passed.
-        """
+        """Read the measures that are still on the device, in one transfer; raises as `see`."""
         unread, self._unread = self._unread, []
         if not unread:
             return

@@ -114,15 +114,15 @@ class EmulatorRecipe:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
-        """The recipe that `to_dict` described; files of version 0.1.0, which lack `format`, are read too.
+        """The recipe that `to_dict` described.
 
         Raises:
             ConfigError: if a newer nmpm wrote it, or a key is missing, unknown or wrong.
         """
         values = dict(plain)
-        check_format(values.pop("format", 0), "This model")
-        if missing := sorted({"cells", "frames", "processor"} - set(values)):  # their defaults are for new models
+        if missing := sorted({"format", "cells", "frames", "processor"} - set(values)):  # defaults are for new models
             raise ConfigError(f"The recipe of an emulator lacks {', '.join(missing)}.")
+        check_format(values.pop("format"), "This model")
         return from_plain(cls, values, "The recipe of an emulator")
 
 

@@ -197,10 +197,7 @@ def unroll_with_gradients(
 
 
 def recomputed(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-    """A call of the emulator that keeps no activations: backward passes compute it again.
-
-    The memory of several is that of one and of the states between them, for the time of one more forward pass.
-    """
+    """A call of the emulator that keeps no activations: backward passes compute it again."""
     bundle: Bundle = checkpoint(emulator, particles, context, use_reentrant=False)
     return bundle
 

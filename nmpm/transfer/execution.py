@@ -26,12 +26,9 @@ _CHUNK_ELSEWHERE = 2**22  # on a GPU many small chunks would cost more in kernel
 
 
 def chunks(count: int, device: torch.device, values: int = 1) -> list[slice]:
-    """Slices that cover `count` particles, at least one, so that temporary memory is bounded; one in traced graphs.
+    """Slices, at least one, that cover `count` particles on a device and bound temporary memory; one in traced graphs.
 
-    Args:
-        count: Number of particles.
-        device: Where they are; decides the size of a chunk.
-        values: Intermediate values that the operation needs for each particle; chunks shrink in proportion.
+    Chunks shrink in proportion to the intermediate values that the operation needs for each particle.
     """
     if torch.compiler.is_compiling():
         return [slice(None)]
@@ -94,10 +91,7 @@ _kernels: ContextVar[bool] = ContextVar("nmpm_kernels", default=True)
 def scatter_backend(name: str) -> Iterator[None]:
     """Choose the scatter-add backend of tensor operations within a `with` block; kernels have sums of their own.
 
-    Outside, it is `sorted` if torch is to be deterministic and the device's own sum is not, else `native`.
-
-    Args:
-        name: "native", "sorted" or "torch-scatter".
+    Outside, it is "sorted" if torch is to be deterministic and the device's own sum is not, else "native".
 
     Raises:
         ConfigError: if there is none of that name.

@@ -112,12 +112,7 @@ class Triton(CudaGraph):
 
 
 class Recorded:
-    """A function's recording for inputs of some shapes.
-
-    Args:
-        predict: Of tensors, without reading any back; makes a bundle.
-        inputs: An example, on a GPU; the recording has copies of its own.
-    """
+    """The recording of a function, of tensors on a GPU to a bundle, for copies of inputs."""
 
     def __init__(self, predict: Callable[[Sequence[Tensor]], Bundle], inputs: Sequence[Tensor]) -> None:
         self._inputs = [tensor.clone(memory_format=torch.contiguous_format) for tensor in inputs]

@@ -47,10 +47,10 @@ class Axis:
         return self.radius + _READ
 
     def span(self, first: Any, last: Any) -> tuple[Any, Any]:
-        """Start and length of the crops in which blocks `first` to `last`, exclusive, may be read.
+        """Start and length of the crops in which blocks `first` to `last`, exclusive, may be read; or arrays of them.
 
-        Starts are multiples of the alignment; lengths have the remainder of the whole axis, which the network pads as
-        it pads that. On a periodic axis a start may be negative. Arguments are integers or arrays of them.
+        Starts are multiples of the alignment, lengths have the remainder of the whole axis, which the network pads as
+        it pads that.
         """
         low = (np.asarray(first) * BLOCK - self.halo) // self.alignment * self.alignment
         high = np.minimum(np.asarray(last) * BLOCK, self.cells) + self.halo
