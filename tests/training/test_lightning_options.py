@@ -133,7 +133,7 @@ REFUSED: dict[str, tuple[Options, str]] = {
     "min_epochs: alone": ({"min_epochs": 1}, "min_epochs=1 needs epochs that end"),
     "min_steps: alone": ({"min_steps": 2}, "min_steps=2 needs epochs that end"),
     "limit_train_batches: a share": ({"limit_train_batches": 0.5}, "1.0"),
-    "overfit_batches: a share": ({"overfit_batches": 0.5}, "IterableDataset"),
+    "overfit_batches: a share": ({"overfit_batches": 0.5}, "0.5 of 1 batches is none"),
     "val_check_interval: a share": ({"val_check_interval": 0.5}, "should be an integer"),
     "bf16-true": ({"precision": "bf16-true"}, "bf16-true.*bf16-mixed.*32-true"),
     "16-true": ({"precision": "16-true"}, "16-true.*bf16-mixed.*32-true"),

@@ -1,0 +1,170 @@
+"""Mistakes get a message of one line that names what is wrong and how to mend it, most before torch is imported."""
+
+import dataclasses
+import inspect
+import json
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from nmpm import EmulatorModule, EmulatorRecipe, TrajectoryDataModule
+from nmpm.cli import main
+from nmpm.cli.early_checks import PARTS, argument_names, class_names
+
+GOOP = ["fit", "--config", "goop.yaml"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def complain(words: list[str], status: int, capsys) -> str:
+    assert main(words) == status
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("nmpm")
+    assert said.err.count("\n") == 1
+    assert len(said.err) < 600
+    return said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--model.constraints.enrgy", "true"], "did you mean --model.constraints.energy?"),
+        (["--model.optimizer", "torch.optim.Adm"], "--model.optimizer: there is no torch.optim.Adm; did you mean"),
+        (["--model.processor.widht", "3"], "the argument widht is unknown; did you mean width?"),
+        (["--trainer.max_steps", "abc"], "--trainer.max_steps: abc is not of type int"),
+        (["--data.source", "foo"], "--data.source: foo is not one of 'disk', 'simulate', 'hub'"),
+        (["--model.processor", "nmpm.transfer.Linear"], "--model.processor: Import path nmpm.transfer.Linear does not"),
+    ],
+    ids=lambda value: "",
+)
+def test_a_wrong_option_gets_the_nearest_name(words, complaint, capsys):
+    assert complaint in complain([*GOOP, *words], 2, capsys)
+
+
+BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("model: {widht: 3}", "unknown key model.widht; did you mean model.processor.width?"),
+        ("modle: {cells: 3}", "unknown key modle.cells; did you mean model.cells?"),
+        ("model: {cells: 3\n  a: [", "--config mine.yaml cannot be read: while parsing a flow mapping"),
+        (BOMB, "--config mine.yaml cannot be read: line 10: nested more than 32 deep, or aliases repeat"),
+        ("data: {path: '${oc.${data.name}:HOME}'}", ": ${…} refers to other keys"),
+        ("trainer: inner.yaml", "--trainer: Unable to load config 'inner.yaml' - line 10: nested"),
+    ],
+    ids=lambda value: "",
+)
+def test_a_wrong_configuration(text, complaint, capsys):
+    Path("mine.yaml").write_text(text)
+    Path("inner.yaml").write_text(BOMB)
+    assert complaint in complain(["fit", "--config", "mine.yaml"], 2, capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["fit", "--config", "gop.yaml"], "Did you mean goop.yaml"),
+        (["simulate", "waterramp", "--out", "a"], "Did you mean waterramps"),
+        (["compare", "goop", "--data", "gop"], "Did you mean goop"),
+        (["trade", "sandramp"], "Did you mean sandramps"),
+        ([*GOOP, "--model.optimizer.lr", "-1"], "lr = -1.0 must be a positive number"),
+        ([*GOOP, "--trainer.max_steps", "-1", "--trainer.max_time", "null"], "has no end"),
+        ([*GOOP, "--checkpoint.dirpath", __file__], "it is a file"),
+        ([*GOOP, "--model.cells", "4"], "too small for a U-Net of depth 3"),
+        (["test", *GOOP[1:], "--ckpt_path", "best"], "To start a new run, call nmpm fit without"),
+        (["validate", *GOOP[1:]], "--ckpt_path is missing, so the model would be an untrained one: give best or last"),
+    ],
+    ids=lambda value: "",
+)
+def test_a_mistake_is_found_before_data_are_simulated(words, complaint, folder, capsys):
+    assert complaint in complain(words, 1, capsys)
+    assert not list(folder.iterdir())
+
+
+def test_wrong_commands(capsys):
+    assert "did you mean fit?" in complain(["fti"], 2, capsys)
+    assert main([]) == 2
+
+
+EARLY = [
+    (["--model.cels=3"], "did you mean --model.cells?"),
+    (["--config", "mine.yaml"], "unknown key model.cels; did you mean model.cells?"),
+    (["--model.processor=nmpm.processors.Unet"], "did you mean nmpm.processors.UNet?"),
+    (["--data.path", "nowhere"], "--data.path nowhere: there is no such dataset."),
+    (["--data.name", "lava"], "No embedded dataset is called 'lava'"),
+    (["--ckpt_path=nowhere.ckpt"], "--ckpt_path nowhere.ckpt: there is no such checkpoint."),
+    (["test", "nowhere"], "nmpm test: nowhere: there is no such folder."),
+    (["predict", "mine.yaml"], "mine.yaml is a file: name the folder of a run"),
+    (["validate", "."], ". is not the folder of a run: there is no config.yaml in it."),
+    (["test", "run"], "no run/checkpoints/best.ckpt or run/checkpoints/last.ckpt; checkpoints there: none."),
+    (["fit", "--resume=run"], "run: there is no run/checkpoints/last.ckpt; checkpoints there: none."),
+    (["fit", "--resume"], "--resume lacks the folder of a run"),
+    (["fit", "run"], "to go on with a run, call nmpm fit --resume run."),
+]
+SCRIPT = """
+import sys, json
+from nmpm.cli import main
+for words in json.loads(sys.argv[1]):
+    assert main(words)
+print("imported", sorted({"torch", "lightning"} & set(sys.modules)))
+"""
+
+
+def test_common_mistakes_are_found_before_torch_and_lightning_are_imported(folder):
+
+    (folder / "mine.yaml").write_text("model: {cels: 3}\n")
+    (folder / "run").mkdir()
+    (folder / "run" / "config.yaml").write_text("model: {cells: 3}\n")
+    calls = [words if words[0] in ("fit", "validate", "test", "predict") else [*GOOP, *words] for words, _ in EARLY]
+    done = subprocess.run([sys.executable, "-c", SCRIPT, json.dumps(calls)], capture_output=True, text=True)
+    assert done.stdout == "imported []\n", done.stderr
+    said = done.stderr.splitlines()
+    assert len(said) == len(EARLY)
+    for line, (_, complaint) in zip(said, EARLY, strict=True):
+        assert complaint in line
+
+
+@pytest.mark.parametrize(
+    ("words", "unwanted"),
+    [
+        (["rollout", "goop", "--frames", "8", "--out", "out.h5"], {"lightning", "neuralop", "matplotlib"}),
+        (["simulate", "--list"], {"lightning", "torch", "matplotlib"}),
+        (["zoo", "card", "goop"], {"lightning", "matplotlib"}),
+        (["fit", "--help"], {"lightning", "torch", "numpy", "jsonargparse"}),
+        (["--help"], {"lightning", "torch", "numpy"}),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_command_imports_what_it_needs(words, unwanted):
+    script = f"import sys; from nmpm.cli import main; assert main({words!r}) == 0; "
+    script += f"print('imported', sorted({unwanted!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert done.stdout.splitlines()[-1] == "imported []"
+
+
+def test_simulators_and_numba_are_imported_for_simulated_data_alone():
+    script = "import sys; import nmpm.cli.run_training; print(sorted({'numba', 'nmpm.sim'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_the_names_that_are_checked_early_are_those_of_the_parts():
+    module = set(inspect.signature(EmulatorModule).parameters) - {"recipe"}
+    fields = {field.name for field in dataclasses.fields(EmulatorRecipe)}
+    assert argument_names("model") == module | fields
+    assert argument_names("data") == set(inspect.signature(TrajectoryDataModule).parameters)
+    for part in PARTS:
+        public = {name for name, kind in vars(import_module(part)).items() if isinstance(kind, type)}
+        defined = {name for name in public if vars(import_module(part))[name].__module__.startswith("nmpm.")}
+        assert defined <= class_names(part), part
