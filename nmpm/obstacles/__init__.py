@@ -14,13 +14,7 @@ In three dimensions there are `Box` and `Sphere`.
 files. Their number is counted from the body's sizes, and has no gradient.
 """
 
-from nmpm.obstacles.body import Body as Body
-from nmpm.obstacles.body import Number as Number
-from nmpm.obstacles.body import Point as Point
-from nmpm.obstacles.plane import Disc as Disc
-from nmpm.obstacles.plane import Polygon as Polygon
-from nmpm.obstacles.plane import Ramp as Ramp
-from nmpm.obstacles.space import Box as Box
-from nmpm.obstacles.space import Sphere as Sphere
+from nmpm.obstacles.body import Body, Number, Point
+from nmpm.obstacles.shapes import Box, Disc, Polygon, Ramp, Sphere
 
 __all__ = ["Body", "Box", "Disc", "Number", "Point", "Polygon", "Ramp", "Sphere"]

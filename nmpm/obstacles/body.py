@@ -1,4 +1,4 @@
-"""What a body is, and the checks and lattices that bodies share."""
+"""The contract of bodies, and the checks and lattices that they share."""
 
 from __future__ import annotations
 
@@ -70,10 +70,13 @@ def box_distance(local: Tensor, sides: Tensor) -> Tensor:
     return torch.where((beyond > 0).any(-1), outside, beyond.amax(-1))
 
 
-def lattice(side: Tensor, spacing: float) -> Tensor:
-    """Places along a side, about `spacing` apart and half of that from its ends, counted from its middle."""
-    number = count(float(side.detach()) / spacing, "side", side)
-    return ((torch.arange(number, dtype=torch.float64) + 0.5) / number - 0.5) * side
+def lattice(sides: Sequence[Tensor], spacing: float) -> Tensor:
+    """(M, D) points that fill a box of D sides around 0, about `spacing` apart and half of that from its faces."""
+    axes = []
+    for side in sides:
+        number = count(float(side.detach()) / spacing, "side", side)
+        axes.append(((torch.arange(number, dtype=torch.float64) + 0.5) / number - 0.5) * side)
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(axes))
 
 
 def count(number: float, name: str, value: Tensor) -> int:
@@ -91,17 +94,17 @@ def check_spacing(spacing: float) -> None:
 
 def size(name: str, value: Number) -> Tensor:
     """A length in float64, with its gradient; ConfigError unless it is positive."""
-    found = tensor(value)
-    count(float(found.detach()), name, found)
-    return found
+    length = tensor(value)
+    count(float(length.detach()), name, length)
+    return length
 
 
 def finite(name: str, value: Number | Point) -> Tensor:
     """A parameter in float64, with its gradient; ConfigError unless it is finite."""
-    found = tensor(value)
-    if not found.detach().isfinite().all():
-        raise ConfigError(f"An obstacle's {name} = {found.tolist()} must be finite.")
-    return found
+    numbers = tensor(value)
+    if not numbers.detach().isfinite().all():
+        raise ConfigError(f"An obstacle's {name} = {numbers.tolist()} must be finite.")
+    return numbers
 
 
 def tensor(value: Number | Point) -> Tensor:

@@ -1,4 +1,4 @@
-"""Bodies in two dimensions."""
+"""The shapes of obstacles: ramps, discs and convex polygons in two dimensions, boxes and spheres in three."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ON_EDGE = 1e-9  # share of a triangle: lattice points on a polygon's edges are 
 
 @dataclass(frozen=True, eq=False)
 class Ramp(Body):
-    """A bar in two dimensions: a turned rectangle.
+    """A bar: a turned rectangle.
 
     Args:
         centre: (x, y) in domain length.
@@ -59,9 +59,7 @@ class Ramp(Body):
 
     def particles(self, spacing: float) -> Tensor:
         check_spacing(spacing)
-        along, across = (lattice(tensor(side), spacing) for side in (self.length, self.thickness))
-        local = torch.stack(torch.meshgrid(along, across, indexing="ij"), dim=-1).reshape(-1, 2)
-        return tensor(self.centre) + local @ self._axes()
+        return tensor(self.centre) + lattice([tensor(self.length), tensor(self.thickness)], spacing) @ self._axes()
 
     def _axes(self) -> Tensor:
         """(2, 2) unit vectors along and across the bar, as rows."""
@@ -72,7 +70,7 @@ class Ramp(Body):
 
 @dataclass(frozen=True, eq=False)
 class Disc(Body):
-    """A disc in two dimensions.
+    """A disc.
 
     Args:
         centre: (x, y) in domain length.
@@ -86,8 +84,8 @@ class Disc(Body):
 
     def distance(self, points: Tensor) -> Tensor:
         offset = points - finite("centre", self.centre)
-        found: Tensor = torch.linalg.vector_norm(offset, dim=-1) - size("radius", self.radius)
-        return found
+        distance: Tensor = torch.linalg.vector_norm(offset, dim=-1) - size("radius", self.radius)
+        return distance
 
     def particles(self, spacing: float) -> Tensor:
         """Particles on a spiral with equal area each (Vogel 1979), one per spacing²; see `Body.particles`."""
@@ -102,7 +100,7 @@ class Disc(Body):
 
 @dataclass(frozen=True, eq=False)
 class Polygon(Body):
-    """A convex polygon in two dimensions.
+    """A convex polygon.
 
     Args:
         corners: (K, 2) in domain length, K at least 3, in order along the outline.
@@ -155,8 +153,7 @@ class Polygon(Body):
 def _fan_weights(corners: Tensor, spacing: float) -> Tensor:
     """(M, K) shares of the corners in the lattice points inside, by the triangles that the first corner makes."""
     low, high = corners.amin(0), corners.amax(0)
-    axes = [lattice(side, spacing) + side / 2 for side in high - low]
-    points = low + torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 2)
+    points = (low + high) / 2 + lattice(list(high - low), spacing)
     weights = corners.new_zeros(len(points), len(corners))
     free = torch.ones(len(points), dtype=torch.bool)
     for second in range(1, len(corners) - 1):
@@ -172,3 +169,89 @@ def _fan_weights(corners: Tensor, spacing: float) -> Tensor:
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Body):
+    """A turned box: a ramp, a wall, a step, a pillar.
+
+    Args:
+        centre: (x, y, z) in domain length.
+        sides: Its three whole lengths, before it is turned.
+        rotation: Axis of the turn times its angle in radians; (0, 0, 0) for none.
+    """
+
+    dim: ClassVar[int] = 3
+
+    centre: Point
+    sides: Point
+    rotation: Point = (0.0, 0.0, 0.0)
+
+    def distance(self, points: Tensor) -> Tensor:
+        return box_distance((points - _three("centre", self.centre)) @ self._axes().T, self._sides())
+
+    def particles(self, spacing: float) -> Tensor:
+        check_spacing(spacing)
+        return _three("centre", self.centre) + lattice(list(self._sides()), spacing) @ self._axes()
+
+    def _sides(self) -> Tensor:
+        return torch.stack([size("side", side) for side in _three("sides", self.sides)])
+
+    def _axes(self) -> Tensor:
+        """(3, 3) unit vectors along the sides, as rows: the rotation's matrix exponential, transposed."""
+        x, y, z = _three("rotation", self.rotation)
+        none = torch.zeros_like(x)
+        cross = torch.stack([torch.stack(row) for row in ((none, -z, y), (z, none, -x), (-y, x, none))])
+        turned: Tensor = torch.linalg.matrix_exp(cross)
+        return turned.T
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Body):
+    """A solid sphere.
+
+    Args:
+        centre: (x, y, z) in domain length.
+        radius: In domain length.
+    """
+
+    dim: ClassVar[int] = 3
+
+    centre: Point
+    radius: Number
+
+    def distance(self, points: Tensor) -> Tensor:
+        distance: Tensor = torch.linalg.vector_norm(points - _three("centre", self.centre), dim=-1)
+        return distance - size("radius", self.radius)
+
+    def particles(self, spacing: float) -> Tensor:
+        """Particles on spirals over nested spheres, with equal volume each; see `Body.particles`."""
+        check_spacing(spacing)
+        radius = tensor(self.radius)
+        number = count(4 / 3 * math.pi * float(radius.detach()) ** 3 / spacing**3, "radius", radius)
+        shells = max(1, round(float(radius.detach()) / spacing))
+        return _three("centre", self.centre) + radius * _unit_ball(number, shells)
+
+
+def _unit_ball(number: int, shells: int) -> Tensor:
+    """(number, 3) points within the unit ball, evenly: in each shell, as many as its volume holds, on one sphere."""
+    edges = torch.linspace(0, 1, shells + 1, dtype=torch.float64) ** 3
+    middles = ((edges[1:] + edges[:-1]) / 2) ** (1 / 3)
+    counts = (number * edges).round().long().diff()
+    return torch.cat([middle * _unit_sphere(int(each)) for middle, each in zip(middles, counts, strict=True)])
+
+
+def _unit_sphere(number: int) -> Tensor:
+    """(number, 3) points on the unit sphere with equal area each, on a spiral."""
+    index = torch.arange(number, dtype=torch.float64)
+    height = 1 - 2 * (index + 0.5) / max(1, number)
+    across = (1 - height**2).sqrt()
+    turn = index * GOLDEN_ANGLE
+    return torch.stack([across * torch.cos(turn), across * torch.sin(turn), height], dim=-1)
+
+
+def _three(name: str, value: Point) -> Tensor:
+    numbers = finite(name, value)
+    if numbers.shape != (3,):
+        raise ConfigError(f"An obstacle's {name} = {numbers.tolist()} must be three numbers.")
+    return numbers
