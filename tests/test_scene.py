@@ -63,17 +63,13 @@ def test_densities_change_neither_channels_nor_what_a_model_suits():
     ("changes", "complaint"),
     [
         ({"domain": ((0.2, 0.92), (0.08, 0.92))}, "axis 0"),
-        ({"gravity": (0.0,)}, "gravity"),
         ({"dt": 0.0}, "dt"),
-        ({"materials": ()}, "material"),
         ({"materials": ("goop", "goop")}, "once"),
         ({"boundary": ("wall", "mirror")}, "mirror"),
         ({"boundary": ("wall", "periodic")}, "Axis 1 is periodic.* must be the same, one period apart"),
         ({"particle_volume": float("nan")}, "particle_volume"),
         ({"densities": (1.0, 2.0)}, "densities"),
         ({"densities": (0.0,)}, "positive and finite"),
-        ({"densities": (float("inf"),)}, "positive and finite"),
-        ({"densities": (float("nan"),)}, "positive and finite"),
     ],
 )
 def test_contradictions_are_named(changes, complaint):
