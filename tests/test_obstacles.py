@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
 from nmpm.obstacles import Box, Disc, Polygon, Ramp, Sphere
-from nmpm.sim.mpm.layouts import Ramp as SimulatedRamp
+from nmpm.sim.mpm.layouts import SimulatedRamp
 
 SQUARE = [(0.2, 0.3), (0.6, 0.3), (0.6, 0.5), (0.2, 0.5)]
 

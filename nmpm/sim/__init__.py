@@ -5,7 +5,7 @@ SPH, 2-D) implement it, and `presets/` describes the shipped scenes.
 """
 
 from nmpm.sim.loading import load_preset, preset_from_dict, preset_names
-from nmpm.sim.mpm.layouts import Ramp
+from nmpm.sim.mpm.layouts import SimulatedRamp
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset
 from nmpm.sim.state import InitialState, SimulatedTrajectory
@@ -14,7 +14,7 @@ __all__ = [
     "InitialState",
     "MpmPreset",
     "Preset",
-    "Ramp",
+    "SimulatedRamp",
     "SimulatedTrajectory",
     "load_preset",
     "preset_from_dict",

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.sim import InitialState, load_preset, preset_from_dict, preset_names
-from nmpm.sim.mpm.layouts import Ramp, distance_to_ramps
+from nmpm.sim.mpm.layouts import SimulatedRamp, distance_to_ramps
 from nmpm.sim.preset import BOUNDARY
 from nmpm.sim.sph.boundary import PolygonObstacle
 from tests.data.fuzzing import FUZZ, VALUES, changed, places
@@ -232,7 +232,7 @@ def test_invalid_states_are_refused(preset, position, velocity, message):
 def test_counts_and_obstacles_must_fit_the_solver():
     low = np.array([0.2, 0.2])
     triangle = PolygonObstacle(low + 0.1 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-    bar = Ramp((0.3, 0.3), 0.2, 0.03, 0.5)
+    bar = SimulatedRamp((0.3, 0.3), 0.2, 0.03, 0.5)
     one = InitialState(np.full((1, 2), 0.7), np.zeros((1, 2)))
     for preset, obstacle in ((load_preset("waterramps"), triangle), (WBC, bar)):
         with pytest.raises(DataError, match="not implemented"):

@@ -153,7 +153,7 @@ def _block_sides(sizes: Array, aspect: tuple[float, float], dim: int, rng: np.ra
 
 
 @dataclass(frozen=True)
-class Ramp(Obstacle):
+class SimulatedRamp(Obstacle):
     """A bar: a turned rectangle.
 
     Args:
@@ -238,7 +238,7 @@ class RampRanges:
 
     def draw(
         self, box: tuple[Interval, ...], occupied: Sequence[tuple[Array, Array]], rng: np.random.Generator
-    ) -> tuple[Ramp, ...]:
+    ) -> tuple[SimulatedRamp, ...]:
         """Random ramps within a box.
 
         Args:
@@ -262,16 +262,16 @@ class RampRanges:
         box: tuple[Interval, ...],
         occupied: Sequence[tuple[Array, Array]],
         rng: np.random.Generator,
-    ) -> tuple[Ramp, ...] | None:
+    ) -> tuple[SimulatedRamp, ...] | None:
         """Bars placed one after the other, or None if the first ones leave no room for the others."""
         low, high = np.array(box).T
-        placed: list[Ramp] = []
+        placed: list[SimulatedRamp] = []
         for _ in range(_RAMP_ATTEMPTS):
             if len(placed) == number:
                 return tuple(placed)
             angle = math.radians(rng.uniform(*self.angle)) * (1 if rng.random() < 0.5 else -1)
             x, y = rng.uniform(low, high).tolist()
-            drawn = Ramp((x, y), float(rng.uniform(*self.length)), self.thickness, angle)
+            drawn = SimulatedRamp((x, y), float(rng.uniform(*self.length)), self.thickness, angle)
             outline = drawn.outline()
             inside = np.all((outline >= low + self.gap) & (outline <= high - self.gap))
             clear = all(other.distance(outline).min() >= self.gap for other in placed)
@@ -280,7 +280,7 @@ class RampRanges:
         return None
 
 
-def _too_close(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
+def _too_close(ramp: SimulatedRamp, corners: tuple[Array, Array], gap: float) -> bool:
     """Whether a ramp comes closer to a rectangle than the gap."""
     low, high = corners
     beyond = np.maximum(np.maximum(low - ramp.outline(), ramp.outline() - high), 0.0)
@@ -290,7 +290,7 @@ def _too_close(ramp: Ramp, corners: tuple[Array, Array], gap: float) -> bool:
     return bool(min(nearest, ramp.distance(points).min()) < gap)
 
 
-def distance_to_ramps(ramps: tuple[Ramp, ...], points: Array) -> Array:
+def distance_to_ramps(ramps: tuple[SimulatedRamp, ...], points: Array) -> Array:
     """(K,) signed distance of points (K, 2) from the nearest bar, negative inside; infinite where there is none."""
     nearest = np.full(len(points), np.inf)
     for ramp in ramps:

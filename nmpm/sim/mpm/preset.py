@@ -15,7 +15,7 @@ from nmpm._support.plain_data import from_plain
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.blocks import draw_gravity
-from nmpm.sim.mpm.layouts import MpmBlockRanges, Ramp, RampRanges, distance_to_ramps
+from nmpm.sim.mpm.layouts import MpmBlockRanges, RampRanges, SimulatedRamp, distance_to_ramps
 from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
@@ -229,7 +229,7 @@ class MpmPreset(Preset):
             raise DataError(f"Counts {counts} do not divide {count} particles among {materials} materials.")
         return counts
 
-    def _grid(self, gravity: tuple[float, ...], ramps: tuple[Ramp, ...]) -> MpmGrid:
+    def _grid(self, gravity: tuple[float, ...], ramps: tuple[SimulatedRamp, ...]) -> MpmGrid:
         low, high = np.array(self.reach).T
         shape = tuple(round(cells) for cells in (high - low) / self.cell_size)
         pull = np.array(gravity, dtype=np.float64)
@@ -281,8 +281,8 @@ def _read_materials(section: Any) -> tuple[Material, ...]:
     return tuple(from_plain(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())
 
 
-def _ramps_of(start: InitialState) -> tuple[Ramp, ...]:
-    ramps = tuple(obstacle for obstacle in start.obstacles if isinstance(obstacle, Ramp))
+def _ramps_of(start: InitialState) -> tuple[SimulatedRamp, ...]:
+    ramps = tuple(obstacle for obstacle in start.obstacles if isinstance(obstacle, SimulatedRamp))
     if len(ramps) != len(start.obstacles):
         raise DataError("The material point method simulates ramps; other obstacles are not implemented.")
     return ramps

@@ -20,7 +20,7 @@ from nmpm.sim.sph.neighbours import PairLists, Pairs, WallPairs
 from nmpm.sim.sph.sums import SUPPORT
 from nmpm.sim.state import Array, check
 
-Box = tuple[Interval, Interval]
+Rectangle = tuple[Interval, Interval]
 
 _ATTEMPTS = 10_000
 
@@ -30,7 +30,7 @@ class FluidLayout(abc.ABC):
 
     @abc.abstractmethod
     def draw(
-        self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
+        self, box: Rectangle, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
     ) -> tuple[Array, Array]:
         """Positions and velocities, (N, 2) each, of particles in the box and in no obstacle.
 
@@ -95,7 +95,7 @@ class Column(FluidLayout):
         return math.prod(self.shape(spacing))
 
     def draw(
-        self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
+        self, box: Rectangle, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
     ) -> tuple[Array, Array]:
         shape = self.shape(spacing)
         low = np.array([axis[0] for axis in box])
@@ -112,7 +112,7 @@ class FluidBlocks(BlockRanges, FluidLayout):
     """Rectangular blocks of fluid, each with one velocity; particles that would be inside obstacles are left out."""
 
     def draw(
-        self, box: Box, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
+        self, box: Rectangle, spacing: float, obstacles: tuple[PolygonObstacle, ...], rng: np.random.Generator
     ) -> tuple[Array, Array]:
         number = int(rng.integers(self.number[0], self.number[1] + 1))
         for _ in range(_ATTEMPTS):
@@ -137,7 +137,7 @@ class FluidBlocks(BlockRanges, FluidLayout):
         return dataclasses.replace(self, particles=(max(1, fewest // factor**2), max(1, most // factor**2)))
 
     def _arrange(
-        self, box: Box, spacing: float, number: int, rng: np.random.Generator
+        self, box: Rectangle, spacing: float, number: int, rng: np.random.Generator
     ) -> list[tuple[Array, tuple[int, int]]] | None:
         """Lower corner and lattice of each block; None if they do not fit, meet, or are too small or large."""
         sizes = self.share + (1 - number * self.share) * rng.dirichlet(np.ones(number))

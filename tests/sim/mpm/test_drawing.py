@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
 from nmpm.sim import load_preset
-from nmpm.sim.mpm.layouts import Ramp, RampRanges, distance_to_ramps
+from nmpm.sim.mpm.layouts import RampRanges, SimulatedRamp, distance_to_ramps
 
 GOOP = load_preset("goop")
 
@@ -20,7 +20,7 @@ RAMPS = RampRanges(number=(2, 4), length=(0.1, 0.3), thickness=0.03, angle=(10.0
 BOX = ((0.1, 0.9), (0.1, 0.9))
 
 ramps = st.builds(
-    Ramp,
+    SimulatedRamp,
     centre=st.tuples(st.floats(0.2, 0.8), st.floats(0.2, 0.8)),
     length=st.floats(0.05, 0.4),
     thickness=st.floats(0.01, 0.05),
