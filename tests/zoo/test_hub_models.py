@@ -128,7 +128,7 @@ def damage(cache, file):
         path.resolve().write_bytes(content)
 
 
-@pytest.mark.parametrize("file", ["model.safetensors", "card.yaml"])
+@pytest.mark.parametrize("file", ["model.safetensors", pytest.param("card.yaml", marks=pytest.mark.slow)])
 def test_a_damaged_file_of_the_cache_is_fetched_again_or_named_with_what_to_delete(hub, root, tmp_path, file):
     identifier = push(root / "small", "lab/small")
     load_model(str(identifier))

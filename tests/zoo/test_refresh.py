@@ -19,7 +19,7 @@ from nmpm.zoo import refresh as module
 from nmpm.zoo.card import lifecycle, table_row
 from nmpm.zoo.measures import simulator
 from nmpm.zoo.measures.simulator import NUDGE, floor_facts, twin_facts
-from nmpm.zoo.pages import write_index
+from nmpm.zoo.pages import entry_page, write_index
 from nmpm.zoo.refresh import add_facts, refresh
 
 SHIPPED = shipped_folder("zoo")
@@ -264,6 +264,8 @@ def test_shipped_cards_are_short_and_make_rows_of_the_table(name):
     assert row.milliseconds["AMD EPYC, 1 thread"] > 0
     assert (row.twins is None) == (name == "waterdrop")
     assert len((SHIPPED / name / "card.yaml").read_text().splitlines()) <= 120
+    page = entry_page(Zoo.card(name, SHIPPED), [path.name for path in (SHIPPED / name).iterdir()])
+    assert (SHIPPED / name / "README.md").read_text() == page
 
 
 @pytest.mark.parametrize(
