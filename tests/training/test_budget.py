@@ -65,7 +65,6 @@ BY_EPOCH = lightning.pytorch.callbacks.Timer(SHORT, interval="epoch")  # which w
         ({"max_time": "00:00:00:00"}, [], "max_time 0: nothing"),
         ({"max_steps": 4, "limit_train_batches": 0.5}, [], "limit_train_batches 0.5 is a share"),
     ],
-    ids=str,
 )
 def test_a_budget_without_end_or_steps_is_refused_before_data_are_loaded(tmp_path, limits, callbacks, complaint):
     with pytest.raises(ConfigError) as refusal:

@@ -111,7 +111,6 @@ class Payload:
         {"state_dict": {}, "hyper_parameters": {"unroll": "many"}},
         {"state_dict": [1, 2], "hyper_parameters": {}},
     ],
-    ids=repr,
 )
 def test_other_files_are_refused_by_name_in_one_line_and_not_executed(content, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

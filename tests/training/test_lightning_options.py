@@ -187,7 +187,7 @@ def options_of(given: Options, folder: Path) -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", map(marked, WORKS))
+@pytest.mark.parametrize("name", list(map(marked, WORKS)))
 def test_works(name, make_dataset, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = make_dataset()
@@ -208,7 +208,7 @@ def test_works(name, make_dataset, tmp_path, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", map(marked, REFUSED))
+@pytest.mark.parametrize("name", list(map(marked, REFUSED)))
 def test_is_refused_before_the_first_step(name, make_dataset, tmp_path):
     options, error = REFUSED[name]
     model, data = make(make_dataset())
