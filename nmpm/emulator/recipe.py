@@ -120,9 +120,9 @@ class EmulatorRecipe:
             ConfigError: if a newer nmpm wrote it, or a key is missing, unknown or wrong.
         """
         values = dict(plain)
-        if missing := sorted({"format", "cells", "frames", "processor"} - set(values)):  # defaults are for new models
+        check_format(values.pop("format", FORMAT), "This model")  # checkpoints state theirs elsewhere
+        if missing := sorted({"cells", "frames", "processor"} - set(values)):  # their defaults are for new models
             raise ConfigError(f"The recipe of an emulator lacks {', '.join(missing)}.")
-        check_format(values.pop("format"), "This model")
         return from_plain(cls, values, "The recipe of an emulator")
 
 
