@@ -28,8 +28,8 @@ from nmpm.sim.state import SimulatedTrajectory
 
 DRAWS = 5
 """Seeds tried for one trajectory; if all are unstable, the preset is at fault."""
-FRAMES_PER_PROCESS = 500
-"""Least frames for which a process is started: these take seconds, the start of a process one or two."""
+FRAMES_PER_PROCESS = 1000
+"""Least frames for which a process is started: these take about three seconds, as does its start."""
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
 """Of a process; nothing is imported from the working directory that this process would not import from there."""
 _POLL_SECONDS = 0.2
