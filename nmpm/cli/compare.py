@@ -38,5 +38,5 @@ def run(words: list[str]) -> None:
     )
     add_scene_options(parser, "compare", scenes=6)
     parser.set_defaults(config=None, predictors=[])
-    chosen = parser.parse_args(words[1:])
-    measure_and_report("compare", chosen, chosen.data)
+    options = parser.parse_args(words[1:])
+    measure_and_report("compare", options, options.data)

@@ -44,17 +44,17 @@ still slows networks more than the simulator, so measure on an idle one. Delete 
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["trade", "goop"]."""
-    chosen = _parser().parse_args(words[1:])
-    if chosen.print_config:
+    options = _parser().parse_args(words[1:])
+    if options.print_config:
         from nmpm.evaluation.trade import shipped_sweep_text
 
         sys.stdout.write(shipped_sweep_text("trade"))
         return
-    if chosen.dataset is None:
+    if options.dataset is None:
         raise ConfigError("name a dataset, such as goop, or the folder of one; see nmpm trade --help.")
-    if chosen.config is not None:
-        check_input("--config", chosen.config)
-    measure_and_report("trade", chosen, chosen.dataset)
+    if options.config is not None:
+        check_input("--config", options.config)
+    measure_and_report("trade", options, options.dataset)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -83,13 +83,13 @@ def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int
     add_device_option(parser)
 
 
-def measure_and_report(command: str, chosen: argparse.Namespace, dataset: str) -> None:
+def measure_and_report(command: str, options: argparse.Namespace, dataset: str) -> None:
     """Measure the sweep of a command on a dataset, print the table, and write the report."""
-    check_at_least("--scenes", chosen.scenes, 1)
-    check_at_least("--wider", chosen.wider, 2)
-    check_device(chosen.device)
-    wider = f"-{chosen.wider}-times-as-wide" if chosen.wider else ""
-    out = chosen.out or Path(command) / f"{Path(dataset).name}{wider}"
+    check_at_least("--scenes", options.scenes, 1)
+    check_at_least("--wider", options.wider, 2)
+    check_device(options.device)
+    wider = f"-{options.wider}-times-as-wide" if options.wider else ""
+    out = options.out or Path(command) / f"{Path(dataset).name}{wider}"
     check_folder("--out", out)
     from rich.console import Console
 
@@ -98,18 +98,18 @@ def measure_and_report(command: str, chosen: argparse.Namespace, dataset: str) -
     from nmpm.evaluation import trade
     from nmpm.evaluation.trade.report import likely_points, report_lines, summary_table, write_report
 
-    if chosen.config is None:
+    if options.config is None:
         sweep = trade.read_sweep(trade.shipped_sweep_text(command), f"the sweep of nmpm {command}")
     else:
-        sweep = trade.read_sweep(read_text(chosen.config), str(chosen.config))
-    sweep = sweep if chosen.scenes is None else sweep.with_scenes(chosen.scenes)
-    predictors = [trade.find_factory(path) for path in chosen.predictors]
-    models = _models_of(Path(dataset).name) if chosen.models is None else _load_models(chosen.models)
-    if chosen.wider:
-        scenes = trade.find_wider_scenes(dataset, sweep.scenes, chosen.wider)
+        sweep = trade.read_sweep(read_text(options.config), str(options.config))
+    sweep = sweep if options.scenes is None else sweep.with_scenes(options.scenes)
+    predictors = [trade.find_factory(path) for path in options.predictors]
+    models = _models_of(Path(dataset).name) if options.models is None else _load_models(options.models)
+    if options.wider:
+        scenes = trade.find_wider_scenes(dataset, sweep.scenes, options.wider)
     else:
         scenes = trade.find_scenes(dataset, sweep.scenes)
-    choices = trade.make_choices(sweep, scenes, models, find_device(chosen.device), predictors)
+    choices = trade.make_choices(sweep, scenes, models, find_device(options.device), predictors)
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     points = trade.measure(choices, scenes, sweep, trade.Store(out), command)

@@ -13,7 +13,7 @@ from rich.table import Table
 PREDICTORS: Mapping[str, str] = MappingProxyType(
     {"model": "model", "still": "nothing moves", "free_fall": "free fall, stopped at walls"}
 )
-"""What is compared, and its name in tables. Figures of all but the model have the key and a slash before their name."""
+"""Predictors and their names in tables. Figures of all but the model have the key and a slash before their name."""
 
 
 _LONGEST = 10**7
@@ -45,7 +45,7 @@ class Unit(NamedTuple):
 
 
 def with_unit(value: float) -> str:
-    """An error of a line of its own, to three digits, such as "0.164 ×10⁻³"."""
+    """An error with its unit, to three digits, such as "0.164 ×10⁻³"."""
     unit = Unit.of([value])
     return f"{unit.show(value, 3)}{unit}"
 

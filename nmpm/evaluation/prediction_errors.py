@@ -42,7 +42,7 @@ _FIELD_FRAMES = 50  # at which fields are compared
 
 @dataclass(frozen=True)
 class Measures:
-    """What is measured of a prediction.
+    """Settings of `measure_errors`.
 
     Args:
         horizons: Frames up to which the MSE is reported, beside the full rollout.

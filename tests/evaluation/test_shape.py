@@ -25,12 +25,6 @@ def lattice_state(count: int, spacing: float, corner: tuple[float, float] = (0.1
     return scene, state
 
 
-def test_a_block_on_the_floor_stands_half_its_height():
-    scene, state = lattice_state(20, 0.01)
-    shape = measure_shape(scene, Grid.of(scene, 84), state, state.position)
-    assert shape.height.item() == pytest.approx(0.1, rel=1e-4)
-
-
 def test_twice_the_particles_in_the_same_cells_are_twice_as_crowded():
     scene, state = lattice_state(20, 0.01)
     grid = Grid.of(scene, 42)  # cells of 0.02: four particles in each

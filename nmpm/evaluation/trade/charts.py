@@ -70,7 +70,7 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
     for point in near:
         axes.axhline(ranks[point.name].mean, **_LINES[point.kind])
     for point in shown:
-        if point.exact and point.kind is Kind.SIMULATOR:  # a logarithmic axis has no place for an error of 0
+        if point.exact and point.kind is Kind.SIMULATOR:  # a logarithmic axis cannot show an error of 0
             axes.axvline(point.milliseconds, color=_MARKERS[point.kind]["color"], lw=1, label="simulator as shipped")
     _describe(axes, shown)
     below = f"\n(below the picture: {far})" if far else ""

@@ -46,7 +46,7 @@ class Store:
         self.folder = Path(folder)
 
     def read(self, kind: str, key: Any) -> dict[str, Any]:
-        """What is stored, by name; empty if nothing is, or the file is damaged."""
+        """The stored values by name; empty if nothing is, or the file is damaged."""
         try:
             content = json.loads(self._path(kind, key).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -100,7 +100,7 @@ def _point(choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times, scen
 def measure_accuracy(
     choice: Choice, scenes: Scenes, measures: Measures, store: Store, step: Step
 ) -> list[dict[str, Any]]:
-    """What `_measure_scene` gives of each scene, measured where the store lacks it; calls `step` after every scene."""
+    """Rows of `_measure_scene`, computed where the store lacks them; calls `step` after every scene."""
     key = {"choice": dict(choice.identity), "measures": measures.to_dict()}
     stored = store.read("errors", key)
     for index, scene in enumerate(scenes.digests):

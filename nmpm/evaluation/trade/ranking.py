@@ -23,7 +23,7 @@ from nmpm.evaluation.trade.choices import Kind, Settings
 
 @dataclass(frozen=True)
 class Times:
-    """What was timed of a choice.
+    """Times of a choice.
 
     Args:
         milliseconds: Per computed frame and scene, of each round, see `Choice.computed_frames`.
@@ -47,7 +47,7 @@ class Point:
     Args:
         kind: What it is.
         name: Unique among the points.
-        settings: What was chosen, by name.
+        settings: Of the choice, by name.
         batch, threads, device: How it was timed.
         times: Its times.
         errors: (S,) of each scene by name; NaN where the prediction failed.
@@ -179,7 +179,7 @@ def pareto_probabilities(times: Floats, errors: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Recommendation:
-    """What to run for budgets from `milliseconds` up to that of the next one.
+    """The choice to run for budgets from `milliseconds` up to that of the next one.
 
     Args:
         milliseconds: Smallest budget per frame for which it holds.
@@ -193,7 +193,7 @@ class Recommendation:
 
 
 def recommend(points: Sequence[Point]) -> list[Recommendation]:
-    """What to run for any budget of milliseconds per frame of one scene: steps from the least budget on.
+    """Recommend a choice for any budget of milliseconds per frame of one scene: steps from the least budget on.
 
     Args:
         points: All of them; those that predict several scenes at once are left out, as a budget is for one scene.

@@ -23,7 +23,7 @@ from nmpm.evaluation.trade.ranking import Point, beside_simulator, measure_names
 from nmpm.evaluation.trade.scenes import Scenes
 
 SETTINGS = ("model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
-"""Columns of what was chosen; empty where it does not apply."""
+"""Columns of settings; empty where one does not apply."""
 
 COLUMNS = (
     "dataset", "scenes", "particles", "kind", "name", *SETTINGS, "batch", "threads", "device", "hardware", "clock",
@@ -232,7 +232,7 @@ def _show(value: float, unit: Unit, digits: int = 3) -> str:
 
 
 def report_lines(points: Sequence[Point]) -> list[str]:
-    """What to run from which budget on, the best emulator beside the simulator, models of other scenes, failures."""
+    """Sentences: recommendations by budget, the best emulator beside the simulator, models of other scenes, failures."""
     lines = [f"from {step.milliseconds:.3g} ms per frame: {step.sentence}" for step in recommend(points)]
     return [*lines, *filter(None, [beside_simulator(points)]), *_origins(points), *_failures(points)]
 

@@ -76,7 +76,7 @@ class Floors:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is compared, and how it is measured.
+    """The choices to compare, and how they are measured.
 
     Args:
         scenes: Test scenes.

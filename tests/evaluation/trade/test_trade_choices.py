@@ -126,7 +126,8 @@ def test_runtimes_are_choices_of_their_own(scenes):
 
 
 def test_a_predictor_of_another_package_is_a_choice(scenes):
-    still, moving = (
+    factories = [find_factory(PATH), find_factory(f"{PATH}:0.5")]
+    still, moving = (c for c in make_choices(tiny_sweep(), scenes, {}, predictors=factories)[-4:-2])
         c
         for c in make_choices(tiny_sweep(), scenes, {}, predictors=[find_factory(PATH), find_factory(f"{PATH}:0.5")])[
             -4:-2
