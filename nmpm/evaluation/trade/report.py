@@ -232,7 +232,7 @@ def _show(value: float, unit: Unit, digits: int = 3) -> str:
 
 
 def report_lines(points: Sequence[Point]) -> list[str]:
-    """Sentences: recommendations by budget, the best emulator beside the simulator, models of other scenes, failures."""
+    """Recommendations by budget, the best emulator beside the simulator, models of other scenes, and failures."""
     lines = [f"from {step.milliseconds:.3g} ms per frame: {step.sentence}" for step in recommend(points)]
     return [*lines, *filter(None, [beside_simulator(points)]), *_origins(points), *_failures(points)]
 

@@ -128,11 +128,6 @@ def test_runtimes_are_choices_of_their_own(scenes):
 def test_a_predictor_of_another_package_is_a_choice(scenes):
     factories = [find_factory(PATH), find_factory(f"{PATH}:0.5")]
     still, moving = (c for c in make_choices(tiny_sweep(), scenes, {}, predictors=factories)[-4:-2])
-        c
-        for c in make_choices(tiny_sweep(), scenes, {}, predictors=[find_factory(PATH), find_factory(f"{PATH}:0.5")])[
-            -4:-2
-        ]
-    )
     assert (still.kind, still.name, moving.name) == (Kind.OTHER, "shifted by 0", "shifted by 0.5")
     start = scenes.window([0]).initial.position
     assert torch.equal(moving.prepare(scenes, [0])(3)[:, 2], start + 1.5)
