@@ -82,12 +82,6 @@ def test_swapped_axes_are_refused(tmp_path):
         nmpm.write_trajectories(tmp_path / "train.h5", [square], ONE)
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(DataError, match=r"file/train.h5: cannot be written \("):
-        nmpm.write_trajectories(tmp_path / "file" / "train.h5", [np.zeros((3, 2, 2))], ONE)
-
-
 def test_splits_of_different_scenes_do_not_mix(tmp_path):
     nmpm.write_trajectories(tmp_path / "train.h5", runs(), SCENE)
     with pytest.raises(DataError, match="states another scene"):
