@@ -63,7 +63,9 @@ def open_dataset(source: FolderSource) -> OpenedDataset:
         source = FolderSource(folder, replace(source.options, family=guess_family(ids, plain or {})))
     metadata, wrong = _read_metadata(source, plain, next(iter(splits.values())), ids)
     try:
-        metadata = source.options.apply_to(metadata)
+        # A gravity that contradicts the file's is a problem that the scene reports.
+        gravity = source.options.gravity if metadata.gravity is None else None
+        metadata = replace(source.options, gravity=gravity).apply_to(metadata)
     except ConfigError as error:
         wrong.append(str(error))
     if unknown := metadata.unknown_types(np.array(ids)):

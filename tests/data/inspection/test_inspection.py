@@ -186,6 +186,7 @@ def test_missing_metadata_and_a_damaged_split_become_findings(folder):
     assert list(found.splits) == ["train"]
     found = look_at(folder, KEYS | {"gravity": [0, -9.81]}, gravity=(0.0, -1.0))
     assert any("contradicts" in finding for finding in found.findings)
+    assert found.gravity == (0.0, -9.81)
 
 
 def test_foreign_data_that_convert_refuses_are_inspected(tmp_path, monkeypatch, capsys):
