@@ -90,7 +90,6 @@ class Grid:
         return not any(step > _MAX_ROUNDING * h for _, step, h in self._steps(dtype))
 
     def _check_precision(self, dtype: torch.dtype) -> None:
-        """Raise DataError if this type does not resolve the cells."""
         for axis, (reach, step, h) in enumerate(self._steps(dtype)):
             if step > _MAX_ROUNDING * h:
                 name = str(dtype).removeprefix("torch.")
@@ -103,12 +102,12 @@ class Grid:
 
     def _steps(self, dtype: torch.dtype) -> list[tuple[float, float, float]]:
         """For each axis the end that is farthest from 0, the spacing of numbers there, and the cell's width."""
-        found = []
+        steps = []
         for low, n, h in zip(self.lower, self.shape, self.spacing, strict=True):
             reach = max(abs(low), abs(low + n * h))
             step = torch.finfo(dtype).eps * 2.0 ** math.floor(math.log2(reach)) if reach > 0 else 0.0
-            found.append((reach, step, h))
-        return found
+            steps.append((reach, step, h))
+        return steps
 
     def to_cell_displacement(self, displacement: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Displacements (..., D) in domain length → cells, of type `dtype`."""
@@ -135,8 +134,8 @@ class Grid:
 
         Computed in float64, which not every device has, on the CPU.
         """
-        known = (scene.bounds, self.lower, self.spacing)
-        limits, lower, spacing = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in known)
+        numbers = (scene.bounds, self.lower, self.spacing)
+        limits, lower, spacing = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in numbers)
         return ((limits.T - lower) / spacing).float().to(torch.get_default_device())
 
     def centres(self, axis: int, dtype: torch.dtype = torch.float64) -> Tensor:

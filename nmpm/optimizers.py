@@ -28,13 +28,9 @@ class SOAP(pytorch_optimizer.SOAP):
     """
 
     def __init__(
-        self,
-        params: Iterable[Tensor],
-        lr: float = 3e-3,
-        weight_decay: float = 0.01,
-        max_precondition_dim: int = 600,
+        self, params: Iterable[Tensor], lr: float = 3e-3, weight_decay: float = 0.01, max_precondition_dim: int = 600,
         precondition_frequency: int = 10,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not lr > 0:
             raise ConfigError(f"SOAP: lr = {lr} must be a positive number.")
         weights = list(params)
@@ -44,9 +40,6 @@ class SOAP(pytorch_optimizer.SOAP):
                 " --model.optimizer.lr 1.5e-3."
             )
         super().__init__(
-            weights,
-            lr=lr,
-            weight_decay=weight_decay,
-            max_precondition_dim=max_precondition_dim,
+            weights, lr=lr, weight_decay=weight_decay, max_precondition_dim=max_precondition_dim,
             precondition_frequency=precondition_frequency,
-        )
+        )  # fmt: skip

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -38,15 +38,9 @@ class _Batched:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The same with a function applied to each tensor, those of fields among them."""
-        return type(self)(**{name: _change(change, value) for name, value in vars(self).items()})
-
-
-def _change(
-    change: Callable[[Tensor], Tensor], value: Tensor | Mapping[str, Tensor] | None
-) -> Tensor | Mapping[str, Tensor] | None:
-    if value is None:
-        return None
-    return change(value) if isinstance(value, Tensor) else {key: change(own) for key, own in value.items()}
+        changed: dict[str, Any] = {name: change(own) for name, own in vars(self).items() if isinstance(own, Tensor)}
+        changed["fields"] = {name: change(values) for name, values in vars(self)["fields"].items()}
+        return type(self)(**changed)
 
 
 @dataclass(frozen=True)
@@ -81,18 +75,8 @@ class Particles(_Batched):
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
-        expected = {
-            "velocity": (batch, count, dim),
-            "material": (batch, count),
-            "mask": (batch, count),
-            "obstacle": (batch, self.obstacle.shape[1], dim),
-            "obstacle_mask": (batch, self.obstacle.shape[1]),
-            "gravity": (batch, dim),
-        }
-        if self.obstacle_share is not None:
-            expected["obstacle_share"] = (batch, self.obstacle.shape[1])
-        _check_shapes(self, expected)
-        _check_fields(self.fields, [(batch, count), (batch, 1)], "Particles")
+        _check_shapes(self, batch, count, dim, [(batch, count), (batch, 1)])
+        _check_shape("Particles.velocity", self.velocity, [(batch, count, dim)])
 
     def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
         """The same particles elsewhere: (B, N, D) positions and velocities."""
@@ -130,17 +114,7 @@ class Window(_Batched):
         batch, frames, count, dim = self.frames.shape
         if frames < 2:
             raise ValueError(f"A window needs at least 2 frames, for a velocity; it has {frames}.")
-        expected = {
-            "material": (batch, count),
-            "mask": (batch, count),
-            "obstacle": (batch, self.obstacle.shape[1], dim),
-            "obstacle_mask": (batch, self.obstacle.shape[1]),
-            "gravity": (batch, dim),
-        }
-        if self.obstacle_share is not None:
-            expected["obstacle_share"] = (batch, self.obstacle.shape[1])
-        _check_shapes(self, expected)
-        _check_fields(self.fields, [(batch, frames, count), (batch, 1, count), (batch, 1, 1)], "Window")
+        _check_shapes(self, batch, count, dim, [(batch, frames, count), (batch, 1, count), (batch, 1, 1)])
 
     @classmethod
     def of(cls, state: Particles) -> Self:
@@ -188,16 +162,26 @@ class Window(_Batched):
         return ahead.expand(-1, self.frames.shape[1] - 2, self.frames.shape[2])
 
 
-def _check_shapes(owner: object, expected: dict[str, tuple[int, ...]]) -> None:
+def _check_shapes(
+    owner: Particles | Window, batch: int, count: int, dim: int, field_shapes: list[tuple[int, ...]]
+) -> None:
+    statics = owner.obstacle.shape[1]
+    expected = {
+        "material": (batch, count),
+        "mask": (batch, count),
+        "obstacle": (batch, statics, dim),
+        "obstacle_mask": (batch, statics),
+        "gravity": (batch, dim),
+    }
+    kind = type(owner).__name__
     for name, shape in expected.items():
-        found = tuple(getattr(owner, name).shape)
-        if found != shape:
-            raise ValueError(f"{type(owner).__name__}.{name} has shape {found}, expected {shape}.")
+        _check_shape(f"{kind}.{name}", getattr(owner, name), [shape])
+    if owner.obstacle_share is not None:
+        _check_shape(f"{kind}.obstacle_share", owner.obstacle_share, [(batch, statics)])
+    for name, values in owner.fields.items():
+        _check_shape(f"{kind}.fields[{name!r}]", values, field_shapes)
 
 
-def _check_fields(fields: Mapping[str, Tensor], allowed: list[tuple[int, ...]], owner: str) -> None:
-    for name, values in fields.items():
-        if tuple(values.shape) not in allowed:
-            raise ValueError(
-                f"{owner}.fields[{name!r}] has shape {tuple(values.shape)}, expected {' or '.join(map(str, allowed))}."
-            )
+def _check_shape(name: str, values: Tensor, allowed: list[tuple[int, ...]]) -> None:
+    if tuple(values.shape) not in allowed:
+        raise ValueError(f"{name} has shape {tuple(values.shape)}, expected {' or '.join(map(str, allowed))}.")

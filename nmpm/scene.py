@@ -174,12 +174,12 @@ class Scene:
         are compared to 5%.
         """
         facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles")
-        found = [name for name in facts if getattr(self, name) != getattr(other, name)]
+        different = [name for name in facts if getattr(self, name) != getattr(other, name)]
         if len(self.materials) != len(other.materials):
-            found.append("materials")
+            different.append("materials")
         if not math.isclose(self.particle_volume, other.particle_volume, rel_tol=0.05):
-            found.append("particle_volume")
-        return tuple(found)
+            different.append("particle_volume")
+        return tuple(different)
 
     def with_fields_of(self, other: Scene) -> Self:
         """The same scene with another's fields: what a model of that other scene is told about this one."""
@@ -199,9 +199,7 @@ class Scene:
         return dataclasses.replace(self, bounds=bounds, domain=domain)
 
     def to_dict(self) -> dict[str, Any]:
-        """The scene as plain lists, strings and numbers; without densities and fields if there are none, as in older
-        files.
-        """
+        """The scene as plain lists, strings and numbers; without densities and fields where there are none."""
         plain = dataclasses.asdict(self)
         for name in ("densities", "evolving", "properties", "parameters"):
             if not plain[name]:
@@ -219,12 +217,12 @@ class Scene:
 
 
 def check_field_names(names: Iterable[str]) -> None:
-    """Make sure that names of fields can name channels.
+    """Raise ConfigError unless names of fields can name channels.
 
     Raises:
         ConfigError: if one is no identifier, is taken by a channel that every scene has, or occurs twice.
     """
-    found: list[str] = []
+    known: set[str] = set()
     for name in names:
         taken = str(name).startswith(("gravity_", "velocity_")) or name in _RESERVED
         if not isinstance(name, str) or not name.isidentifier() or taken:
@@ -232,6 +230,6 @@ def check_field_names(names: Iterable[str]) -> None:
                 f"A field cannot be called {str(name)[:40]!r}: give letters, digits and underscores, and none of"
                 f" {', '.join(sorted(_RESERVED))}."
             )
-        if name in found:
+        if name in known:
             raise ConfigError(f"The field {name!r} is given twice.")
-        found.append(name)
+        known.add(name)

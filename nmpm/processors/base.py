@@ -19,7 +19,7 @@ from nmpm.grid import Grid
 
 @dataclass(frozen=True)
 class GridLayout:
-    """What the scene and the emulator demand of a network.
+    """The channels, frames and axes that scene and emulator demand of a network.
 
     Args:
         in_channels: C_in, channels of the grid state.
