@@ -42,7 +42,7 @@ _load = get_loader(PARSER_MODE)
 
 
 def load_checked(text: str) -> Any:
-    """What LightningCLI reads of a configuration's text, which may refer to its own values, but not to anything else.
+    """Read a configuration's text, in which ${…} may refer to its other keys, but not to anything else.
 
     Raises:
         ValueError: for what `check_yaml` refuses, and resolvers, such as `${oc.env:HOME}`, as runs are shared.

@@ -35,7 +35,7 @@ class EmulatorRecipe:
         processor: The network on the grid.
         decoder: What the network's output means.
         grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training only.
-        constraints: Facts that rollouts are held to; but for the bounds they do not act in training.
+        constraints: Physical limits enforced in rollouts; only `bounds` also in training.
 
     Raises:
         ConfigError: if scene, grid, processor and constraints do not suit each other.

@@ -159,14 +159,7 @@ class EmulatorModule(EvaluatedModule):
         return super().configure_callbacks()
 
     def setup(self, stage: str) -> None:
-        """Check that data, model and metrics suit each other.
-
-        Raises:
-            ConfigError: naming what does not.
-
-        Warns:
-            UserWarning: naming the fields that the model was trained without.
-        """
+        """Raise ConfigError if data, model or metrics do not suit each other; warn of fields that are ignored."""
         data = getattr(self.trainer, "datamodule", None)
         scene, horizon = getattr(data, "scene", None), getattr(data, "horizon", None)
         if isinstance(scene, Scene):
@@ -267,10 +260,6 @@ class EmulatorModule(EvaluatedModule):
         """The optimizer, and the schedule of its learning rate. A new emulator is calibrated first.
 
         Here and not in `on_fit_start`, as Lightning's finders take their steps before that.
-
-        Raises:
-            ConfigError: if the learning rate is not a positive number, the training has no end, or the trainer has
-                been used for another one.
         """
         if self._steps_before:
             raise ConfigError(

@@ -62,7 +62,11 @@ def obstacles(request) -> int:
     return request.param
 
 
-@pytest.fixture(params=config_names())
+IN_EACH_RUN = ("goop.yaml", "waterdrop3d.yaml")
+CONFIGS = [pytest.param(name, marks=[] if name in IN_EACH_RUN else pytest.mark.slow) for name in config_names()]
+
+
+@pytest.fixture(params=CONFIGS)
 def fitted(request, make_dataset, monkeypatch, obstacles) -> OnDevice:
     data = TrajectoryDataModule(path=str(make_dataset(statics=obstacles)), horizon=4, batch_size=2)
     module = build_module(request.param, data.scene)
@@ -83,18 +87,14 @@ def fitted(request, make_dataset, monkeypatch, obstacles) -> OnDevice:
     return OnDevice(module, short, whole)
 
 
-def test_a_training_step_never_leaves_the_device(fitted):
-    module, short, _ = fitted
+def test_steps_and_evaluations_never_leave_the_device_until_figures_are_read(fitted):
+    module, short, whole = fitted
     module.train()
     loss = module.training_step(short, 0)
     assert loss.device == META
     loss.backward()
     assert all(weight.grad.device == META for weight in module.parameters())
     assert all(buffer.device == META for name, buffer in module.emulator.named_buffers() if name != "calibrated")
-
-
-def test_an_evaluation_never_leaves_the_device_until_figures_are_read(fitted):
-    module, _, whole = fitted
     module.eval()
     with torch.no_grad():
         predicted = torch.cat([bundle.position for bundle in unroll(module.emulator, whole.initial, 5)], dim=1)

@@ -26,9 +26,9 @@ RANKS_AGREE_EVERY = 16
 class BestCheckpoint(ModelCheckpoint):
     """A ModelCheckpoint that takes the best scores so far from the files in its folder.
 
-    What Lightning resumes from names files by their former absolute paths, and was written before the process was
-    killed: a moved or copied folder would lose its best weights to worse ones, and so would one killed after a
-    validation. A validation that was due at the step that a training goes on from, and has no score, is made up for.
+    Lightning's checkpoints name files by absolute paths, and may be older than the best weights: a run that was moved,
+    or killed after a validation, would lose its best weights to worse ones. A validation that was due at the step that
+    a training goes on from, and has no score, is run first.
 
     Attributes:
         scored_step: Step of the last weights that have a score; -1 before the first, or where no best weights are left.
