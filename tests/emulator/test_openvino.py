@@ -158,6 +158,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="signal stacks are restored on Linux")
 def test_an_interrupt_is_an_interrupt_and_nothing_is_sent(tmp_path):
     """Loading OpenVINO replaces the signal stack, and importing it reports to its makers, unless both are prevented."""
