@@ -17,6 +17,7 @@ from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import class_path, to_plain
 from nmpm.emulator import EmulatorRecipe
+from nmpm.emulator.recipe import FORMAT
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.scene import Scene
 
@@ -123,7 +124,8 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], recipe: EmulatorRecip
         ConfigError: naming the parts that differ with both values, or if the stored recipe cannot be read.
     """
     names = {field.name for field in dataclasses.fields(EmulatorRecipe)}
-    stored = EmulatorRecipe.from_dict({name: value for name, value in hyper_parameters.items() if name in names})
+    recipe_values = {name: value for name, value in hyper_parameters.items() if name in names}
+    stored = EmulatorRecipe.from_dict({"format": FORMAT, **recipe_values})
     check_same_scene(stored.scene, recipe.scene)
     if stored.scene.output_channels != recipe.scene.output_channels or stored.scene.fields != recipe.scene.fields:
         raise ConfigError(
