@@ -182,8 +182,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 def _refresh(options: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
-    from nmpm.zoo.pages import write_index
-    from nmpm.zoo.refresh import refresh
+    from nmpm.zoo.refresh import refresh, write_index
     from nmpm.zoo.registry import Zoo
 
     _check_one("--data is the folder of one model's data", options.data, options.name)
@@ -196,7 +195,7 @@ def _refresh(options: argparse.Namespace) -> None:
         refresh(folder, options.measure, options.data, options.failures, options.device)
         sys.stdout.write(f"wrote {folder}\n")
     if all(folder.resolve().is_relative_to(root.resolve()) for folder in folders):
-        sys.stdout.write(f"wrote {write_index(root, Zoo.list(root))}\n")
+        sys.stdout.write(f"wrote {write_index(root)}\n")
 
 
 def _check_one(option: str, value: object, name: str | None) -> None:

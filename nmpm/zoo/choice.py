@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
-from nmpm._support.numbers import is_finite
 from nmpm.errors import ConfigError, ZooError
+from nmpm.zoo.card import stated_error, stated_milliseconds
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
     Raises:
         ZooError: if none is within the limits, or times are needed of which none is known.
     """
-    errors = {name: mse for name, card in cards.items() if (mse := stated_mse(card)) is not None}
+    errors = {name: mse for name, card in cards.items() if (mse := stated_error(card)) is not None}
     times = {name: time for name in errors if (time := milliseconds(name)) is not None}
     if limits.max_ms_per_frame is not None and errors and not times:
         hardware = sorted({hardware for name in errors for hardware in stated_milliseconds(cards[name])})
@@ -74,18 +74,3 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
         raise ZooError(f"No model is within the limits. {figures or 'None states an error.'}")
     by_time = limits.max_ms_per_frame is None and bool(timed)
     return min(within, key=lambda name: times[name] if by_time else errors[name])
-
-
-def stated_milliseconds(card: Mapping[str, Any]) -> dict[str, float]:
-    """Milliseconds per frame by hardware, as a card states them; malformed ones are left out."""
-    speed = card.get("speed")
-    entries = [entry for entry in speed if isinstance(entry, Mapping)] if isinstance(speed, list) else []
-    times = {str(entry.get("hardware")): entry.get("ms_per_frame") for entry in entries}
-    return {name: float(time) for name, time in times.items() if is_finite(time) and time > 0}
-
-
-def stated_mse(card: Mapping[str, Any]) -> float | None:
-    """The full-rollout error that a card states; None where it states none that is finite."""
-    test = card.get("test")
-    mse = test.get("mse") if isinstance(test, Mapping) else None
-    return float(mse) if is_finite(mse) else None

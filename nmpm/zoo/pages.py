@@ -1,4 +1,4 @@
-"""What is written for readers: an entry's README and chart, and the table of a zoo's models."""
+"""What is written for readers: an entry's README and chart, and the page of a zoo's models."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
 
-from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import read_yaml
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import DataError, ZooError
 from nmpm.evaluation.figures import PREDICTORS, Unit, figures_unit, with_unit
-from nmpm.scene import Scene
-from nmpm.zoo.card import FACTOR, lifecycle, table_row
-from nmpm.zoo.choice import stated_milliseconds
+from nmpm.zoo.card import FACTOR, fastest_time, lifecycle, stated_milliseconds, trivial_error
 from nmpm.zoo.entries import CONFIG, read_card, read_recipe
 
 if TYPE_CHECKING:
@@ -47,20 +44,14 @@ QUALITY = {
 }
 """Further errors: name, factor and unit, by their key in the card."""
 OPTIONAL = (
-    "about",
-    "twin",
-    "floor",
-    "quality",
-    "speed",
-    "trade",
-    "stress",
-    "stress_free",
-    "failures",
-    "weights",
-    "license",
-    "sha256",
+    *("about", "twin", "floor", "quality", "speed", "trade", "stress", "stress_free"),
+    *("failures", "weights", "license", "sha256"),
 )
 """Keys that a card may lack."""
+TRADE = "../benchmarks/trade/goop/trade.png"
+"""The picture of error and time, beside the zoo of a clone."""
+PLAIN = "eager float32"
+"""Runtime and precision of a model as `Zoo.load` gives it."""
 COLUMNS = {"mse@100": "frames 1 – 100", "mse": "all frames"}
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, TemplateError)
 """What pages and charts raise where a card or a table lacks something, or has other kinds of values."""
@@ -82,7 +73,7 @@ def entry_page(card: Mapping[str, Any], files: Collection[str] = (), load: str |
         files: Names of the entry's files; pictures among them are shown.
         load: What `Zoo.load` takes; the model's name when left out.
     """
-    unit = figures_unit(card["test"])
+    unit, count = figures_unit(card["test"]), card["test_scenes"]
     return _TEMPLATES.get_template("entry.md").render(
         card={**dict.fromkeys(OPTIONAL), **card},
         state=lifecycle(card),
@@ -91,13 +82,14 @@ def entry_page(card: Mapping[str, Any], files: Collection[str] = (), load: str |
         unit_of=with_unit,
         columns={name: text for name, text in COLUMNS.items() if name in card["test"]},
         errors=list(_error_rows(card, unit)),
-        scenes=_scene_count(card),
+        scenes="one test scene" if count == 1 else f"{count} test scenes",
         unstable=(card.get("floor") or {}).get("unstable"),
-        quality=[_quality(card["quality"], name) for name in QUALITY if name in (card.get("quality") or {})],
-        fastest=min((card.get("trade") or {}).get("times", []), key=lambda time: time["ms_per_frame"], default=None),
+        quality=list(_quality(card.get("quality") or {})),
+        fastest=fastest_time(card),
         training=card["training"],
         constraints=_constraints(card),
         stress=_stress,
+        ratio=_ratio,
         digits=lambda value: f"{value:.3g}",
         memory=lambda megabytes: "" if megabytes is None else f", {megabytes:.3g} MB",
         duration=lambda seconds: f"{seconds / 3600:.1f} hours" if seconds >= 3600 else f"{seconds / 60:.1f} minutes",
@@ -125,14 +117,11 @@ def _error_rows(card: Mapping[str, Any], unit: Unit) -> Iterator[tuple[str, list
             yield label, cells(test, f"{kind}/")
 
 
-def _scene_count(card: Mapping[str, Any]) -> str:
-    count = card["test_scenes"]
-    return "one test scene" if count == 1 else f"{count} test scenes"
-
-
-def _quality(quality: Mapping[str, Any], name: str) -> str:
-    (label, factor, unit), (mean, low, high) = QUALITY[name], quality[name]
-    return f"{label} {factor * mean:.3g} ({factor * low:.3g} – {factor * high:.3g}){unit}"
+def _quality(quality: Mapping[str, Any]) -> Iterator[str]:
+    for name, (label, factor, unit) in QUALITY.items():
+        if name in quality:
+            mean, low, high = (factor * value for value in quality[name])
+            yield f"{label} {mean:.3g} ({low:.3g} – {high:.3g}){unit}"
 
 
 def _constraints(card: Mapping[str, Any]) -> list[str]:
@@ -153,47 +142,68 @@ def _stress(digest: Mapping[str, Any] | None) -> str:
     return f"{digest['passed']} of {total} pass, {digest['size']}{f' (failed: {failed})' if failed else ''}"
 
 
-def write_index(root: Path, names: Sequence[str]) -> Path:
-    """Write the table of a zoo's models, `README.md` in its folder; entries with a damaged card are left out."""
+def index_page(root: Path, names: Sequence[str]) -> str:
+    """The page of a zoo's models, as Markdown; entries with a damaged card are left out."""
     entries = []
     for name in names:
         try:
-            card = read_card(root / name)
-            recipe = read_recipe(read_yaml(root / name / CONFIG))
-            times = "; ".join(f"{time:.2g} ({hardware})" for hardware, time in stated_milliseconds(card).items())
-            entries.append((table_row({**card, "name": name}), times, _scene_cells(card, recipe)))
+            card, recipe = read_card(root / name), read_recipe(read_yaml(root / name / CONFIG))
+            entries.append((name, lifecycle(card), _figure_cells(card), _scene_cells(card, recipe)))
         except (ZooError, DataError, *MALFORMED):
             continue
-    text = _TEMPLATES.get_template("index.md").render(
-        entries=entries,
-        factor=f"{FACTOR:g}",
-        thousandths=lambda value: "" if value is None else f"{1e3 * value:.3g}",
-    )
-    with atomic_write(root / "README.md") as part:
-        part.write_text(text, encoding="utf-8")
-    return root / "README.md"
+    picture = TRADE if (root / TRADE).is_file() else None
+    return _TEMPLATES.get_template("index.md").render(entries=entries, factor=f"{FACTOR:g}", picture=picture)
+
+
+def _figure_cells(card: Mapping[str, Any]) -> list[str]:
+    """Errors, times, speed-up and hours of training."""
+    test, twin, trade = card["test"], card.get("twin"), card.get("trade") or {}
+    low, high = (card.get("interval") or {}).get("mse", (None, None))
+    between = "" if low is None else f" ({_thousandths(low)} – {_thousandths(high)})"
+    simulator = "" if twin is None else _thousandths(twin["mse"])
+    if twin is not None and abs(twin["substeps"] - twin["own_substeps"] / 2) > 0.5:
+        simulator += f" ({twin['substeps']} of {twin['own_substeps']})"
+    plain = stated_milliseconds(card)
+    plain |= {time["hardware"]: time["ms_per_frame"] for time in trade.get("times", []) if time["runtime"] == PLAIN}
+    fastest = fastest_time(card)
+    return [
+        _thousandths(test.get("mse@100")),
+        _thousandths(test["mse"]) + between,
+        simulator,
+        _thousandths(trivial_error(card)),
+        "; ".join(_time(time, hardware) for hardware, time in plain.items()),
+        "" if fastest is None else _time(fastest["ms_per_frame"], f"{fastest['runtime']}, {fastest['hardware']}"),
+        _ratio(trade["speed_up"]) if "speed_up" in trade else "",
+        f"{card['training']['seconds'] / 3600:.1f} h",
+    ]
+
+
+def _thousandths(value: float | None) -> str:
+    return "" if value is None else Unit(-3).show(value, 3)
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _time(milliseconds: float, where: str) -> str:
+    return f"{milliseconds:.2g} ({where.removesuffix(', 1 thread')})"
 
 
 def _scene_cells(card: Mapping[str, Any], recipe: EmulatorRecipe) -> list[str]:
     scene = recipe.scene
+    known = "unknown" if scene.gravity is None else "(" + ", ".join(f"{value:.3g}" for value in scene.gravity) + ")"
     return [
+        str(card.get("dataset", "")),
         ", ".join(scene.materials),
         " × ".join(f"{high - low:.3g}" for low, high in scene.bounds),
         str(card.get("particles", "")),
         f"{1e3 * scene.dt:.3g}",
-        _gravity(scene),
+        "any" if scene.gravity_varies else known,
         "yes" if scene.obstacles else "no",
         " × ".join(str(count) for count in recipe.grid.shape),
         str(recipe.frames),
     ]
-
-
-def _gravity(scene: Scene) -> str:
-    if scene.gravity_varies:
-        return "any"
-    if scene.gravity is None:
-        return "unknown"
-    return "(" + ", ".join(f"{value:.3g}" for value in scene.gravity) + ")"
 
 
 def draw_chart(folder: Path, name: str) -> Figure | None:

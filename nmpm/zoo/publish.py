@@ -25,10 +25,9 @@ from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.card import CARD, FORMAT, intervals, stress_digest
 from nmpm.zoo.entries import BEST, CONFIG, SCENES, WEIGHTS
-from nmpm.zoo.pages import write_index
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.refresh import write_card, writing
-from nmpm.zoo.registry import Zoo, check_name
+from nmpm.zoo.refresh import write_card, write_index, writing
+from nmpm.zoo.registry import check_name
 from nmpm.zoo.verification import golden_distance, golden_rollout
 
 STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
@@ -73,7 +72,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
     try:
         rows = figures["per_trajectory"]["model"]
         card = _card(name, about, figures, rows, emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
-        card |= {key: stress_digest(content) for key, content in stress.items()}
+        card |= {key: stress_digest(content["size"], content["lines"]) for key, content in stress.items()}
     except (KeyError, TypeError) as error:
         raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -93,7 +92,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
             write_card(new, card)
             for variant in target.glob(f"*/{CARD}"):  # they lie within it
                 shutil.copytree(variant.parent, new / variant.parent.name)
-        write_index(zoo, Zoo.list(zoo))
+        write_index(zoo)
     except OSError as error:
         raise ZooError(f"{target} cannot be written: {error.strerror or error}.") from error
     return target

@@ -20,25 +20,23 @@ from nmpm.zoo.entries import load_entry, read_card
 from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts
 from nmpm.zoo.measures.simulator import floor_facts, twin_facts
 from nmpm.zoo.measures.speed import speed_facts
-from nmpm.zoo.pages import CHART, MALFORMED, draw_chart, entry_page
+from nmpm.zoo.pages import CHART, MALFORMED, draw_chart, entry_page, index_page
 from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.registry import Zoo
 
-Measure = Callable[[Pretrained, Path, Path | None], dict[str, Any]]
-
-MEASURES: Mapping[str, Measure] = MappingProxyType(
+MEASURES: Mapping[str, Callable[[Pretrained, Path, Path | None], dict[str, Any]]] = MappingProxyType(
     {
-        "speed": speed_facts,
+        "speed": lambda model, folder, _: speed_facts(model, folder),
         "quality": quality_facts,
-        "twin": twin_facts,
-        "floor": floor_facts,
-        "stress": stress_facts,
-        "invariants": invariant_facts,
+        "twin": lambda model, _, data: twin_facts(model, data),
+        "floor": lambda model, _, data: floor_facts(model, data),
+        "stress": lambda model, *_: stress_facts(model),
+        "invariants": lambda model, *_: invariant_facts(model),
     }
 )
-"""What `nmpm zoo refresh --measure` adds to cards.
+"""What `nmpm zoo refresh --measure` adds to cards, of a model, its entry's folder and the folder of its data or None.
 
-A measure takes a model, its entry's folder and the folder of its data, or None to simulate its test scenes from their
-seeds; it returns the keys of the card that it replaces, and may write pictures into the entry's folder.
+Each gives the keys of the card that it replaces, and may write pictures into the entry's folder.
 """
 
 
@@ -110,21 +108,28 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
     """
     try:
         check_plain(card, folder / CARD)
+        chart = draw_chart(folder, card["name"])
+        page = entry_page(card, [path.name for path in folder.iterdir()] + [CHART] * (chart is not None))
     except DataError as error:
         raise ZooError(str(error)) from error
-    try:
-        chart = draw_chart(folder, card["name"])
-        pictures = {path.name for path in folder.iterdir()} | ({CHART} if chart else set())
-        page = entry_page(card, pictures)
     except MALFORMED as error:
         raise ZooError(
             f"{folder / CARD} or a table beside it is not complete ({type(error).__name__}: {one_line(error)})."
             " `nmpm zoo card NAME --yaml` shows what the card has; `nmpm zoo add` writes a new one from the run."
         ) from error
-    with atomic_write(folder / CARD) as part:
-        part.write_text(to_yaml(card), encoding="utf-8")
+    _write(folder / CARD, to_yaml(card))
     if chart is not None:
         with atomic_write(folder / CHART) as part:
             chart.savefig(part, format="png")
-    with atomic_write(folder / "README.md") as part:
-        part.write_text(page, encoding="utf-8")
+    _write(folder / "README.md", page)
+
+
+def write_index(root: Path) -> Path:
+    """Write the page of a zoo's models, `README.md` in its folder."""
+    _write(root / "README.md", index_page(root, Zoo.list(root)))
+    return root / "README.md"
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_write(path) as part:
+        part.write_text(text, encoding="utf-8")

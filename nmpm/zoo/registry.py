@@ -24,8 +24,8 @@ from nmpm._support.devices import device_name, find_device
 from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
-from nmpm.zoo.card import CARD
-from nmpm.zoo.choice import Limits, choose, stated_milliseconds
+from nmpm.zoo.card import CARD, stated_milliseconds
+from nmpm.zoo.choice import Limits, choose
 from nmpm.zoo.entries import BEST, load_checkpoint, load_entry, read_card
 from nmpm.zoo.hub import HubId, download
 from nmpm.zoo.measures.speed import measure_speed

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from torch import Tensor
 
 from nmpm._support.messages import one_line
 from nmpm._support.numbers import is_number
-from nmpm._support.progress import progress_bar
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.emulator import Emulator, rollout
 from nmpm.errors import ZooError
@@ -99,11 +97,8 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
     yield Check("golden rollout, largest distance in cells", 0.0, distance, 0.0, TOLERANCE)
     yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
-    errors = []
-    with progress_bar(f"Verifying {model.name}", count) as step:
-        for window in islice(iterate_test_scenes(model, frames, data), count):
-            errors.append(_errors(model, window))
-            step()
+    windows = iterate_test_scenes(f"Verifying {model.name}", model, data, count, frames)
+    errors = [_errors(model, window) for window in windows]
     checks = list(_means(rows, errors) if full else _scenes(rows, errors))
     if not checks:
         more = "" if full else "; --full measures the whole scenes"

@@ -16,10 +16,10 @@ from nmpm.sim import load_preset
 from nmpm.sim.predictability import nudge, twin_of
 from nmpm.zoo import Zoo, load_model
 from nmpm.zoo import refresh as module
-from nmpm.zoo.card import lifecycle, table_row
+from nmpm.zoo.card import lifecycle, stated_milliseconds
 from nmpm.zoo.measures import simulator
 from nmpm.zoo.measures.simulator import NUDGE, floor_facts, twin_facts
-from nmpm.zoo.pages import entry_page, write_index
+from nmpm.zoo.pages import entry_page, index_page
 from nmpm.zoo.refresh import add_facts, refresh
 
 SHIPPED = shipped_folder("zoo")
@@ -95,7 +95,7 @@ def test_scenes_that_are_unstable_are_named(goop, monkeypatch):
     assert "Test scenes 0, which this makes unstable, are left out." in (goop / "README.md").read_text()
     monkeypatch.setattr(simulator, "nudge", nudge_all_but(set()))
     with pytest.raises(UnstableError, match="all test scenes of goop unstable"):
-        floor_facts(model, goop, None)
+        floor_facts(model, None)
 
     class Unstable:
         substeps = 3
@@ -105,7 +105,7 @@ def test_scenes_that_are_unstable_are_named(goop, monkeypatch):
 
     monkeypatch.setattr(simulator, "twin_of", lambda preset: Unstable())
     with pytest.raises(UnstableError, match=r"With 3 substeps test scenes \[0, 1\] are unstable: goop has no twin"):
-        twin_facts(model, goop, None)
+        twin_facts(model, None)
 
 
 def test_a_twin_has_half_the_substeps_where_that_is_stable_and_the_data_are_simulated(goop):
@@ -117,7 +117,7 @@ def test_a_twin_has_half_the_substeps_where_that_is_stable_and_the_data_are_simu
     for simulation in (card["simulation"] | {"revision": -1}, None):
         add_facts(goop, card["sha256"], {"simulation": simulation})
         with pytest.raises(ConfigError, match=r"revision -1|recorded data"):
-            twin_facts(load_model(goop), goop, None)
+            twin_facts(load_model(goop), None)
 
 
 @pytest.mark.parametrize("measure", ["stress", "invariants"])
@@ -249,23 +249,29 @@ def test_the_table_of_a_zoo_names_every_model_whose_card_can_be_read(entry, smal
     (entry.parent / "broken" / "card.yaml").write_text("{")
     (entry / "errors.csv").write_text("frame,model,still,free_fall\n1,0.1,0.2,0.3\n2,0.2,0.3,0.4\n")
     assert main(["zoo", "refresh", "small", "--root", str(entry.parent)]) == 0
-    text = write_index(entry.parent, Zoo.list(entry.parent)).read_text()
-    assert "| [small](small/README.md) | made up | 10 | 100 (50 – 150) |  |  | 1e+03 | 2.0 h |" in text
+    text = (entry.parent / "README.md").read_text()
+    assert "| [small](small/README.md) | 10 | 100 (50 – 150) |  | 1000 |  |  |  | 2.0 h |" in text
     assert "odd" not in text
     assert "broken" not in text
     assert "![errors over frames and over training](chart.png)" in (entry / "README.md").read_text()
 
 
 @pytest.mark.parametrize("name", Zoo.list(SHIPPED))
-def test_shipped_cards_are_short_and_make_rows_of_the_table(name):
-    row = table_row(Zoo.card(name, SHIPPED))
-    assert 0 < row.mse_100 < row.mse < row.trivial
-    assert row.interval[0] < row.mse < row.interval[1]
-    assert row.milliseconds["AMD EPYC, 1 thread"] > 0
-    assert (row.twins is None) == (name == "waterdrop")
+def test_shipped_cards_are_short_and_their_pages_are_made_of_them(name):
+    card = Zoo.card(name, SHIPPED)
+    assert stated_milliseconds(card)["AMD EPYC, 1 thread"] > 0
+    assert ("twin" not in card) == (name == "waterdrop")
     assert len((SHIPPED / name / "card.yaml").read_text().splitlines()) <= 120
-    page = entry_page(Zoo.card(name, SHIPPED), [path.name for path in (SHIPPED / name).iterdir()])
+    page = entry_page(card, [path.name for path in (SHIPPED / name).iterdir()])
     assert (SHIPPED / name / "README.md").read_text() == page
+
+
+def test_the_page_of_the_shipped_zoo_is_made_of_its_cards():
+    page = (SHIPPED / "README.md").read_text()
+    assert page == index_page(SHIPPED, Zoo.list(SHIPPED))
+    assert "| 0.14 (openvino bfloat16, Intel(R) Xeon(R) Processor) | 4.9 | 5.0 h |" in page
+    assert "(../benchmarks/trade/goop/trade.png)" in page
+    assert len([word for line in page.splitlines() if not line.startswith("|") for word in line.split()]) < 400
 
 
 @pytest.mark.parametrize(

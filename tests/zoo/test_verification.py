@@ -113,7 +113,7 @@ def test_malformed_tables_of_scenes_are_not_confirmed(root, text):
 
 def test_a_folder_with_other_test_scenes_than_the_cards_is_refused(make_dataset):
     with pytest.raises(ConfigError, match="has other test scenes than the card of goop is of"):
-        next(iterate_test_scenes(Zoo.load("goop", SHIPPED), 10, make_dataset()))
+        next(iterate_test_scenes("x", Zoo.load("goop", SHIPPED), make_dataset(), frames=10))
 
 
 @pytest.mark.slow

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +13,11 @@ from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
 from nmpm.evaluation.stress import GROUPS, QUICK, ModelUnderTest, TestResult, battery
-from nmpm.evaluation.stress.results import as_json
 from nmpm.particles import Window
-from nmpm.sim import Preset, load_preset, preset_names
+from nmpm.sim import load_preset, preset_names
 from nmpm.viz import write_snapshots
 from nmpm.zoo.card import stress_digest
-from nmpm.zoo.measures.scenes import track_test_scenes
+from nmpm.zoo.measures.scenes import iterate_test_scenes
 from nmpm.zoo.pretrained import Pretrained
 
 FIRST, WORST = "rollout.png", "worst.png"
@@ -38,8 +35,8 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     """
     rows: list[dict[str, float]] = []
     worst: tuple[Window, Tensor] | None = None
-    for window in track_test_scenes("quality", model, data):
-        predicted = model.rollout(window.initial.to(model.emulator.device), window.target.shape[1]).cpu()
+    for window in iterate_test_scenes(f"quality of {model.name}", model, data):
+        predicted = model.rollout(window.initial, window.target.shape[1]).cpu()
         rows.append(measure_errors(model.scene, window, predicted, Measures((), EMD_FRAMES)))
         if len(rows) == 1:
             write_snapshots(labelled_trajectories(model.scene, window, predicted), folder / FIRST)
@@ -48,44 +45,38 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     if worst is not None:
         title = f"{model.name}: the test scene with the largest error"
         write_snapshots(labelled_trajectories(model.scene, *worst, title), folder / WORST)
-    names = [name for name in rows[0] if name != "mse" and all(name in row for row in rows)]
+    quality: dict[str, Any] = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows if name in row]
+        if name != "mse" and len(values) == len(rows):
+            quality[name] = [float(np.mean(values)), *interval(values)]
     index = int(np.argmax([row["mse"] for row in rows]))
-    means = {name: float(np.mean([row[name] for row in rows])) for name in names}
-    quality: dict[str, Any] = {name: [mean, *interval([row[name] for row in rows])] for name, mean in means.items()}
     return {"quality": quality | {"worst": {"scene": index, "mse": rows[index]["mse"]}}}
 
 
-def stress_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
+def stress_facts(model: Pretrained) -> dict[str, Any]:
     """The keys `stress` and `stress_free` of a card, see `nmpm stress`; takes minutes, for SPH more than an hour."""
-    return _stress(model, load_preset(model.preset) if model.preset in preset_names() else None, "quick")
+    preset = load_preset(model.preset) if model.preset in preset_names() else None
+    return _stress(ModelUnderTest(model.name, model.emulator, model.horizon, preset, 0), "quick")
 
 
-def invariant_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
+def invariant_facts(model: Pretrained) -> dict[str, Any]:
     """The same keys from tests of invariants alone, without the simulator: from a thrown block, in minutes."""
-    return _stress(model, None, "quick, without the simulator")
+    tested = ModelUnderTest(model.name, model.emulator, model.horizon, None, 0)
+    return _stress(tested, "quick, without the simulator")
 
 
-def _stress(model: Pretrained, preset: Preset | None, size: str) -> dict[str, Any]:
-    constrained = ModelUnderTest(model.name, model.emulator, model.horizon, preset, 0)
-    free = constrained.with_emulator(model.emulator.unconstrained())
-    others = [name for name in GROUPS if name != _SETTLING]
-    with progress_bar(f"stress of {model.name}", len(GROUPS) + len(others)) as advance:
-        results = _run_groups(constrained, GROUPS, advance)
-        # The last result of this group is the one without constraints; its simulations are most of the battery's time.
-        free_results = _run_groups(free, others, advance) | {_SETTLING: results[_SETTLING][-1:]}
-    return {"stress": _digest(model, results, size), "stress_free": _digest(model, free_results, size)}
-
-
-def _run_groups(
-    model: ModelUnderTest, names: Iterable[str], advance: Callable[[], object]
-) -> dict[str, list[TestResult]]:
-    results = {}
-    for name in names:
-        results[name] = list(battery(model, QUICK, {name: GROUPS[name]}))
-        advance()
-    return results
-
-
-def _digest(model: Pretrained, results: dict[str, list[TestResult]], size: str) -> dict[str, Any]:
-    ordered = [result for name in GROUPS for result in results[name]]
-    return stress_digest(json.loads(as_json(model.name, size, 0.0, ordered)))
+def _stress(model: ModelUnderTest, size: str) -> dict[str, Any]:
+    free = model.with_emulator(model.emulator.unconstrained())
+    results: list[TestResult] = []
+    free_results: list[TestResult] = []
+    with progress_bar(f"stress of {model.name}", len(GROUPS)) as advance:
+        for name, group in GROUPS.items():
+            results += battery(model, QUICK, {name: group})
+            # The last result of settling is without constraints; simulating it again would take most of the time.
+            free_results += results[-1:] if name == _SETTLING else battery(free, QUICK, {name: group})
+            advance()
+    return {
+        "stress": stress_digest(size, map(vars, results)),
+        "stress_free": stress_digest(size, map(vars, free_results)),
+    }

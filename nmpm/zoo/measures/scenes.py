@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,44 +13,62 @@ from nmpm.data.format import Split, Trajectory, find_split, read_metadata
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import RecordingReader, SplitRecordings
+from nmpm.data.loading.recording import Recording, RecordingReader, SplitRecordings
 from nmpm.data.simulation_request import SimulationRequest, same_test_scenes
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
-from nmpm.sim import Preset, preset_from_dict
+from nmpm.sim import Preset, SimulatedTrajectory, preset_from_dict
 from nmpm.zoo.pretrained import Pretrained
 
 
-def iterate_test_scenes(model: Pretrained, frames: int | None, data: Path | None) -> Iterator[Window]:
-    """The test scenes in the order of the card, one at a time, with so many frames to predict; all where None.
+def iterate_test_scenes(
+    what: str, model: Pretrained, data: Path | None, count: int | None = None, frames: int | None = None
+) -> Iterator[Window]:
+    """The first test scenes in the order of the card, one at a time, with a progress bar.
+
+    Args:
+        what: Is done with them, for the progress bar.
+        model: Whose scenes they are.
+        data: Folder of the dataset; simulated scenes need none.
+        count: Number of scenes; all when left out.
+        frames: Frames to predict; all when left out.
 
     Raises:
         ConfigError: if they cannot be had: recorded data without `data`, simulated by another revision, or `data` with
             other test scenes than the card's.
         DataError: if the data cannot be read.
     """
-    if data is not None:
-        split, metadata = Split(find_split(data, "test")), read_metadata(data, "deepmind")
-        _check_same_scenes(model, metadata.extra.get("simulation"), data)
-        for window in EvaluationLoader(SplitRecordings(split, metadata, model.scene), 1):
-            yield window if frames is None else window.first(frames + 2)
-        return
-    preset, request = simulation_of(model)
-    shorter = preset if frames is None else preset.with_frames(frames + 1)
-    reader = RecordingReader(preset_metadata(preset), model.scene)
-    for index in range(request.counts["test"]):
-        seed = request.trajectory_seed("test", index)
-        run = shorter.simulate(seed)
-        stored = Trajectory(run.position, run.particle_type, run.attributes)
-        yield collate([reader.recording(stored, f"{preset.name}, seed {seed}")], model.scene)
-
-
-def track_test_scenes(what: str, model: Pretrained, data: Path | None) -> Iterator[Window]:
-    """All of `iterate_test_scenes` whole, with a progress bar that says what is done with them."""
-    with progress_bar(f"{what} of {model.name}", int(model.card["test_scenes"])) as advance:
-        for window in iterate_test_scenes(model, None, data):
+    windows = _simulate(model, frames) if data is None else _read(model, frames, data)
+    with progress_bar(what, count or int(model.card["test_scenes"])) as advance:
+        for window in islice(windows, count):
             yield window
             advance()
+
+
+def _read(model: Pretrained, frames: int | None, data: Path) -> Iterator[Window]:
+    split, metadata = Split(find_split(data, "test")), read_metadata(data, "deepmind")
+    stated, simulated = model.card.get("simulation"), metadata.extra.get("simulation")
+    if isinstance(stated, Mapping) and not (isinstance(simulated, Mapping) and same_test_scenes(stated, simulated)):
+        raise ConfigError(
+            f"{data} has other test scenes than the card of {model.name} is of: other scenes, seeds, revision of the"
+            " simulator or number. Without a folder they are simulated."
+        )
+    for window in EvaluationLoader(SplitRecordings(split, metadata, model.scene), 1):
+        yield window if frames is None else window.first(frames + 2)
+
+
+def _simulate(model: Pretrained, frames: int | None) -> Iterator[Window]:
+    preset, request = simulation_of(model)
+    shorter = preset if frames is None else preset.with_frames(frames + 1)
+    for index in range(request.counts["test"]):
+        seed = request.trajectory_seed("test", index)
+        yield collate([as_recording(model, preset, shorter.simulate(seed), seed)], model.scene)
+
+
+def as_recording(model: Pretrained, preset: Preset, run: SimulatedTrajectory, seed: int) -> Recording:
+    """A simulated trajectory as a recording of the model's scene."""
+    stored = Trajectory(run.position, run.particle_type, run.attributes)
+    return RecordingReader(preset_metadata(preset), model.scene).recording(stored, f"{preset.name}, seed {seed}")
 
 
 def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
@@ -73,19 +92,3 @@ def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
             f" {preset.revision} and gives other trajectories."
         )
     return preset, request
-
-
-def _check_same_scenes(model: Pretrained, simulated: object, data: Path) -> None:
-    """Compare how a folder's data were simulated with what a model's card states; recorded data have neither.
-
-    Raises:
-        ConfigError: if the test scenes differ.
-    """
-    stated = model.card.get("simulation")
-    if not isinstance(stated, Mapping):
-        return
-    if not isinstance(simulated, Mapping) or not same_test_scenes(stated, simulated):
-        raise ConfigError(
-            f"{data} has other test scenes than the card of {model.name} is of: other scenes, seeds, revision of the"
-            " simulator or number. Without a folder they are simulated."
-        )

@@ -21,7 +21,7 @@ REPETITIONS = 5
 PARTICLES = 1000
 
 
-def speed_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[str, Any]:  # noqa: ARG001
+def speed_facts(model: Pretrained, folder: Path) -> dict[str, Any]:
     """The key `speed` of a card: what `measure_speed` returns, and what the card states of other hardware by then."""
     measured = measure_speed(model)
     others = [time for time in read_card(folder).get("speed") or [] if time["hardware"] != measured["hardware"]]
@@ -57,8 +57,7 @@ def thrown_scene(model: Pretrained) -> Particles:
     stated = model.card.get("particles", PARTICLES)
     if not isinstance(stated, int) or isinstance(stated, bool) or stated < 1:
         raise ZooError(f"{model.name}: particles of its card should be their number, not {one_line(repr(stated), 60)}.")
-    count = model.fitting_count(stated)
-    return model.example(count=count).to(model.emulator.device)
+    return model.example(count=model.fitting_count(stated)).to(model.emulator.device)
 
 
 def repeat_scene(state: Particles, batch: int) -> Particles:
