@@ -5,7 +5,7 @@ import pytest
 from nmpm.cli import main
 from nmpm.data.format import read_metadata
 from tests.data.convert import records
-from tests.data.convert.test_deepmind import METADATA, made
+from tests.data.convert.records import METADATA, made
 
 
 @pytest.fixture

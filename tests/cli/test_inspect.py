@@ -8,7 +8,7 @@ from nmpm.cli import main
 from nmpm.data.convert.cache import native_folder
 from nmpm.errors import DataError
 from tests.data.convert import records
-from tests.data.convert.test_deepmind import METADATA, made
+from tests.data.convert.records import METADATA, made
 
 
 @pytest.fixture

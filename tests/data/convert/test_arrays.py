@@ -7,15 +7,11 @@ from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 
 SCENE = nmpm.Scene(
-    bounds=((0.0, 1.0), (0.0, 0.5)),
-    domain=((-0.05, 1.05), (-0.05, 0.55)),
-    dt=0.01,
-    materials=("honey", "milk"),
-    particle_volume=1e-4,
-    gravity=(0.0, -9.81),
-    obstacles=True,
-)
+    ((0.0, 1.0), (0.0, 0.5)), ((-0.05, 1.05), (-0.05, 0.55)), 0.01, ("honey", "milk"), 1e-4,
+    gravity=(0.0, -9.81), obstacles=True,
+)  # fmt: skip
 ONE = nmpm.Scene(((0.0, 1.0),) * 2, ((-0.1, 1.1),) * 2, 0.01, ("honey",), 1e-4)
+TYPES = np.array([0, 0, 1, 1, 2])
 
 
 def runs(number: int = 2, frames: int = 7) -> list[nmpm.Trajectory]:
@@ -24,9 +20,7 @@ def runs(number: int = 2, frames: int = 7) -> list[nmpm.Trajectory]:
     for i in range(number):
         position = np.repeat(rng.uniform(0.1, 0.4, (1, 5, 2)), frames, axis=0)
         position[:, :4, 0] += 0.01 * np.arange(frames)[:, None]
-        made.append(
-            nmpm.Trajectory(position, np.array([0, 0, 1, 1, 2]), {"seed": i}, {"heat": rng.random((frames, 5))})
-        )
+        made.append(nmpm.Trajectory(position, TYPES, {"seed": i}, {"heat": rng.random((frames, 5))}))
     return made
 
 
@@ -54,32 +48,30 @@ def test_bare_arrays_suffice_for_one_material(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("position", "types", "message"),
     [
-        (lambda p, t: (p + 1, t), r"trajectory 0, frame 0: particle \d is at .* outside the domain"),
-        (lambda p, t: (p, t + 1), r"has particle types \[1, 2, 3\]; the scene has 0 honey, 1 milk, 2 boundary"),
-        (lambda p, t: (p[..., :1], t), "has 1 axes, the scene has 2"),
+        (runs()[0].position + 1, TYPES, r"trajectory 0, frame 0: particle \d is at .* outside the domain"),
+        (runs()[0].position, TYPES + 1, r"has particle types \[1, 2, 3\]; the scene has 0 honey, 1 milk, 2 boundary"),
+        (runs()[0].position[..., :1], TYPES, "has 1 axes, the scene has 2"),
     ],
+    ids=["position", "types", "axes"],
 )
-def test_trajectories_that_do_not_fit_the_scene_are_refused_and_nothing_is_written(tmp_path, change, message):
-    wrong = nmpm.Trajectory(*change(runs()[0].position, runs()[0].particle_type))
+def test_trajectories_that_do_not_fit_the_scene_are_refused_and_nothing_is_written(tmp_path, position, types, message):
     with pytest.raises(DataError, match=message):
-        nmpm.write_trajectories(tmp_path / "train.h5", [wrong], SCENE)
+        nmpm.write_trajectories(tmp_path / "train.h5", [nmpm.Trajectory(position, types)], SCENE)
     assert not list(tmp_path.iterdir())
 
 
 def test_swapped_axes_are_refused(tmp_path):
-    position = runs()[0].position
+    position, types = runs()[0].position, np.zeros(5, int)
     with pytest.raises(DataError, match=r"7 particles but particle_type has 5\. Are its axes swapped\?.*swapaxes"):
-        nmpm.Trajectory(position.swapaxes(0, 1), np.zeros(5, int))
+        nmpm.Trajectory(position.swapaxes(0, 1), types)
     for bare in (position, position[:5], position[:1]):
         nmpm.write_trajectories(tmp_path / "right" / "train.h5", [bare], ONE)
-    for bare in (position, position[:5]):
+    square = position[:5].swapaxes(0, 1)
+    for swapped in (position.swapaxes(0, 1), square, nmpm.Trajectory(square, types)):
         with pytest.raises(DataError, match=r"trajectory 0: the axes of positions \(5, \d, 2\) look swapped.*swapaxes"):
-            nmpm.write_trajectories(tmp_path / "train.h5", [bare.swapaxes(0, 1)], ONE)
-    square = nmpm.Trajectory(position[:5].swapaxes(0, 1), np.zeros(5, int))
-    with pytest.raises(DataError, match="look swapped"):
-        nmpm.write_trajectories(tmp_path / "train.h5", [square], ONE)
+            nmpm.write_trajectories(tmp_path / "train.h5", [swapped], ONE)
 
 
 def test_splits_of_different_scenes_do_not_mix(tmp_path):

@@ -1,8 +1,5 @@
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import h5py
@@ -21,11 +18,6 @@ def source_of(*trajectories: Trajectory, **changes) -> ForeignDataset:
     return ForeignDataset(made_up_metadata(**changes), {"train": Rereadable(lambda: iter(trajectories))})
 
 
-def broken():
-    yield made_up_trajectory(5, 3)
-    raise DataError("the second is damaged.")
-
-
 def test_an_existing_destination_is_not_overwritten(tmp_path):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "precious.txt").write_text("mine")
@@ -35,6 +27,10 @@ def test_an_existing_destination_is_not_overwritten(tmp_path):
 
 
 def test_an_error_leaves_no_files_or_is_collected(tmp_path):
+    def broken():
+        yield made_up_trajectory(5, 3)
+        raise DataError("the second is damaged.")
+
     source = ForeignDataset(made_up_metadata(), {"train": Rereadable(broken)})
     with pytest.raises(DataError, match="second is damaged"):
         write_native(source, tmp_path / "out")
@@ -45,26 +41,23 @@ def test_an_error_leaves_no_files_or_is_collected(tmp_path):
     assert len(Split(tmp_path / "out" / "train.h5")) == 1
 
 
-def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_removes_its_files(tmp_path):
-    script = f"""
-import sys, time
-sys.path.insert(0, {str(Path.cwd())!r})
+KILLED = """
+import os, signal, sys
 from pathlib import Path
 from nmpm.data.convert import ForeignDataset, Rereadable
 from nmpm.data.convert.conversion import write_native
 from tests.made_up import made_up_metadata, made_up_trajectory
-def slow():
+def killed():
     yield made_up_trajectory(5, 3)
-    print("begun", flush=True)
-    time.sleep(60)
-write_native(ForeignDataset(made_up_metadata(), {{"train": Rereadable(slow)}}), Path({str(tmp_path / "out")!r}))
+    os.kill(os.getpid(), signal.SIGKILL)
+write_native(ForeignDataset(made_up_metadata(), {"train": Rereadable(killed)}), Path(sys.argv[1]))
 """
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"begun\n"
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    time.sleep(0.1)
+
+
+def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_removes_its_files(tmp_path):
+    folder = Path(__file__).parents[3]
+    assert subprocess.run([sys.executable, "-c", KILLED, tmp_path / "out"], cwd=folder, check=False).returncode < 0
+    assert list(tmp_path.iterdir())
     assert not (tmp_path / "out").exists()
     write_native(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
     assert [item.name for item in tmp_path.iterdir()] == ["out"]
@@ -101,29 +94,22 @@ def test_unknown_types_and_formats_are_refused_with_a_suggestion(tmp_path):
         convert(tmp_path, tmp_path / "out", "tf")
 
 
-def test_stated_options_enter_the_metadata(make_dataset, tmp_path):
-    folder = make_dataset(statics=1)
-    convert(folder, tmp_path / "out", options=Options(types={7: "honey"}, gravity=(0.0, -1.0), dt=0.5))
-    metadata = read_metadata(tmp_path / "out")
-    assert metadata.particle_types == {3: "boundary", 7: "honey"}
-    assert (metadata.dt, metadata.gravity) == (0.5, (0.0, -1.0))
-    for name in ("train", "valid", "test"):
-        old, new = Split(folder / f"{name}.h5"), Split(tmp_path / "out" / f"{name}.h5")
-        for index in range(len(old)):
-            np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
-
-
-def test_types_are_renumbered_and_none_is_lost(make_dataset, tmp_path):
+def test_stated_options_enter_the_metadata_and_types_are_renumbered(make_dataset, tmp_path):
     folder = make_dataset(statics=2)
     for ids, message in (({5: 0}, "no particle type 5"), ({7: 0, 3: 0}, "the same id"), ({7: 3}, "type 3 occurs")):
         with pytest.raises(ConfigError, match=message):
             convert(folder, tmp_path / "out", ids=ids)
         assert not (tmp_path / "out").exists()
-    convert(folder, tmp_path / "out", ids={7: 0, 3: 1})
+    options = Options(types={7: "honey"}, gravity=(0.0, -1.0), dt=0.5)
+    convert(folder, tmp_path / "out", options=options, ids={7: 0, 3: 1})
     metadata = read_metadata(tmp_path / "out")
-    assert metadata.particle_types == {0: "goop", 1: "boundary"}
-    assert metadata.static_types == {1}
+    assert (metadata.particle_types, metadata.static_types) == ({0: "honey", 1: "boundary"}, {1})
+    assert (metadata.dt, metadata.gravity) == (0.5, (0.0, -1.0))
     assert Split(tmp_path / "out" / "train.h5").particle_type(0).tolist() == [0] * 5 + [1] * 2
+    for name in ("train", "valid", "test"):
+        old, new = Split(folder / f"{name}.h5"), Split(tmp_path / "out" / f"{name}.h5")
+        for index in range(len(old)):
+            np.testing.assert_array_equal(old.read(index).position, new.read(index).position)
 
 
 def test_recorded_fields_and_periodic_axes_survive(recorded, tmp_path):

@@ -1,6 +1,4 @@
-import json
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,23 +9,10 @@ from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert import records
 
-METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 4, "default_connectivity_radius": 0.015, "dim": 2,
-            "dt": 0.0025, "vel_std": [1e-3, 1e-3]}  # fmt: skip
-
-
-def made(frames: int = 5, particles: int = 4, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    position = np.random.default_rng(seed).uniform(0.2, 0.8, (frames, particles, 2)).astype(np.float32)
-    position[:, -1] = position[0, -1]
-    return position, np.array([5] * (particles - 1) + [3])
-
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    for split, number in (("train", 2), ("test", 1)):
-        rows = [records.trajectory_record(*made(seed=i), step_context=np.full((5, 6), i)) for i in range(number)]
-        records.write_records(tmp_path / "ramps" / f"{split}.tfrecord", *rows)
-    (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
-    return tmp_path / "ramps"
+def folder(tmp_path):
+    return records.write_dataset(tmp_path / "ramps")
 
 
 def test_all_values_are_converted(folder, tmp_path):
@@ -36,11 +21,11 @@ def test_all_values_are_converted(folder, tmp_path):
     split = Split(tmp_path / "native" / "train.h5")
     assert len(split) == 2
     for index in range(2):
-        position, particle_type = made(seed=index)
+        position, particle_type = records.made(seed=index)
         trajectory = split.read_with_fields(index)
         np.testing.assert_array_equal(trajectory.position, position)
         np.testing.assert_array_equal(trajectory.particle_type, particle_type)
-        np.testing.assert_array_equal(trajectory.fields["step_context"], np.full((5, 6), index))
+        np.testing.assert_array_equal(trajectory.fields["step_context"], np.full((8, 6), index))
         assert trajectory.attributes["key"] == 7
     metadata = read_metadata(tmp_path / "native")
     assert metadata.particle_types[5] == "oil"
@@ -59,8 +44,8 @@ def test_a_single_file_is_a_dataset(folder, tmp_path):
 def test_inconsistent_content_is_refused_by_name(folder, tmp_path):
     with pytest.raises(ConfigError, match=r"gravity = .* each of the data's 2 axes"):
         convert(folder, tmp_path / "native", options=Options(gravity=(0.0, 0.0, -9.81)))
-    (folder / "metadata.json").write_text(json.dumps(METADATA | {"dim": 3, "bounds": [[0, 1]] * 3}))
-    with pytest.raises(DataError, match=r"record 0: 5 frames, 4 particles: each frame needs 4 x 3 .* has 8"):
+    records.write_dataset(folder, dim=3, bounds=[[0, 1]] * 3)
+    with pytest.raises(DataError, match=r"record 0: 8 frames, 4 particles: each frame needs 4 x 3 .* has 8"):
         convert(folder, tmp_path / "native")
     payload = records.sequence_example({"key": records.integer_feature(0)}, {"place": [records.bytes_feature(b"")]})
     records.write_records(folder / "train.tfrecord", records.record(payload))
@@ -89,8 +74,7 @@ def test_recorded_sand_equals_the_pickled_rollout(recorded, tmp_path):
 def test_recorded_forces_and_a_moving_tool_are_kept(recorded, tmp_path):
     notes = convert(recorded / "mpm-excavation-3d", tmp_path / "sand")
     trajectory = Split(tmp_path / "sand" / "train.h5").read_with_fields(0)
-    assert trajectory.position.shape == (11, 26945, 3)
-    assert trajectory.fields["force"].shape == (11, 3)
+    assert (trajectory.position.shape, trajectory.fields["force"].shape) == ((11, 26945, 3), (11, 3))
     tool = trajectory.position[:, trajectory.particle_type == 3]
     assert np.abs(tool[-1] - tool[0]).max() > 1e-3
     assert any("static type move in 1 of 1" in note for note in notes)

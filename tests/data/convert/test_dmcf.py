@@ -37,10 +37,8 @@ def test_all_values_are_converted(tmp_path):
     trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
     assert trajectory.position.shape == (4, 12, 3)
     for index, frame in enumerate(made):
-        fluid = np.frombuffer(frame[b"pos"][b"data"], "<f4").reshape(5, 3)
-        np.testing.assert_array_equal(trajectory.position[index, :5], fluid)
-        velocity = np.frombuffer(frame[b"vel"][b"data"], "<f4").reshape(5, 3)
-        np.testing.assert_array_equal(trajectory.fields["vel"][index], velocity)
+        for read, key in ((trajectory.position[index, :5], b"pos"), (trajectory.fields["vel"][index], b"vel")):
+            np.testing.assert_array_equal(read, np.frombuffer(frame[key][b"data"], "<f4").reshape(5, 3))
     assert trajectory.fields["box_normals"].shape == (7, 3)
     assert trajectory.particle_type.tolist() == [0] * 5 + [1] * 7
     assert read_metadata(tmp_path / "out").gravity == (0.0, -9.81, 0.0)

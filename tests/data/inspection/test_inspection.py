@@ -16,7 +16,7 @@ from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import DataError
 from nmpm.sim import load_preset
 from tests.data.convert import records
-from tests.data.convert.test_deepmind import METADATA, made
+from tests.data.convert.records import METADATA, made
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 UNIT = {"bounds": ((0.0, 1.0),) * 2, "domain": ((0.0, 1.0),) * 2, "particle_volume": 1e-4}
