@@ -17,7 +17,7 @@ from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
-    from nmpm.data.inspection.report import Inspection, Range
+    from nmpm.data.inspection import Inspection, Range
     from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
@@ -124,7 +124,7 @@ def _dataset_of(path: Path) -> Path:
 
 def _converted(path: Path, options: Options) -> tuple[FolderSource, list[str]]:
     """A foreign dataset in the cache; a gravity that contradicts its files is left out and becomes a finding."""
-    from nmpm.data.convert.cache import native_folder
+    from nmpm.data.convert import native_folder
     from nmpm.data.loading.sources import FolderSource
 
     try:
@@ -203,16 +203,13 @@ def _rest(inspection: Inspection) -> str:
 
 
 def _draw(source: FolderSource, inspection: Inspection, path: Path) -> None:
-    import numpy as np
-
     from nmpm.data.gravity import trajectory_gravity
     from nmpm.data.inspection.reading import open_dataset
     from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
 
     data = open_dataset(source)
     metadata, scene, trajectory = data.source.metadata, data.source.scene, next(iter(data.splits.values())).read(0)
-    moving = np.isin(trajectory.particle_type, metadata.moving_types)
-    static = np.isin(trajectory.particle_type, list(metadata.static_types))
+    moving, static = metadata.is_moving(trajectory.particle_type), metadata.is_static(trajectory.particle_type)
     pictured = LabelledTrajectories(
         positions={"recorded": trajectory.position[:, moving]},
         material=material_names(trajectory.particle_type[moving], metadata.particle_types),

@@ -63,7 +63,7 @@ def add_fields(
     Raises:
         DataError: as `read_fields`.
     """
-    moving = np.isin(split.particle_type(index), metadata.moving_types)
+    moving = metadata.is_moving(split.particle_type(index))
     for name, values in read_fields(split, index, names).items():
         facts.setdefault(name, FieldFacts(values.shape)).add(values if values.shape[1] == 1 else values[:, moving])
 

@@ -151,6 +151,11 @@ class Split:
         """Number of particles, N, of a trajectory, static ones included."""
         return self._entries[index].particles
 
+    def sample(self, size: int) -> range:
+        """Indices of evenly spaced trajectories, with up to about `size` bytes of positions in all."""
+        total = sum(4 * self.frames(index) * self.particles(index) * self.dim for index in range(len(self)))
+        return range(0, len(self), max(1, -(-total // size)))
+
     def where(self, index: int) -> str:
         """File and trajectory, for error messages."""
         return f"{self.path}, trajectory {self._entries[index].name}"

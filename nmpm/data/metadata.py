@@ -87,6 +87,14 @@ class Metadata:
         names = self.particle_types
         return tuple(sorted(i for i in names if i not in self.static_types and names[i] != PADDING))
 
+    def is_moving(self, particle_type: np.ndarray) -> np.ndarray:
+        """(N,) bool, of (N,) type ids."""
+        return np.isin(particle_type, self.moving_types)
+
+    def is_static(self, particle_type: np.ndarray) -> np.ndarray:
+        """(N,) bool, of (N,) type ids."""
+        return np.isin(particle_type, list(self.static_types))
+
     def unknown_types(self, particle_type: np.ndarray) -> list[int]:
         """Ids in an array that have no name, ascending."""
         return sorted(set(np.unique(particle_type).tolist()) - set(self.particle_types))

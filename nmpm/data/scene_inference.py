@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from nmpm.data.convert.base import Options
 from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
 from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
+from nmpm.data.statistics import Extent, neighbour_distance
 from nmpm.errors import DataError
-from nmpm.scene import Interval, Scene, check_field_names
+from nmpm.scene import Interval, Scene
 
 _WALL_LAYER = 0.025  # of the extent; DeepMind's 0.1-0.9 becomes the paper's 0.08-0.92
 _SAMPLE_BYTES = 2**27
-_SPACING_TRAJECTORIES = 8
 
 
 def infer_scene(folder: Path, options: Options | None = None) -> Scene:
@@ -55,41 +52,55 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
             f"{split.path}: positions have {split.dim} dimensions, {METADATA_FILE} has dim = {metadata.dim}."
         )
     types = _types(split, metadata)
-    observed = _observe(split, metadata)
-    widened, domain = _extents(metadata, observed, folder)
+    sample = split.sample(_SAMPLE_BYTES)
+    moving, everything = Extent(metadata.dim), Extent(metadata.dim)
+    for index in sample:
+        trajectory = split.read(index)
+        moves, rests = metadata.is_moving(trajectory.particle_type), metadata.is_static(trajectory.particle_type)
+        moving.add(trajectory.position[:, moves])
+        everything.add(trajectory.position[:, moves | rests])
+    bounds, domain = _extents(metadata, moving, everything, folder)
     gravities = distinct_gravities(
         trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in range(len(split))
     )
     if options.gravity is not None:
         for other in gravities:
             check_gravity(options.gravity, other, split.path)
-    materials = _materials(types, metadata, split)
-    kinds = _kinds_of_fields(split, metadata, metadata.fields)
+    materials = tuple(dict.fromkeys(metadata.particle_types[i] for i in metadata.moving_types if i in types))
+    if not materials:
+        raise DataError(f"{split.path}: no particle has a moving type; check static_types in {METADATA_FILE}.")
+    densities = tuple(metadata.densities[name] for name in materials if name in metadata.densities)
+    kinds = _kinds_of_fields(split, sample, metadata)
+    volume = metadata.particle_volume or neighbour_distance(split, sample, metadata) ** metadata.dim
+    if volume <= 0:
+        raise DataError(
+            f"{folder / METADATA_FILE}: the volume of a particle cannot be estimated from the distances between them;"
+            ' add it, e.g. "particle_volume": 6.4e-5 (length ** dim).'
+        )
     return Scene(
-        bounds=widened,
+        bounds=bounds,
         domain=domain,
         dt=metadata.dt,
         materials=materials,
-        particle_volume=metadata.particle_volume or _volume(observed, metadata, folder),
+        particle_volume=volume,
         boundary=tuple("periodic" if flag else "wall" for flag in metadata.periodic),
         gravity=common_gravity(gravities, metadata, split),
         gravity_varies=len(gravities) > 1,
         obstacles=bool(types & metadata.static_types),
-        densities=_densities(materials, metadata),
+        densities=densities if 1 < len(densities) == len(materials) else (),
         evolving=tuple(name for name, kind in kinds.items() if kind == "evolving"),
         properties=tuple(name for name, kind in kinds.items() if kind == "property"),
         parameters=tuple(name for name, kind in kinds.items() if kind == "parameter"),
     )
 
 
-def _kinds_of_fields(split: Split, metadata: Metadata, names: Sequence[str]) -> dict[str, Kind]:
+def _kinds_of_fields(split: Split, sample: range, metadata: Metadata) -> dict[str, Kind]:
     """The kinds of the declared fields, in their order."""
-    check_field_names(names)
-    require_fields(split, names)
+    require_fields(split, metadata.fields)
     facts: dict[str, FieldFacts] = {}
-    for index in _sample(split) if names else ():
-        add_fields(facts, split, index, metadata, names)
-    return {name: facts[name].kind for name in names}
+    for index in sample if metadata.fields else ():
+        add_fields(facts, split, index, metadata, metadata.fields)
+    return {name: facts[name].kind for name in metadata.fields}
 
 
 def _types(split: Split, metadata: Metadata) -> frozenset[int]:
@@ -102,93 +113,16 @@ def _types(split: Split, metadata: Metadata) -> frozenset[int]:
     return frozenset(types)
 
 
-def _materials(types: frozenset[int], metadata: Metadata, split: Split) -> tuple[str, ...]:
-    names = [metadata.particle_types[i] for i in metadata.moving_types if i in types]
-    if not names:
-        raise DataError(f"{split.path}: no particle has a moving type; check static_types in {METADATA_FILE}.")
-    return tuple(dict.fromkeys(names))
-
-
-def _densities(materials: tuple[str, ...], metadata: Metadata) -> tuple[float, ...]:
-    """Density of each material; empty where one is unknown, or there is one material only."""
-    densities = [metadata.densities[name] for name in materials if name in metadata.densities]
-    return tuple(densities) if 1 < len(densities) == len(materials) else ()
-
-
-@dataclass(frozen=True)
-class _ObservedExtents:
-    """Extents (2, D) of the sampled moving particles and of all, and distances to the nearest neighbour."""
-
-    moving: np.ndarray
-    everything: np.ndarray
-    spacing: np.ndarray
-
-
-def _observe(split: Split, metadata: Metadata) -> _ObservedExtents:
-    sample = _sample(split)
-    measured = set(sample[:: -(-len(sample) // _SPACING_TRAJECTORIES)])
-    moving: list[list[np.ndarray]] = []
-    everything: list[list[np.ndarray]] = []
-    spacing = [np.empty(0)]
-    for index in sample:
-        trajectory = split.read(index)
-        kind = np.isin(trajectory.particle_type, metadata.moving_types)
-        present = kind | np.isin(trajectory.particle_type, list(metadata.static_types))
-        for extents, particles in ((moving, kind), (everything, present)):
-            if particles.any():
-                position = trajectory.position[:, particles]
-                extents.append([position.min(axis=(0, 1)), position.max(axis=(0, 1))])
-        if index in measured:
-            spacing.append(_spacing(trajectory.position[0, kind], metadata))
-    return _ObservedExtents(_union(moving, metadata), _union(everything, metadata), np.concatenate(spacing))
-
-
-def _sample(split: Split) -> range:
-    """Indices of evenly spaced trajectories, of so many bytes of positions in all."""
-    sizes = [4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split))]
-    return range(0, len(split), max(1, -(-sum(sizes) // _SAMPLE_BYTES)))
-
-
-def _union(extents: list[list[np.ndarray]], metadata: Metadata) -> np.ndarray:
-    if not extents:
-        return np.asarray(metadata.bounds).T
-    pairs = np.asarray(extents, dtype=np.float64)
-    return np.stack([pairs[:, 0].min(axis=0), pairs[:, 1].max(axis=0)])
-
-
-def _spacing(position: np.ndarray, metadata: Metadata) -> np.ndarray:
-    """Distance of each of (N, D) particles to its nearest neighbour, (N,)."""
-    if len(position) < 2:
-        return np.empty(0)
-    lower, upper = np.asarray(metadata.bounds).T
-    # cKDTree takes a period of 0 for an axis that is not periodic.
-    period = np.where(metadata.periodic, upper - lower, 0.0)
-    shifted = position.astype(np.float64) - lower
-    wrapped = np.where(metadata.periodic, np.mod(shifted, np.where(period > 0, period, 1.0)), shifted)
-    distance: np.ndarray = cKDTree(wrapped, boxsize=period).query(wrapped, k=2)[0][:, 1]
-    return distance
-
-
-def _volume(observed: _ObservedExtents, metadata: Metadata, folder: Path) -> float:
-    distance = float(np.median(observed.spacing)) if len(observed.spacing) else 0.0
-    if distance <= 0:
-        raise DataError(
-            f"{folder / METADATA_FILE}: the volume of a particle cannot be estimated from the distances between them;"
-            ' add it, e.g. "particle_volume": 6.4e-5 (length ** dim).'
-        )
-    return float(distance**metadata.dim)
-
-
 def _extents(
-    metadata: Metadata, observed: _ObservedExtents, folder: Path
+    metadata: Metadata, moving: Extent, everything: Extent, folder: Path
 ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Bounds and domain, (lower, upper) per axis."""
     stated = metadata.domain or (None,) * metadata.dim
     pairs = [
-        _periodic_extent(metadata.bounds[axis], stated[axis], axis, folder)
+        _periodic_extent(bounds, stated[axis], axis, folder)
         if metadata.periodic[axis]
-        else _walled_extent(metadata.bounds[axis], stated[axis], observed, axis, folder)
-        for axis in range(metadata.dim)
+        else _walled_extent(bounds, stated[axis], moving.intervals[axis], everything.intervals[axis], axis, folder)
+        for axis, bounds in enumerate(metadata.bounds)
     ]
     return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
 
@@ -204,11 +138,11 @@ def _periodic_extent(bounds: Interval, stated: Interval | None, axis: int, folde
 
 
 def _walled_extent(
-    bounds: Interval, stated: Interval | None, observed: _ObservedExtents, axis: int, folder: Path
+    bounds: Interval, stated: Interval | None, moving: Interval, everything: Interval, axis: int, folder: Path
 ) -> tuple[Interval, Interval]:
     low, high = bounds
-    seen_low, seen_high = map(float, observed.everything[:, axis])
-    widened = (min(low, float(observed.moving[0, axis])), max(high, float(observed.moving[1, axis])))
+    seen_low, seen_high = everything
+    widened = (min(low, moving[0]), max(high, moving[1]))
     if stated is not None:
         if seen_low < stated[0] or seen_high > stated[1]:
             raise DataError(

@@ -1,17 +1,89 @@
-"""Displacements of particles, and their statistics as in DeepMind's and LagrangeBench's metadata."""
+"""Statistics of trajectories: extents, distances of neighbours, displacements, and what contradicts the metadata."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.errors import DataError
 from nmpm.scene import Interval
 
 STATISTICS_KEYS = ("vel_mean", "vel_std", "acc_mean", "acc_std")
 _STILL = 1e-3  # of the extent; displacements up to it count as rest
+_SPACING_TRAJECTORIES = 8
+
+
+class Extent:
+    """Smallest and largest coordinates (D,) of the positions added so far; infinite before the first."""
+
+    def __init__(self, dim: int) -> None:
+        self.lower, self.upper = np.full(dim, np.inf), np.full(dim, -np.inf)
+
+    def add(self, position: np.ndarray) -> None:
+        """Adds (T, N, D) positions, or none."""
+        if position.size:
+            self.lower = np.minimum(self.lower, position.min(axis=(0, 1)))
+            self.upper = np.maximum(self.upper, position.max(axis=(0, 1)))
+
+    @property
+    def intervals(self) -> tuple[Interval, ...]:
+        """(lower, upper) per axis."""
+        return tuple(zip(self.lower.tolist(), self.upper.tolist(), strict=True))
+
+    def notes(self, metadata: Metadata) -> list[str]:
+        """Sentences on positions beyond the stated bounds."""
+        return [
+            f"Along {'xyz'[axis]} positions reach from {low:.4g} to {high:.4g}, beyond the stated bounds"
+            f" {list(bounds)}; the scene's domain contains them."
+            for axis, ((low, high), bounds) in enumerate(zip(self.intervals, metadata.bounds, strict=True))
+            if not metadata.periodic[axis] and (low < bounds[0] or high > bounds[1])
+        ]
+
+
+def extent_of(position: np.ndarray) -> Extent:
+    """The extent of (T, N, D) positions."""
+    extent = Extent(position.shape[2])
+    extent.add(position)
+    return extent
+
+
+def notes_on_lengths(frames: set[int], metadata: Metadata, others: Iterable[int] = ()) -> list[str]:
+    """A sentence if trajectories have other numbers of frames than the metadata's `sequence_length` or `others`."""
+    # Files often have one frame more than stated.
+    expected = {length + more for length in (metadata.sequence_length, *others) for more in (0, 1)}
+    few, many = min(frames), max(frames)
+    if frames <= expected:
+        return []
+    lengths = f"{few}" if few == many else f"{few} to {many}"
+    return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {lengths} frames."]
+
+
+def neighbour_distance(split: Split, indices: Sequence[int], metadata: Metadata) -> float:
+    """Median distance of moving particles to the nearest other one, in first frames; 0 where it is unknown.
+
+    Args:
+        split: The trajectories.
+        indices: Of some of them; at most 8, evenly spaced, are read, and those that cannot be read are left out.
+        metadata: States bounds and periodic axes.
+    """
+    distances = [np.empty(0)]
+    lower, upper = np.asarray(metadata.bounds).T
+    period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
+    for index in indices[:: -(-len(indices) // _SPACING_TRAJECTORIES)]:
+        try:
+            first = split.read(index, 0, 1)
+        except DataError:
+            continue
+        position = first.position[0, metadata.is_moving(first.particle_type)].astype(np.float64) - lower
+        if len(position) > 1:
+            wrapped = np.where(metadata.periodic, np.mod(position, np.where(period > 0, period, 1.0)), position)
+            distances.append(cKDTree(wrapped, boxsize=period).query(wrapped, k=2)[0][:, 1])
+    every = np.concatenate(distances)
+    return float(np.median(every)) if len(every) else 0.0
 
 
 def displacements(position: np.ndarray, metadata: Metadata) -> np.ndarray:
@@ -41,7 +113,7 @@ class MotionStatistics:
 
     def add(self, trajectory: Trajectory) -> None:
         """Adds a trajectory."""
-        moving = np.isin(trajectory.particle_type, self._metadata.moving_types)
+        moving = self._metadata.is_moving(trajectory.particle_type)
         velocity = displacements(trajectory.position[:, moving], self._metadata)
         for key, values in (("vel", velocity), ("acc", np.diff(velocity, axis=0))):
             flat = values.reshape(-1, values.shape[-1])
@@ -58,17 +130,8 @@ class MotionStatistics:
         return statistics
 
 
-def find_disagreements(measured: Mapping[str, list[float]], stated: Mapping[str, Any], share: float = 0.1) -> list[str]:
-    """Compares stated standard deviations with measured ones.
-
-    Args:
-        measured: From `MotionStatistics.result`.
-        stated: The metadata's; missing ones are skipped.
-        share: Relative difference up to which they agree.
-
-    Returns:
-        A sentence for each that disagrees.
-    """
+def find_disagreements(measured: Mapping[str, list[float]], stated: Mapping[str, Any]) -> list[str]:
+    """A sentence for each stated standard deviation that differs by more than 10% from the measured one."""
     sentences = []
     for key in ("vel_std", "acc_std"):
         try:
@@ -76,7 +139,7 @@ def find_disagreements(measured: Mapping[str, list[float]], stated: Mapping[str,
             actual = np.asarray(measured[key])
         except (KeyError, TypeError, ValueError):
             continue
-        if expected.shape != actual.shape or not np.allclose(expected, actual, rtol=share, atol=0):
+        if expected.shape != actual.shape or not np.allclose(expected, actual, rtol=0.1, atol=0):
             shown = f"{_short(expected)}; these trajectories have {_short(actual)}"
             sentences.append(f"The metadata state {key} = {shown}.")
     return sentences

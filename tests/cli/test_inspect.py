@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from nmpm.cli import main
-from nmpm.data.convert.cache import native_folder
+from nmpm.data.convert import native_folder
 from nmpm.errors import DataError
 from tests.data.convert import records
 from tests.data.convert.records import METADATA, made

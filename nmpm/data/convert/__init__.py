@@ -5,9 +5,14 @@ Each format is one class in one file; `FORMATS` lists them in the order in which
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
+from nmpm._support.atomic import lock_folder
+from nmpm._support.shipped import user_home
 from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
@@ -19,7 +24,11 @@ from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.rollout_pickle import RolloutPickle
+from nmpm.data.format import METADATA_FILE
+from nmpm.data.gravity import check_gravity
 from nmpm.errors import ConfigError, DataError
+
+_log = logging.getLogger(__name__)
 
 FORMATS: tuple[DatasetFormat, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
 
@@ -87,3 +96,50 @@ def convert(
     """
     dataset = open_dataset(source, format_name, options)
     return write_native(renumber_types(dataset, ids) if ids else dataset, destination, problems)
+
+
+def native_folder(path: Path, options: Options | None = None) -> Path:
+    """A folder in the native layout with the same data, converted now or by an earlier call.
+
+    The dataset is converted again when the size or time of a source file, or an option, has changed.
+
+    Args:
+        path: A file or folder of any format that `nmpm convert` reads.
+        options: Facts that its files do not state.
+
+    Raises:
+        DataError: if the source cannot be read or the cache cannot be written.
+        ConfigError: if the options contradict the gravity that the files state.
+    """
+    path, options = Path(path).resolve(), options or Options()
+    if options.gravity is not None:
+        stated = open_dataset(path, options=replace(options, gravity=None))
+        if "gravity" not in stated.assumed:
+            metadata = (path if path.is_dir() else path.parent) / METADATA_FILE
+            check_gravity(options.gravity, stated.metadata.gravity, metadata if metadata.is_file() else path)
+    cache = user_home() / "converted"
+    folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
+    with lock_folder(cache):
+        if not (folder / METADATA_FILE).is_file():
+            for note in convert(path, folder, options=options):
+                _log.info("%s: %s", path.name, note)
+    return folder
+
+
+def _fingerprint(path: Path, options: Options) -> str:
+    # Mappings and sets of equal content may have another order.
+    ordered = [
+        sorted(value.items() if isinstance(value, Mapping) else value)
+        if isinstance(value, Mapping | frozenset)
+        else value
+        for value in vars(options).values()
+    ]
+    identity = repr((str(path), ordered, list(_stamps(path))))
+    return hashlib.sha256(identity.encode()).hexdigest()[:10]
+
+
+def _stamps(path: Path) -> Iterator[tuple[str, int, int]]:
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if file.is_file():
+            status = file.stat()
+            yield str(file.relative_to(path)), status.st_size, status.st_mtime_ns

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from nmpm.data.families import STATIC_NAMES
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Boundary, Interval
+from nmpm.scene import Boundary, Interval, check_field_names
 
 UNKNOWN_LENGTH = 0
 """`Metadata.sequence_length` where the files do not state it; the conversion sets the length that it finds."""
@@ -34,7 +34,7 @@ class Options:
         fields: Names of the fields that are inputs of models.
 
     Raises:
-        ConfigError: for another boundary.
+        ConfigError: for another boundary, or a name that no field can have.
     """
 
     family: str | None = None
@@ -49,6 +49,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.boundary is not None and not set(self.boundary) <= {"wall", "periodic"}:
             raise ConfigError(f'boundary = {list(self.boundary)} must be "wall" or "periodic" per axis.')
+        check_field_names(self.fields or ())
 
     def apply_to(self, metadata: Metadata) -> Metadata:
         """The metadata with the user's corrections; the family is applied where the type ids are read.

@@ -13,7 +13,14 @@ from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Rereadable
 from nmpm.data.format import SPLITS, Metadata, Trajectory, write_metadata, write_split
-from nmpm.data.statistics import STATISTICS_KEYS, MotionStatistics, find_disagreements, first_moving_particle
+from nmpm.data.statistics import (
+    STATISTICS_KEYS,
+    Extent,
+    MotionStatistics,
+    find_disagreements,
+    first_moving_particle,
+    notes_on_lengths,
+)
 from nmpm.errors import ConfigError, DataError
 
 NOTES = "conversion"
@@ -53,19 +60,19 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
     log = _Log(source.metadata, problems)
     with progress_bar("Converting", total) as advance:
         for name in names:
-            done = log.number
+            before = log.number
             try:
                 write_split(folder / f"{name}.h5", log.watch(source.splits[name], name, advance))
             except DataError:
-                if not problems or log.number > done:
+                if not problems or log.number > before:
                     raise
             # The statistics are those of the first split, train where there is one.
             log.statistics = log.statistics or log.motion.result()
     if problems and not log.number:
         raise DataError(problems[0])
-    metadata, inconsistencies = log.final_metadata()
-    write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *inconsistencies]}))
-    return (*source.notes, *inconsistencies, *log.out_of_bounds_notes())
+    metadata, notes = log.final_metadata()
+    write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *notes]}))
+    return (*source.notes, *notes, *log.extent.notes(source.metadata))
 
 
 class _Log:
@@ -79,10 +86,9 @@ class _Log:
     def __init__(self, metadata: Metadata, problems: list[str] | None) -> None:
         self.metadata, self.problems = metadata, problems
         self.motion, self.statistics = MotionStatistics(metadata), dict[str, list[float]]()
-        self.number, self.moving_boundaries = 0, 0
+        self.number = self.moving_boundaries = self.particles = 0
         self.frames: set[int] = set()
-        self.particles = 0
-        self.lower, self.upper = np.full(metadata.dim, np.inf), np.full(metadata.dim, -np.inf)
+        self.extent = Extent(metadata.dim)
 
     def watch(
         self, trajectories: Iterable[Trajectory], split: str, advance: Callable[[], object]
@@ -99,20 +105,17 @@ class _Log:
             self.problems.append(f"{error} Trajectories after it are not read.")
 
     def _add(self, trajectory: Trajectory, where: str) -> None:
-        types, position, dim = trajectory.particle_type, trajectory.position, self.metadata.dim
-        if position.shape[2] != dim:
-            raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {dim}.")
+        types, position, metadata = trajectory.particle_type, trajectory.position, self.metadata
+        if position.shape[2] != metadata.dim:
+            raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {metadata.dim}.")
         if self.problems is None:
-            self.metadata.check_types(types, where)
+            metadata.check_types(types, where)
         if not self.statistics:
             self.motion.add(trajectory)
+        static = metadata.is_static(types)
         self.number += 1
-        static = np.isin(types, list(self.metadata.static_types))
-        self.moving_boundaries += first_moving_particle(position, static, self.metadata.bounds) is not None
-        present = static | np.isin(types, self.metadata.moving_types)
-        if present.any():
-            self.lower = np.minimum(self.lower, position[:, present].min(axis=(0, 1)))
-            self.upper = np.maximum(self.upper, position[:, present].max(axis=(0, 1)))
+        self.moving_boundaries += first_moving_particle(position, static, metadata.bounds) is not None
+        self.extent.add(position[:, static | metadata.is_moving(types)])
         self.frames.add(len(position))
         self.particles = max(self.particles, position.shape[1])
 
@@ -132,28 +135,13 @@ class _Log:
                 f"Particles of a static type move in {self.moving_boundaries} of {self.number} trajectories. Their"
                 " positions are kept; to train on them, state which types are static (--static)."
             )
-        length, few, many = self.metadata.sequence_length, min(self.frames), max(self.frames)
-        if length != UNKNOWN_LENGTH and not self.frames <= {length, length + 1}:
-            lengths = f"{few}" if few == many else f"{few} to {many}"
-            notes.append(f"The metadata state sequence_length {length}; trajectories have {lengths} frames.")
-        return replace(self.metadata, extra=extra, sequence_length=length or many - 1), notes
-
-    def out_of_bounds_notes(self) -> list[str]:
-        """Notes on positions outside of the stated bounds."""
-        return [
-            f"Along {'xyz'[axis]} positions reach from {self.lower[axis]:.4g} to {self.upper[axis]:.4g}, beyond the"
-            f" stated bounds {[low, high]}; the scene's domain will contain them."
-            for axis, (low, high) in enumerate(self.metadata.bounds)
-            if not self.metadata.periodic[axis] and (self.lower[axis] < low or self.upper[axis] > high)
-        ]
+        if self.metadata.sequence_length != UNKNOWN_LENGTH:
+            return replace(self.metadata, extra=extra), notes + notes_on_lengths(self.frames, self.metadata)
+        return replace(self.metadata, extra=extra, sequence_length=max(self.frames) - 1), notes
 
 
 def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDataset:
-    """The same dataset with other particle type ids, as other readers expect; names and static types follow.
-
-    Args:
-        source: The dataset.
-        ids: New ids by old ones; other ids stay.
+    """The same dataset with new particle type ids by old ones; other ids stay, names and static types follow.
 
     Raises:
         ConfigError: if two types would get the same id, or an old id is unknown.

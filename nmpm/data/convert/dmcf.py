@@ -20,6 +20,7 @@ from nmpm._support.messages import one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
 from nmpm.data.families import find_family
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 _FLUID, _WALL = 0, 1
@@ -44,7 +45,7 @@ class Dmcf(FileFormat):
         dim = position.shape[1]
         everything = np.concatenate([position, _wall(first, dim, file)])
         metadata = Metadata(
-            bounds=tuple(zip(everything.min(0).tolist(), everything.max(0).tolist(), strict=True)),
+            bounds=extent_of(everything[None]).intervals,
             dt=_DT,
             dim=dim,
             sequence_length=UNKNOWN_LENGTH,

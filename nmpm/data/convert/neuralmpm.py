@@ -19,7 +19,7 @@ from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
 from nmpm.data.families import find_family
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.data.statistics import first_moving_particle
+from nmpm.data.statistics import extent_of, first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
@@ -66,10 +66,10 @@ class NeuralMpm(FileFormat):
                 f"{folder}: the files do not state the time between frames, and no published dataset is called"
                 f" {folder.name!r} ({', '.join(_PUBLISHED)}). Give --dt, and --gravity and --bounds if you know them."
             )
-        dim, low, high = first.position.shape[2], first.position.min(axis=(0, 1)), first.position.max(axis=(0, 1))
+        dim = first.position.shape[2]
         fits = published is not None and len(published.domain) == dim
         metadata = Metadata(
-            bounds=published.domain if published and fits else tuple(zip(low.tolist(), high.tolist(), strict=True)),
+            bounds=published.domain if published and fits else extent_of(first.position).intervals,
             dt=published.dt if published else options.dt or 1.0,
             dim=dim,
             sequence_length=UNKNOWN_LENGTH,

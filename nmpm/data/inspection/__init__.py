@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from nmpm._support.progress import progress_bar
 from nmpm.data.fields import FieldFacts, Kind, add_fields
 from nmpm.data.format import Metadata, Split
 from nmpm.data.gravity import distinct_gravities, trajectory_gravity
-from nmpm.data.inspection.measurements import Measurements, find_anomalies
+from nmpm.data.inspection.measurements import GridFacts, Measurements, find_anomalies
 from nmpm.data.inspection.reading import open_dataset
-from nmpm.data.inspection.report import Inspection, Range, SplitFacts
 from nmpm.data.loading.sources import FolderSource
-from nmpm.data.statistics import MotionStatistics, find_disagreements
+from nmpm.data.statistics import MotionStatistics, find_disagreements, neighbour_distance, notes_on_lengths
 from nmpm.errors import DataError, NmpmError
-from nmpm.scene import Scene
+from nmpm.scene import Interval, Scene
 
+Range = tuple[int, int]
+"""Smallest and largest value."""
 _BYTES = 2**28  # of positions per split that are read by default
 _MOST_FINDINGS = 12
 _DIFFERS: Mapping[Kind, str] = MappingProxyType(
@@ -30,6 +31,80 @@ _DIFFERS: Mapping[Kind, str] = MappingProxyType(
         "constant": "is the same everywhere",
     }
 )
+
+
+@dataclass(frozen=True)
+class SplitFacts:
+    """Facts about one split.
+
+    Args:
+        trajectories: Number of trajectories in the file.
+        inspected: Number of those that were read.
+        frames: Frames of a trajectory.
+        particles: Moving particles of a trajectory.
+        static: Static particles of a trajectory.
+    """
+
+    trajectories: int
+    inspected: int
+    frames: Range
+    particles: Range
+    static: Range
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """The results of an inspection; lengths in domain length, times in seconds.
+
+    Args:
+        path: Of the dataset.
+        dim: Number of axes.
+        dt: Time between frames.
+        splits: By name.
+        materials: Particles of each material in a trajectory, by name.
+        stated_bounds: The metadata's.
+        observed: Extent of all positions.
+        domain: Extent that a grid should cover.
+        boundary: "wall" or "periodic" per axis.
+        gravity: In length/s², where it is known and the same for all trajectories.
+        first_acceleration: Median in the first frames, in length/s²; equals gravity where particles start in free fall.
+        spacing: Median distance to the nearest neighbour in first frames.
+        varies: What differs between trajectories: "gravity", "materials", "particles", "frames", "obstacles", fields.
+        fields: Shape of each further array, in the first trajectory.
+        grids: Candidate grids.
+        recommended: Recommended cells along the longest side.
+        occupied: Fraction of the domain that a particle ever visits, in all trajectories together.
+        occupied_each: The same in one trajectory, median.
+        rest: First frame from which a trajectory is at rest: median, smallest, largest; None where none comes to rest.
+        restless: Trajectories that still move at their end.
+        notes: Notes that need no action.
+        findings: Anomalies.
+        channels: For each field how it differs, and which channels of a model that makes.
+    """
+
+    path: str
+    dim: int
+    dt: float
+    splits: dict[str, SplitFacts]
+    materials: dict[str, Range]
+    stated_bounds: tuple[Interval, ...]
+    observed: tuple[Interval, ...]
+    domain: tuple[Interval, ...]
+    boundary: tuple[str, ...]
+    gravity: tuple[float, ...] | None
+    first_acceleration: tuple[float, ...]
+    spacing: float
+    varies: tuple[str, ...]
+    fields: dict[str, tuple[int, ...]]
+    grids: tuple[GridFacts, ...]
+    recommended: int
+    occupied: float
+    occupied_each: float
+    rest: tuple[int, int, int] | None
+    restless: int
+    notes: tuple[str, ...]
+    findings: tuple[str, ...]
+    channels: dict[str, str]
 
 
 def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection:
@@ -53,13 +128,19 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
     domain = scene.domain if scene else metadata.domain or metadata.bounds
     counts = _Counts(splits, metadata)
     findings += counts.problems
-    sample = [(name, split, index) for name, split in splits.items() for index in _spread_evenly(split, trajectories)]
+    samples = {
+        name: split.sample(_BYTES) if trajectories is None else range(0, len(split), -(-len(split) // trajectories))
+        for name, split in splits.items()
+    }
+    first = next(iter(splits))
+    spacing = neighbour_distance(splits[first], samples[first], metadata)
+    spacing = spacing or max(high - low for low, high in metadata.bounds) / 64
     measured, statistics = Measurements(metadata, domain), MotionStatistics(metadata)
-    spacing, first = _spacing(sample, metadata), next(iter(splits))
     shapes: dict[str, tuple[int, ...]] = {}
     facts: dict[str, FieldFacts] = {}
-    with progress_bar("Inspecting", len(sample)) as advance:
-        for name, split, index in sample:
+    with progress_bar("Inspecting", sum(map(len, samples.values()))) as advance:
+        for name, index in ((name, index) for name, sample in samples.items() for index in sample):
+            split = splits[name]
             try:
                 trajectory = split.read(index)
                 stored = {key: values.shape for key, values in split.fields(index).items()}
@@ -74,12 +155,12 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
             except DataError as error:
                 findings.append(str(error))
             advance()
-    if not np.isfinite(measured.observed).all():
+    if not np.isfinite(measured.observed.lower).all():
         raise DataError(f"{data.source.folder}: none of its trajectories could be read. {findings[0]}")
-    inspected = {name: sum(name == other for other, _, _ in sample) for name in splits}
-    if inspected[first] == len(splits[first]):  # stated are those of the whole first split
+    if len(samples[first]) == len(splits[first]):  # stated are those of the whole first split
         findings += find_disagreements(statistics.result(), metadata.extra)
-    findings += counts.unexpected_lengths(metadata)
+    stated = [metadata.extra.get(f"sequence_length_{name}") for name in splits]
+    findings += notes_on_lengths(counts.frames, metadata, [length for length in stated if isinstance(length, int)])
     occupied, occupied_each = measured.occupied()
     fall = np.median(measured.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
     rests = [rest for rest in measured.rests if rest is not None]
@@ -88,10 +169,10 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         path=str(source.path),
         dim=metadata.dim,
         dt=metadata.dt,
-        splits={name: counts.facts(name, number) for name, number in inspected.items()},
+        splits={name: counts.facts(name, len(sample)) for name, sample in samples.items()},
         materials={name: _range(numbers) for name, numbers in counts.materials.items()},
         stated_bounds=metadata.bounds,
-        observed=tuple((float(low), float(high)) for low, high in measured.observed.T),
+        observed=measured.observed.intervals,
         domain=tuple(domain),
         boundary=scene.boundary if scene else tuple("periodic" if flag else "wall" for flag in metadata.periodic),
         gravity=scene.gravity if scene else metadata.gravity,
@@ -115,18 +196,15 @@ class _Counts:
     """Sizes, materials and gravities of all trajectories, read without their positions."""
 
     def __init__(self, splits: Mapping[str, Split], metadata: Metadata) -> None:
-        self.frames: dict[str, list[int]] = {name: [] for name in splits}
-        self.moving: dict[str, list[int]] = {name: [] for name in splits}
-        self.static: dict[str, list[int]] = {name: [] for name in splits}
+        self.sizes: dict[str, list[tuple[int, int, int]]] = {name: [] for name in splits}
         self.materials: dict[str, list[int]] = {}
         self.gravities: list[tuple[float, ...] | None] = []
         self.problems: list[str] = []
         for name, split in splits.items():
             for index in range(len(split)):
                 types = split.particle_type(index)
-                self.frames[name].append(split.frames(index))
-                self.moving[name].append(int(np.isin(types, metadata.moving_types).sum()))
-                self.static[name].append(int(np.isin(types, list(metadata.static_types)).sum()))
+                moving, static = int(metadata.is_moving(types).sum()), int(metadata.is_static(types).sum())
+                self.sizes[name].append((split.frames(index), moving, static))
                 for number, count in zip(*np.unique(types, return_counts=True), strict=True):
                     self.materials.setdefault(metadata.particle_types[int(number)], []).append(int(count))
                 try:
@@ -134,61 +212,30 @@ class _Counts:
                 except DataError as error:
                     self.problems.append(str(error))
 
+    @property
+    def frames(self) -> set[int]:
+        """Numbers of frames that occur."""
+        return {frames for sizes in self.sizes.values() for frames, _, _ in sizes}
+
     def facts(self, name: str, inspected: int) -> SplitFacts:
         """The facts about a split."""
-        ranges = (_range(numbers[name]) for numbers in (self.frames, self.moving, self.static))
-        return SplitFacts(len(self.frames[name]), inspected, *ranges)
+        return SplitFacts(len(self.sizes[name]), inspected, *map(_range, zip(*self.sizes[name], strict=True)))
 
     def varies(self) -> tuple[str, ...]:
         """What differs between trajectories."""
-        total = sum(map(len, self.frames.values()))
+        sizes = [size for sizes in self.sizes.values() for size in sizes]
         differing = {
             "gravity": len(distinct_gravities(self.gravities)) > 1,
-            "materials": any(len(counts) < total for counts in self.materials.values()),
-            "particles": len({n for counts in self.moving.values() for n in counts}) > 1,
-            "frames": len({n for counts in self.frames.values() for n in counts}) > 1,
-            "obstacles": len({n for counts in self.static.values() for n in counts}) > 1,
+            "materials": any(len(counts) < len(sizes) for counts in self.materials.values()),
+            "particles": len({moving for _, moving, _ in sizes}) > 1,
+            "frames": len(self.frames) > 1,
+            "obstacles": len({static for _, _, static in sizes}) > 1,
         }
         return tuple(what for what, differs in differing.items() if differs)
 
-    def unexpected_lengths(self, metadata: Metadata) -> list[str]:
-        """A sentence on numbers of frames that are not as the metadata state."""
-        stated = [metadata.extra.get(f"sequence_length_{name}") for name in self.frames]
-        lengths = [metadata.sequence_length, *(value for value in stated if isinstance(value, int))]
-        # Files often have one frame more than stated.
-        expected = {length + more for length in lengths for more in (0, 1)}
-        unexpected = {n for counts in self.frames.values() for n in counts} - expected
-        if not unexpected:
-            return []
-        span = f"{min(unexpected)}" if len(unexpected) == 1 else f"{min(unexpected)} to {max(unexpected)}"
-        return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {span} frames."]
 
-
-def _range(values: list[int]) -> Range:
+def _range(values: Sequence[int]) -> Range:
     return min(values), max(values)
-
-
-def _spread_evenly(split: Split, trajectories: int | None) -> range:
-    """Indices of evenly spaced trajectories."""
-    if trajectories is None:
-        size = sum(4 * split.frames(i) * split.particles(i) * split.dim for i in range(len(split)))
-        trajectories = max(1, int(len(split) * min(1.0, _BYTES / size)))
-    return range(0, len(split), max(1, -(-len(split) // trajectories)))
-
-
-def _spacing(sample: list[tuple[str, Split, int]], metadata: Metadata) -> float:
-    """Median distance to the nearest particle in the first frames of a few trajectories."""
-    medians = []
-    for _, split, index in sample[:8]:
-        try:
-            first = split.read(index, 0, 1)
-        except DataError:
-            continue
-        position = first.position[0, np.isin(first.particle_type, metadata.moving_types)]
-        if len(position) > 1:
-            medians.append(float(np.median(cKDTree(position).query(position, k=2)[0][:, 1])))
-    lower, upper = np.asarray(metadata.bounds).T
-    return float(np.median(medians)) if medians and np.median(medians) > 0 else float((upper - lower).max()) / 64
 
 
 def _describe_channels(name: str, field: FieldFacts, metadata: Metadata, materials: tuple[str, ...]) -> str:
@@ -209,13 +256,7 @@ def _notes(stated: FolderSource, source: FolderSource, measured: Measurements, m
             f"The metadata do not state what the particle types mean; they are read as those of the {family} family, by"
             f" the ids that occur. If that is right, add --family {family}; nmpm fit needs --data.family {family}."
         )
-    for axis, (low, high) in enumerate(metadata.bounds):
-        seen_low, seen_high = measured.observed[:, axis].tolist()
-        if not metadata.periodic[axis] and (seen_low < low or seen_high > high):
-            yield (
-                f"Along {'xyz'[axis]} positions reach from {seen_low:.4f} to {seen_high:.4f}, beyond the stated bounds"
-                f" {low:g} to {high:g}; the domain was chosen to contain them."
-            )
+    yield from measured.observed.notes(metadata)
     notes = metadata.extra.get("conversion")
     yield from [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
 

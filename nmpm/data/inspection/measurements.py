@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.inspection.report import GridFacts
-from nmpm.data.statistics import displacements, first_moving_particle
+from nmpm.data.statistics import Extent, displacements, first_moving_particle
 from nmpm.scene import Interval
 
 CANDIDATES = (16, 32, 64, 128, 256, 512)
@@ -22,6 +22,27 @@ _FRAMES_ON_GRIDS = 12
 _REST = 0.02  # of a trajectory's peak speed
 _JUMP = 5.0  # in spacings; a larger change between successive displacements of a particle is an anomaly
 _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 2.3% wide
+
+
+@dataclass(frozen=True)
+class GridFacts:
+    """Facts about the data on one grid.
+
+    Args:
+        cells: Cells along the longest side.
+        shape: Cells along each axis.
+        per_cell: Particles per occupied cell, median over frames.
+        median_speed: Median speed of the moving particles, in cells per frame.
+        high_speed: 99.9% quantile of their speeds, in cells per frame.
+        most_speed: Largest speed, in cells per frame.
+    """
+
+    cells: int
+    shape: tuple[int, ...]
+    per_cell: float
+    median_speed: float
+    high_speed: float
+    most_speed: float
 
 
 class Measurements:
@@ -37,7 +58,7 @@ class Measurements:
         self.low, high = np.asarray(domain).T
         self.extent = high - self.low
         self.longest = float(self.extent.max())
-        self.observed = np.array([np.full(metadata.dim, np.inf), np.full(metadata.dim, -np.inf)])
+        self.observed = Extent(metadata.dim)
         self.rests: list[int | None] = []
         self.falls: list[np.ndarray] = []
         self._counts = np.zeros(len(_BINS) + 1)
@@ -53,11 +74,8 @@ class Measurements:
     def add(self, trajectory: Trajectory) -> None:
         """Adds a trajectory."""
         types, position = trajectory.particle_type, trajectory.position
-        moving = np.isin(types, self.metadata.moving_types)
-        present = moving | np.isin(types, list(self.metadata.static_types))
-        if present.any():
-            self.observed[0] = np.minimum(self.observed[0], position[:, present].min(axis=(0, 1)))
-            self.observed[1] = np.maximum(self.observed[1], position[:, present].max(axis=(0, 1)))
+        moving = self.metadata.is_moving(types)
+        self.observed.add(position[:, moving | self.metadata.is_static(types)])
         if moving.any():
             step = displacements(position[:, moving], self.metadata)
             if len(step):
@@ -128,7 +146,7 @@ def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, w
         where: Split and trajectory, to name in the sentences.
     """
     types, position = trajectory.particle_type, trajectory.position
-    moving = np.flatnonzero(np.isin(types, metadata.moving_types))
+    moving = np.flatnonzero(metadata.is_moving(types))
     if metadata.domain is not None:
         lower, upper = np.asarray(metadata.domain).T
         outside = (((position < lower) | (position > upper)) & ~np.asarray(metadata.periodic)).any(axis=-1)
@@ -152,7 +170,6 @@ def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, w
         twin = int(moving[first[int(np.argmax(number))]])
         twins = int((number - 1).sum())
         yield f"{where}, frame 0: {twins} particles have the position of another, e.g. of particle {twin}."
-    static = np.isin(types, list(metadata.static_types))
-    mover = first_moving_particle(position, static, metadata.bounds)
+    mover = first_moving_particle(position, metadata.is_static(types), metadata.bounds)
     if mover is not None:
         yield f"{where}: particle {mover}, of the static type {types[mover]}, moves."

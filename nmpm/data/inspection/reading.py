@@ -13,6 +13,7 @@ from nmpm.data.families import FAMILIES
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import load_json, parse_metadata
+from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError
 
 
@@ -98,13 +99,12 @@ def _read_metadata(
         problems.append(f"{path}: dim = {one_line(plain['dim'], 40)}, but positions have {split.dim} axes.")
         plain = plain | {"dim": split.dim}
     try:
-        position = split.read(0).position
-        low, high = position.min(axis=(0, 1)), position.max(axis=(0, 1))
+        extent = extent_of(split.read(0).position).intervals
     except DataError:
-        low, high = np.zeros(split.dim), np.ones(split.dim)
+        extent = ((0.0, 1.0),) * split.dim
     substitutes = {
         "dim": split.dim,
-        "bounds": tuple(zip(low.tolist(), np.where(high > low, high, low + 1).tolist(), strict=True)),
+        "bounds": tuple((low, high if high > low else low + 1) for low, high in extent),
         "dt": 1.0,
         "sequence_length": split.frames(0),
         "particle_types": {i: f"type {i}" for i in ids},

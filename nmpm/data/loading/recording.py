@@ -79,8 +79,8 @@ class RecordingReader:
         """
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
-        moving = np.isin(types, self.metadata.moving_types)
-        static = np.isin(types, list(self.metadata.static_types))
+        moving = self.metadata.is_moving(types)
+        static = self.metadata.is_static(types)
         self._check_inside(trajectory, moving | static, where, first_frame)
         if not moving.any():
             raise DataError(f"{where}: no particle has a moving type; check static_types in the metadata.")

@@ -9,8 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from nmpm.data.convert import Options
-from nmpm.data.convert.cache import native_folder
+from nmpm.data.convert import Options, native_folder
 from nmpm.data.format import Metadata, Split, find_split, read_metadata, split_paths
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider

@@ -3,8 +3,7 @@ import os
 import numpy as np
 import pytest
 
-from nmpm.data.convert import Options
-from nmpm.data.convert.cache import native_folder
+from nmpm.data.convert import Options, native_folder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import read_metadata
 from nmpm.errors import ConfigError
