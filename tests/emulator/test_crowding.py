@@ -6,14 +6,13 @@ from scenes import box, cloud
 from torch import Tensor
 
 from nmpm.emulator import Emulator, EmulatorRecipe
-from nmpm.emulator.calibration import density_cap
-from nmpm.emulator.constraints import Constraints, affordable_share, energy
+from nmpm.emulator.constraints import Constraints, energy
 from nmpm.emulator.contact import SURFACE
 from nmpm.emulator.crowding import MAX_SHIFT, Crowding
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles
 from nmpm.processors import Pointwise
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
@@ -132,12 +131,6 @@ def test_the_form_for_other_devices_is_the_same(monkeypatch):
     assert torch.equal(crowd.shift(dense, everybody(dense)), expected)
     loose = block(8, 8)
     assert crowd.shift(loose, everybody(loose)).eq(0).all()
-
-
-def test_the_affordable_part_of_a_way():
-    before, after = torch.tensor([[1.0, 1.0]] * 4), torch.tensor([[1.5, 2.0], [3.0, 2.0], [0.0, 0.5], [9.0, 9.0]])
-    budget = torch.tensor([2.0, 2.0, 0.7, 0.5])
-    torch.testing.assert_close(affordable_share(before, after, budget), torch.tensor([1.0, 0.5, 1.0, 0.0]))
 
 
 # Rollouts
@@ -264,17 +257,3 @@ def test_gradients_of_a_capped_rollout_are_finite():
 def test_a_cap_that_is_none():
     with pytest.raises(ConfigError, match="density_cap"):
         Constraints(density_cap=float("nan"))
-
-
-def test_the_cap_is_measured_in_windows():
-    scene = SCENES["walls"]
-    emulator = emulator_of(scene)
-    lattice = block(0.4, 40, centre=0.5)  # 1600 particles: 100 cells of the grid's 256 hold 0.01 of the domain each
-    state = dataclasses.replace(crowd_in(scene, 1600), position=lattice)
-    path = lattice.unsqueeze(1).expand(-1, 6, -1, -1)
-    window = Window(path, state.material, state.mask, state.obstacle, state.obstacle_mask, state.gravity)
-    expected = 1600 * scene.particle_volume / 0.4**2
-    assert density_cap(emulator, [window]) == pytest.approx(expected, rel=0.05)
-    empty = dataclasses.replace(window, mask=torch.zeros_like(window.mask))
-    with pytest.raises(ValueError, match="half full"):
-        density_cap(emulator, [empty])

@@ -4,52 +4,37 @@ import dataclasses
 
 import pytest
 import torch
-from scenes import box, cloud
 
-from nmpm.decoders import Residual
 from nmpm.emulator import EmulatorRecipe, predict_rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.rasterise import grid_state
 from nmpm.errors import ConfigError
-from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
 from nmpm.scene import Scene
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic
 from nmpm.zoo.export.parts import Step
+from tests.scenes import box, cloud, emulator_of, padded, silenced, window_of
 
-SMALL = UNet(width=4, depth=1, perceptron=(4,))
 ALL = {"evolving": ("temperature",), "properties": ("stiffness",), "parameters": ("friction",)}
 
 
-def small(scene, transfer=Linear(), frames=3):
-    torch.manual_seed(0)
-    return EmulatorRecipe(scene, 16, frames, transfer, SMALL, Residual()).build().eval()
+def small(scene, transfer=Linear()):
+    return emulator_of(scene, frames=3, transfer=transfer, processor=UNet(width=4, depth=1, perceptron=(4,)))
 
 
 def constant_rate(emulator, rate):
     """The emulator with a network that says zero for velocities and one number for the rates of fields."""
-    for parameter in emulator.processor.parameters():
-        torch.nn.init.zeros_(parameter)
-    flows = emulator.scene.dim * len(emulator.scene.materials)
-
-    def constant(module, inputs, output):
-        output = output.clone()
-        output[:, :, flows:] = rate
-        return output
-
-    emulator.processor.register_forward_hook(constant)
+    flows = torch.arange(len(emulator.scene.output_channels)) < emulator.scene.dim * len(emulator.scene.materials)
+    rates = torch.where(flows, 0.0, rate).view(-1, 1, 1)
+    silenced(emulator).processor.register_forward_hook(lambda _, __, output: output + rates)
     return emulator
 
 
-def with_fields(particles, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    batch, count = particles.mask.shape
-    values = {
-        "temperature": 1 + 0.1 * torch.rand(batch, count, generator=generator),
-        "stiffness": torch.rand(batch, count, generator=generator),
-        "friction": torch.rand(batch, 1, generator=generator),
-    }
-    return particles.with_fields(values)
+def with_fields(particles):
+    generator = torch.Generator().manual_seed(0)
+    temperature, stiffness = torch.rand(2, *particles.mask.shape, generator=generator)
+    friction = torch.rand(len(stiffness), 1, generator=generator)
+    return particles.with_fields({"temperature": 1 + 0.1 * temperature, "stiffness": stiffness, "friction": friction})
 
 
 def test_the_channels_follow_from_the_fields():
@@ -67,8 +52,7 @@ def test_the_channels_follow_from_the_fields():
 @pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic(), Affine()])
 def test_a_field_that_is_the_same_everywhere_is_so_on_the_grid_and_stays_so(transfer):
     scene = box(2, ("water", "sand"), evolving=("temperature",))
-    emulator = constant_rate(small(scene, transfer), 0.0)
-    particles = cloud(scene, speed=0.005)
+    emulator, particles = constant_rate(small(scene, transfer), 0.0), cloud(scene, speed=0.005)
     particles = particles.with_fields({"temperature": torch.full(particles.mask.shape, 1.25)})
     cells, velocity, _ = emulator.in_cells(particles)
     solid = emulator.solid(particles)
@@ -83,30 +67,19 @@ def test_a_field_that_is_the_same_everywhere_is_so_on_the_grid_and_stays_so(tran
 
 def test_a_uniform_rate_adds_up_over_frames_and_bundles():
     scene = box(evolving=("temperature",))
-    emulator = constant_rate(small(scene), 0.5)
+    emulator, particles = constant_rate(small(scene), 0.5), with_fields(cloud(scene))
     emulator.field_scales.std.fill_(0.1)
-    particles = with_fields(cloud(scene))
-    found = predict_rollout(emulator, particles, 7).fields["temperature"]
+    predicted = predict_rollout(emulator, particles, 7).fields["temperature"]
     steps = 0.05 * torch.arange(1, 8).view(1, -1, 1)
-    torch.testing.assert_close(found, particles.fields["temperature"].unsqueeze(1) + steps)
+    torch.testing.assert_close(predicted, particles.fields["temperature"].unsqueeze(1) + steps)
 
 
 @pytest.mark.parametrize("filler", [1e30, float("nan")])
 def test_padded_particles_change_no_field_to_the_bit(filler):
     scene = box(**ALL)
     emulator, particles = small(scene), with_fields(cloud(scene, count=20))
-
-    def pad(values, number):
-        return torch.cat([values, values.new_full((1, 7, *values.shape[2:]), number)], dim=1)
-
-    fields = {
-        name: values if values.shape[1] == 1 else pad(values, filler) for name, values in particles.fields.items()
-    }
-    padded = Particles(
-        pad(particles.position, 0.5), pad(particles.velocity, 0.3), pad(particles.material, 0),
-        pad(particles.mask, False), particles.obstacle, particles.obstacle_mask, particles.gravity, fields,
-    )  # fmt: skip
-    one, other = predict_rollout(emulator, particles, 7), predict_rollout(emulator, padded, 7)
+    more = padded(particles, torch.full((7, 2), 0.5), field=filler)
+    one, other = (predict_rollout(emulator, state, 7) for state in (particles, more))
     assert torch.equal(one.position, other.position[:, :, :20])
     assert torch.equal(one.fields["temperature"], other.fields["temperature"][..., :20])
 
@@ -115,36 +88,27 @@ def test_a_missing_field_has_its_training_mean_and_is_named():
     scene = box(**ALL)
     emulator, particles = small(scene), with_fields(cloud(scene))
     emulator.field_scales.mean.copy_(torch.tensor([1.05, 0.4, 0.3]))
-    lacking = dataclasses.replace(particles, fields={})
-    means = {
-        "temperature": torch.full(particles.mask.shape, 1.05),
-        "stiffness": torch.full(particles.mask.shape, 0.4),
-        "friction": torch.full((1, 1), 0.3),
-    }
+    means = dict(zip(("temperature", "stiffness", "friction"), (1.05, 0.4, 0.3), strict=True))
+    means = {name: torch.full_like(particles.fields[name], value) for name, value in means.items()}
     with pytest.warns(UserWarning, match="has no stiffness.*training mean, 0.4,"):
-        found = predict_rollout(emulator, lacking, 5)
+        predicted = predict_rollout(emulator, dataclasses.replace(particles, fields={}), 5)
     expected = predict_rollout(emulator, particles.with_fields(means), 5)
-    torch.testing.assert_close(found.position, expected.position)
-    torch.testing.assert_close(found.fields["temperature"], expected.fields["temperature"])
+    torch.testing.assert_close(predicted.position, expected.position)
+    torch.testing.assert_close(predicted.fields["temperature"], expected.fields["temperature"])
 
 
 def test_calibration_measures_fields_over_real_particles_and_scenes():
     scene = box(**ALL)
-    state = cloud(scene, count=8, batch=2)
-    mask = torch.ones(2, 8, dtype=torch.bool)
-    mask[1, 4:] = False
-    rise = torch.arange(6.0).view(1, 6, 1).expand(2, 6, 8)
-    frames = state.position.unsqueeze(1) + 0.001 * rise.unsqueeze(-1)
-    temperature = (1 + 0.01 * rise).clone()
+    state, rise = cloud(scene, count=8, batch=2), torch.arange(6.0).view(1, 6, 1).expand(2, 6, 8)
+    state.mask[1, 4:] = False
+    temperature = 1 + 0.01 * rise
     temperature[1, :, 4:] = 1e6
-    friction = torch.tensor([1.0, 3.0]).view(2, 1, 1)
-    stiffness = torch.full((2, 1, 8), 7.0)
-    values = {"temperature": temperature, "stiffness": stiffness, "friction": friction}
-    window = Window(frames, state.material, mask, state.obstacle, state.obstacle_mask, state.gravity, values)
+    friction, stiffness = torch.tensor([1.0, 3.0]).view(2, 1, 1), torch.full((2, 1, 8), 7.0)
+    window = window_of(state, state.position.unsqueeze(1) + 0.001 * rise.unsqueeze(-1))
+    window.fields = {"temperature": temperature, "stiffness": stiffness, "friction": friction}
     emulator = small(scene)
     calibrate(emulator, [window])
-    levels = 1 + 0.01 * torch.arange(6.0)
-    scales = emulator.field_scales
+    levels, scales = 1 + 0.01 * torch.arange(6.0), emulator.field_scales
     torch.testing.assert_close(scales.mean, torch.tensor([float(levels.mean()), 7.0, 2.0]))
     torch.testing.assert_close(scales.std, torch.tensor([float(levels.std(correction=0)), 1.0, 1.0]))
     rate = 0.01 / levels.std(correction=0)
@@ -154,7 +118,6 @@ def test_calibration_measures_fields_over_real_particles_and_scenes():
 def test_other_scenes_keep_the_models_fields_and_exports_refuse_them():
     emulator = small(box(**ALL))
     assert emulator.over(box(bounds=((0.1, 0.9),) * 2)).scene.fields == emulator.scene.fields
-    recipe = EmulatorRecipe.from_dict(emulator.recipe.to_dict())
-    assert recipe.scene == emulator.scene
+    assert EmulatorRecipe.from_dict(emulator.recipe.to_dict()).scene == emulator.scene
     with pytest.raises(ConfigError, match=r"temperature, stiffness, friction.*exported files do not"):
         Step(emulator)

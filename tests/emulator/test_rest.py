@@ -1,76 +1,178 @@
-"""Scenes at rest: unrolling makes no further calls, and nothing that would still move is frozen."""
+"""Only what lies on something rests, to the bit; what rests is not computed again; kernels beside tensor operations."""
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from nmpm.emulator import Emulator, EmulatorRecipe, unroll
-from nmpm.emulator.constraints import Constraints
+from nmpm.data.initial_states import lattice, state_at_rest
+from nmpm.decoders import Absolute
+from nmpm.emulator import Emulator, unroll
+from nmpm.emulator.fused.rest import find_support
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.rollouts import rollout
+from nmpm.emulator.support import REACH, Support, floor_rows
+from nmpm.grid import Grid
 from nmpm.particles import Particles
-from nmpm.processors import UNet
-from tests.scenes import box, cloud
+from nmpm.transfer import without_kernels
+from tests.scenes import CHANNEL, box, cloud, emulator_of, silenced
 
 BUNDLES = 6
 WEIGHTLESS = box(gravity=(0.0, 0.0))
 
 
-def emulator(rest_speed: float) -> Emulator:
-    torch.manual_seed(0)
-    constraints = Constraints(rest_speed=rest_speed)
-    recipe = EmulatorRecipe(WEIGHTLESS, 16, 4, processor=UNet(4, 1), constraints=constraints)
-    return recipe.build().eval().requires_grad_(False)
+def motionless(scene, **changes) -> Emulator:
+    """An emulator whose network predicts that everything stands still, in the air too."""
+    emulator = emulator_of(scene, decoder=Absolute(), **({"rest_speed": 0.01} | changes))
+    return silenced(emulator).requires_grad_(False)
 
 
-def count_calls(model: Emulator) -> list[int]:
-    calls = [0]
-    model.processor.register_forward_hook(lambda *_: calls.__setitem__(0, calls[0] + 1))
-    return calls
+def block(scene, low: float, high: float) -> Particles:
+    """A block of particles at rest between two heights along the last axis."""
+    return state_at_rest(scene, lattice((((0.4, 0.6),) * (scene.dim - 1)) + ((low, high),), 0.02))
 
 
-def called_each_time(model: Emulator, particles: Particles, bundles: int = BUNDLES) -> list[torch.Tensor]:
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_drop_under_the_ceiling_comes_down_as_fast_as_from_rest_in_each_bundle(dim):
+    scene = box(dim)
+    drop = block(scene, 0.86, 0.9)
+    predicted = rollout(motionless(scene), drop, 8)
+    times = torch.tensor([1, 3, 6, 10, 11, 13, 16, 20])
+    fallen = (drop.position.unsqueeze(1) - predicted)[..., -1]
+    expected = 9.81 * scene.dt**2 * times.view(1, -1, 1).expand_as(fallen)
+    torch.testing.assert_close(fallen, expected, rtol=1e-2, atol=1e-6)
+    torch.testing.assert_close(predicted[..., :-1], drop.position.unsqueeze(1).expand_as(predicted)[..., :-1])
+
+
+@pytest.mark.parametrize("solids", [True, False])
+def test_what_lies_on_an_obstacle_stays_and_what_hangs_below_it_falls(solids):
+    scene = box(obstacles=True)
+    beam = lattice(((0.3, 0.7), (0.5, 0.6)), 0.01)
+    above, below = (lattice(((0.4, 0.6), ends), 0.02) for ends in ((0.62, 0.7), (0.42, 0.46)))
+    state = state_at_rest(scene, torch.cat([above, below]), beam)
+    fallen = (state.position - rollout(motionless(scene, solids=solids), state, 8)[:, -1])[0, :, -1]
+    assert (fallen[: len(above)].abs() < 1e-6).all()
+    assert (fallen[len(above) :] > 1e-4).all()
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [WEIGHTLESS, box(gravity=None), box(boundary=("wall", "periodic"), domain=((0.08, 0.92), (0.1, 0.9)))],
+    ids=["no gravity", "unknown gravity", "a periodic axis"],
+)
+def test_where_there_is_no_floor_what_rests_stays(scene):
+    drop = block(scene, 0.6, 0.7)
+    predicted = rollout(motionless(scene), drop, 8)
+    torch.testing.assert_close(predicted, drop.position.unsqueeze(1).expand_as(predicted), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(("gap", "held"), [(REACH - 1, True), (REACH, False)])
+def test_gaps_of_less_than_the_reach_are_bridged(gap, held):
+    grid = Grid((5, 12), (0.0, 0.0), (1.0, 1.0), (False, False))
+    scene = box(bounds=((0.0, 5.0), (0.0, 12.0)), domain=((0.0, 5.0), (0.0, 12.0)))
+    filled = torch.zeros(1, 1, 5, 12)
+    filled[..., :3] = filled[..., 3 + gap] = 1.0
+    support = Support(filled, None, scene, grid).supported_cells(torch.tensor([[[0.0, -1.0]]]))
+    assert support[0, 2, : 4 + min(gap, REACH - 1)].all()
+    assert bool(support[0, 2, 3 + gap]) == held
+
+
+def random_support(seed: int, shape: tuple[int, ...], periodic: tuple[bool, ...], obstacles: bool) -> Support:
+    """Two scenes with random material, obstacles, and wall layers of random thickness."""
+    generator = torch.Generator().manual_seed(seed)
+    layer = (3 * torch.rand(len(shape), 2, generator=generator)).tolist()
+    sides = [
+        (0.0, float(n)) if wraps else (low, n - high)
+        for n, wraps, (low, high) in zip(shape, periodic, layer, strict=True)
+    ]
+    boundary = tuple("periodic" if wraps else "wall" for wraps in periodic)
+    domain = tuple((0.0, float(n)) for n in shape)
+    scene = box(len(shape), bounds=tuple(sides), domain=domain, boundary=boundary, obstacles=True)
+    filled = torch.rand(2, 1, *shape, generator=generator) * (torch.rand(2, 1, *shape, generator=generator) < 0.35)
+    share = torch.rand(2, 1, *shape, generator=generator) * (torch.rand(2, 1, *shape, generator=generator) < 0.15)
+    grid = Grid(shape, (0.0,) * len(shape), (1.0,) * len(shape), periodic)
+    return Support(filled, share if obstacles else None, scene, grid)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    shape=st.lists(st.integers(7, 12), min_size=2, max_size=3).map(tuple),
+    wraps=st.lists(st.booleans(), min_size=3, max_size=3),
+    gravity=st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), min_size=6, max_size=6),
+    obstacles=st.booleans(),
+)
+@settings(max_examples=12)
+def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obstacles):
+    dim = len(shape)
+    support = random_support(seed, shape, tuple(wraps[:dim]), obstacles)
+    pull = torch.tensor(gravity).view(2, 1, 3)[..., :dim]
+    expected = support.supported_cells(pull)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nmpm.emulator.support.is_eager_cpu", lambda _: False)
+        assert torch.equal(support.supported_cells(pull), expected)
+    floors, held = np.array(floor_rows(support.scene, support.grid)), np.empty(support.grid.size, np.bool_)
+    for scene in range(2):
+        state = support.filled[scene].flatten(1).T.contiguous().numpy()
+        share = np.empty(0, np.float32) if support.obstacle is None else support.obstacle[scene].flatten().numpy()
+        grid = (support.grid.shape, support.grid.periodic)
+        find_support(state, (0, 1), share, pull[scene, 0].numpy(), grid, floors, held)
+        assert np.array_equal(held, expected[scene].flatten().numpy())
+
+
+def test_kernels_hold_what_tensor_operations_hold():
+    scene = box(2, ("water", "sand"), obstacles=True, **CHANNEL)
+    position = 0.11 + 0.78 * torch.rand(60, 2, generator=torch.Generator().manual_seed(2))
+    emulator, state = motionless(scene), state_at_rest(scene, position, lattice(((0.3, 0.5),) * 2, 0.02))
+    fused = emulator(state).position
+    with without_kernels():
+        tensors = emulator(state).position
+    moved = (tensors[:, -1] - state.position).norm(dim=-1) > 1e-5
+    assert 0.1 < moved.float().mean() < 0.95
+    torch.testing.assert_close(fused, tensors, rtol=0, atol=1e-6)
+
+
+# Rollouts in which scenes come to rest
+
+
+def called_each_time(emulator: Emulator, particles: Particles) -> list[torch.Tensor]:
     """Positions of the bundles when every one of them is computed."""
-    context, positions = model.context(particles), []
-    for _ in range(bundles):
-        bundle = model(particles, context)
+    context, positions = emulator.context(particles), []
+    for _ in range(BUNDLES):
+        bundle = emulator(particles, context)
         positions.append(bundle.position)
         particles = particles.with_motion(bundle.position[:, -1], bundle.velocity)
     return positions
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_a_scene_at_rest_is_not_computed_again(batch):
-    model, particles = emulator(rest_speed=1e3), cloud(WEIGHTLESS, batch=batch)
-    expected, calls = called_each_time(model, particles), count_calls(model)
-    found = [bundle.position for bundle in unroll(model, particles, BUNDLES)]
-    assert 1 < calls[0] < BUNDLES
-    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+def scenes_computed(emulator: Emulator) -> list[int]:
+    """A list to which each call of the network adds its number of scenes."""
+    sizes: list[int] = []
+    emulator.processor.register_forward_hook(lambda _, inputs, __: sizes.append(len(inputs[0])))
+    return sizes
 
 
-def test_what_moves_is_computed():
-    model, particles = emulator(rest_speed=0.0), cloud(WEIGHTLESS, speed=0.01)
-    expected, calls = called_each_time(model, particles), count_calls(model)
-    found = [bundle.position for bundle in unroll(model, particles, BUNDLES)]
-    assert calls == [BUNDLES]
-    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
-
-
-def joined(*states: Particles) -> Particles:
-    names = [name for name, values in vars(states[0]).items() if isinstance(values, torch.Tensor)]
-    return Particles(**{name: torch.cat([getattr(state, name) for state in states]) for name in names})
+@pytest.mark.parametrize("rest_speed", [0.0, 1e3])
+def test_a_batch_at_rest_is_not_computed_again(rest_speed):
+    emulator = emulator_of(WEIGHTLESS, scale=0.01, rest_speed=rest_speed).requires_grad_(False)
+    particles = cloud(WEIGHTLESS, batch=3, speed=0.01)
+    expected, sizes = called_each_time(emulator, particles), scenes_computed(emulator)
+    predicted = [bundle.position for bundle in unroll(emulator, particles, BUNDLES)]
+    assert 1 < len(sizes) < BUNDLES if rest_speed else len(sizes) == BUNDLES
+    assert all(map(torch.equal, predicted, expected))
+    assert torch.equal(predicted[-1][:, -1], predicted[-2][:, -1]) == bool(rest_speed)
 
 
 def test_only_scenes_that_move_are_computed():
-    model = emulator(rest_speed=0.05)
-    batch = joined(*(cloud(WEIGHTLESS, speed=speed, seed=seed) for seed, speed in enumerate((0.0, 0.02, 0.0))))
-    expected, sizes = called_each_time(model, batch), []
-    model.processor.register_forward_hook(lambda _, inputs, __: sizes.append(len(inputs[0])))
-    monitor = Monitor()
-    found = [bundle.position for bundle in unroll(model, batch, BUNDLES, monitor)]
-    assert 0.5 < monitor.rest_share < 0.7
+    emulator = emulator_of(WEIGHTLESS, scale=0.01, rest_speed=0.05).requires_grad_(False)
+    batch = cloud(WEIGHTLESS, batch=3, speed=0.02)
+    batch.velocity[::2] = 0.0
+    expected, sizes, monitor = called_each_time(emulator, batch), scenes_computed(emulator), Monitor()
+    predicted = [bundle.position for bundle in unroll(emulator, batch, BUNDLES, monitor)]
+    assert 0.6 < monitor.rest_share < 0.75
     assert f"{monitor.rest_share:.0%} of all at rest" in monitor.report()
-    assert sizes[0] == 3
-    assert sizes[-1] == 1
-    for one, other in zip(found, expected, strict=True):
+    assert (sizes[0], sizes[-1]) == (3, 1)
+    for one, other in zip(predicted, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
         assert torch.equal(one[::2], other[::2])
-    assert not torch.equal(found[-1][1, -1], found[-2][1, -1])
+    assert not torch.equal(predicted[-1][1, -1], predicted[-2][1, -1])
