@@ -15,8 +15,6 @@ from nmpm._support.devices import processor_name
 Action = Callable[[], object]
 Clock = Callable[[], float]
 
-CPU_TIME, WALL_TIME = "CPU time", "wall time"
-
 
 def synchronize() -> None:
     """Wait until the GPU has finished; does nothing where none is in use."""
@@ -32,14 +30,12 @@ def wall_clock() -> float:
     return time.perf_counter()
 
 
-def clock_for(device: torch.device, threads: int) -> tuple[str, Clock]:
-    """The name of the clock that a computation is timed by, and the clock.
+def clock_for(device: torch.device) -> tuple[str, Clock]:
+    """The name of the clock that one thread's computation is timed by, and the clock: CPU time, wall time on GPUs.
 
-    One thread of a CPU by its CPU time, which other programs disturb less; everything else by wall time.
+    Other programs disturb CPU time less.
     """
-    if device.type == "cpu" and threads == 1:
-        return CPU_TIME, time.thread_time
-    return WALL_TIME, wall_clock
+    return ("CPU time", time.thread_time) if device.type == "cpu" else ("wall time", wall_clock)
 
 
 def peak_bytes(action: Action, device: torch.device) -> float:
@@ -49,7 +45,12 @@ def peak_bytes(action: Action, device: torch.device) -> float:
     systems other than Linux.
     """
     if device.type == "cuda":
-        return _peak_on_cuda(action, device)
+        synchronize()
+        allocated = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        action()
+        synchronize()
+        return float(torch.cuda.max_memory_allocated(device) - allocated)
     if device.type != "cpu" or not Path("/proc/self/clear_refs").exists():
         action()
         return float("nan")
@@ -58,15 +59,6 @@ def peak_bytes(action: Action, device: torch.device) -> float:
     before = _process_status("VmRSS")
     action()
     return float(_process_status("VmHWM") - before)
-
-
-def _peak_on_cuda(action: Action, device: torch.device) -> float:
-    torch.cuda.synchronize(device)
-    before = torch.cuda.memory_allocated(device)
-    torch.cuda.reset_peak_memory_stats(device)
-    action()
-    torch.cuda.synchronize(device)
-    return float(torch.cuda.max_memory_allocated(device) - before)
 
 
 def _process_status(name: str) -> int:

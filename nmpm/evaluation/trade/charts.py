@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,25 +16,24 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.messages import counted
 from nmpm.evaluation.bootstrap import Floats
 from nmpm.evaluation.trade.choices import Kind
-from nmpm.evaluation.trade.models import OTHER_SCENES
 from nmpm.evaluation.trade.ranking import Point, Rank, rank
 from nmpm.evaluation.trade.scenes import Scenes
+from nmpm.evaluation.trade.sweep import OTHER_SCENES
 from nmpm.viz.panel import PanelRenderer
 from nmpm.viz.trajectories import LabelledTrajectories
 
-_MARKERS: Mapping[Kind, dict[str, Any]] = MappingProxyType(
+_EMULATOR = {"marker": "o", "color": "#2670c8", "label": "emulator"}
+_MARKERS: Mapping[tuple[Kind, bool], dict[str, Any]] = MappingProxyType(
     {
-        Kind.MODEL: {"marker": "o", "color": "#2670c8", "label": "emulator"},
-        Kind.OTHER: {"marker": "^", "color": "#8a4ab0", "label": "other predictor"},
-        Kind.SIMULATOR: {"marker": "s", "color": "#c8642a", "markerfacecolor": "none", "label": "simulator"},
+        (Kind.MODEL, False): _EMULATOR,
+        (Kind.MODEL, True): _EMULATOR | {"markerfacecolor": "none", "label": "emulator of other scenes"},
+        (Kind.OTHER, False): {"marker": "^", "color": "#8a4ab0", "label": "other predictor"},
+        (Kind.SIMULATOR, False): {"marker": "s", "color": "#c8642a", "markerfacecolor": "none", "label": "simulator"},
     }
 )
-_OTHER_SCENES: Mapping[str, Any] = MappingProxyType(
-    _MARKERS[Kind.MODEL] | {"markerfacecolor": "none", "label": "emulator of other scenes"}
-)
+"""Styles by kind, and by whether it was trained on other scenes."""
 _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
     {
         Kind.MODEL: {"lw": 1.6},
@@ -57,69 +55,56 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
     """
     ranks = rank(points)
     shown = [p for p in points if p.stable and p.batch == 1 and p.name in ranks and math.isfinite(p.milliseconds)]
-    marked = sorted((p for p in shown if p.kind in _MARKERS and not p.exact), key=_legend_order)
-    lines = [p for p in shown if p.kind not in _MARKERS and ranks[p.name].mean > 0]
-    least = min((ranks[p.name].low for p in shown if p.kind in _MARKERS and ranks[p.name].low > 0), default=0.0)
+    measured = [p for p in shown if p.kind not in (Kind.TRIVIAL, Kind.FLOOR)]
+    lines = [p for p in shown if p not in measured and ranks[p.name].mean > 0]
+    least = min((ranks[p.name].low for p in measured if ranks[p.name].low > 0), default=0.0)
     near = [p for p in lines if ranks[p.name].mean > least / _FAR]
     far = "; ".join(f"{p.name}: {ranks[p.name].mean:.1g}" for p in lines if p not in near)
 
     figure = _figure(9, 5.8)
     axes = figure.subplots()
-    for style, group in itertools.groupby(marked, key=_style):
-        _draw_points(axes, list(group), ranks, style)
+    marked = [p for p in measured if not p.exact]
+    for kind, style in _MARKERS.items():
+        if group := [p for p in marked if (p.kind, p.of_other_scenes) == kind]:
+            _draw_points(axes, group, ranks, style)
     for point in near:
         axes.axhline(ranks[point.name].mean, **_LINES[point.kind])
-    for point in shown:
-        if point.exact and point.kind is Kind.SIMULATOR:  # a logarithmic axis cannot show an error of 0
-            axes.axvline(point.milliseconds, color=_MARKERS[point.kind]["color"], lw=1, label="simulator as shipped")
-    _describe(axes, shown)
+    for point in measured:
+        if point.exact:  # a logarithmic axis cannot show an error of 0
+            axes.axvline(point.milliseconds, color="#c8642a", lw=1, label="simulator as shipped")
+    _scale(axes, measured)
+    machine = f"; {shown[0].times.hardware}, 1 thread, {shown[0].times.clock}" if shown else ""
+    axes.set(xlabel=f"milliseconds per frame, one scene at a time{machine}", ylabel="MSE of the full rollout")
     below = f"\n(below the picture: {far})" if far else ""
     axes.set_title(f"{scenes.name}: time and error on {len(scenes)} test scenes{below}")
     if marked:
-        figure.legend(loc="outside lower center", ncols=len(_MARKERS) + 2, frameon=False)
+        figure.legend(loc="outside lower center", ncols=len(_MARKERS) + 1, frameon=False)
     _write_names(axes, marked, near, ranks)
     _save(figure, path)
 
 
-def _legend_order(point: Point) -> tuple[int, bool]:
-    return list(_MARKERS).index(point.kind), point.of_other_scenes
-
-
-def _style(point: Point) -> Mapping[str, Any]:
-    return _OTHER_SCENES if point.of_other_scenes else _MARKERS[point.kind]
-
-
 def _draw_points(axes: Any, points: Sequence[Point], ranks: Mapping[str, Rank], style: Mapping[str, Any]) -> None:
     """Means with bootstrap intervals and time quartiles; members of the Pareto set in a ring."""
-    times = [point.milliseconds for point in points]
-    means = [ranks[point.name].mean for point in points]
-    ends = [(ranks[p.name].mean - ranks[p.name].low, ranks[p.name].high - ranks[p.name].mean) for p in points]
-    spread = [(p.milliseconds - p.quartiles[0], p.quartiles[2] - p.milliseconds) for p in points]
-    lengths = {"yerr": np.transpose(ends), "xerr": np.transpose(spread)}
+    times = np.array([p.milliseconds for p in points])
+    means = np.array([ranks[p.name].mean for p in points])
+    bounds = np.transpose([(ranks[p.name].low, ranks[p.name].high) for p in points])
+    quartiles = np.transpose([(p.quartiles[0], p.quartiles[2]) for p in points])
+    lengths = {"xerr": np.abs(quartiles - times), "yerr": np.abs(bounds - means)}
     axes.errorbar(times, means, **lengths, linestyle="none", ms=6, elinewidth=0.7, alpha=0.9, **style)
-    members = [p for p in points if ranks[p.name].member]
-    axes.plot(
-        [p.milliseconds for p in members], [ranks[p.name].mean for p in members], linestyle="none", marker="o", ms=13,
-        markerfacecolor="none", markeredgecolor="0.2", markeredgewidth=0.8,
-    )  # fmt: skip
+    members = [ranks[p.name].member for p in points]
+    ring = {"markerfacecolor": "none", "markeredgecolor": "0.2", "markeredgewidth": 0.8}
+    axes.plot(times[members], means[members], linestyle="none", marker="o", ms=13, **ring)
 
 
-def _describe(axes: Any, shown: Sequence[Point]) -> None:
-    """Logarithmic axes with names, and space beside the outermost points."""
-    machine = ""
-    if shown:
-        times = shown[0].times
-        machine = f"; {times.hardware}, {counted(shown[0].threads, 'thread')}, {times.clock}"
-    axes.set(
-        xscale="log", yscale="log", xlabel=f"milliseconds per frame, one scene at a time{machine}",
-        ylabel="MSE of the full rollout",
-    )  # fmt: skip
+def _scale(axes: Any, measured: Sequence[Point]) -> None:
+    """Logarithmic axes, with space beside the outermost points."""
+    axes.set(xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())
-    milliseconds = [point.milliseconds for point in shown if point.kind in _MARKERS]
-    if milliseconds:
+    if measured:
+        milliseconds = [point.milliseconds for point in measured]
         axes.set_xlim(min(milliseconds) / 1.4, max(milliseconds) * 1.15)
     axes.grid(visible=True, which="major", color="0.9", lw=0.7)
     axes.set_axisbelow(True)
@@ -127,13 +112,12 @@ def _describe(axes: Any, shown: Sequence[Point]) -> None:
 
 def _write_names(axes: Any, marked: Sequence[Point], lines: Sequence[Point], ranks: Mapping[str, Rank]) -> None:
     """Names beside points, joined to those that they had to leave, and above the left end of lines."""
-    names = [  # spaces keep them off the markers
-        axes.text(
-            p.milliseconds, ranks[p.name].mean, f"   {_short(p)}   ", fontsize=7, va="center",
-            color=_MARKERS[p.kind]["color"],
-        )
-        for p in marked
-    ]  # fmt: skip
+    names = []
+    for p in marked:
+        short = p.name.removeprefix("simulator, ").replace(OTHER_SCENES, "")
+        text = f"   {short.replace(' resolution', '').replace('bfloat16', 'bf16')}   "  # spaces keep it off the marker
+        colour = _MARKERS[p.kind, p.of_other_scenes]["color"]
+        names.append(axes.text(p.milliseconds, ranks[p.name].mean, text, fontsize=7, va="center", color=colour))
     left = axes.get_xlim()[0]
     texts = [
         axes.text(left, ranks[p.name].mean, f" {p.name}", fontsize=7.5, va="bottom", color=_LINES[p.kind]["color"])
@@ -142,11 +126,6 @@ def _write_names(axes: Any, marked: Sequence[Point], lines: Sequence[Point], ran
     if names:
         arrows = {"arrowstyle": "-", "color": "0.6", "lw": 0.6}
         adjust_text(names, ax=axes, objects=texts or None, iter_lim=_MOVES, arrowprops=arrows)
-
-
-def _short(point: Point) -> str:
-    shown = point.name.removeprefix("simulator, ").replace(OTHER_SCENES, "")
-    return shown.replace(" resolution", "").replace("bfloat16", "bf16")
 
 
 def draw_curves(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
@@ -179,7 +158,12 @@ def draw_frames(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
             columns[point.name] = point.frames
     (left, right), (low, high) = scenes.scene.domain[:2]
     width = max(_PANEL, round(_PANEL * ((right - left) / (high - low)) ** 0.5))
-    panel = PanelRenderer(_trajectories(columns, scenes), width)
+    first = scenes.recordings[0]
+    obstacle = first.obstacle.numpy() if len(first.obstacle) else None
+    material, gravity = first.material.numpy(), first.gravity.tolist()
+    panel = PanelRenderer(
+        LabelledTrajectories.from_scene(scenes.scene, columns, material, obstacle, gravity=gravity), width
+    )
     figure = _figure(len(columns) * width / 200, len(indices) * panel.height / 200 + 0.3, dpi=200)
     grid = figure.subplots(len(indices), len(columns), squeeze=False)
     for column, (name, frames) in zip(grid.T, columns.items(), strict=True):
@@ -196,13 +180,6 @@ def _first_forms(points: Sequence[Point]) -> list[Point]:
     """The points without the further forms of each model."""
     first = {point.settings.get("model") if point.kind is Kind.MODEL else point.name: point for point in points[::-1]}
     return list(first.values())[::-1]
-
-
-def _trajectories(columns: Mapping[str, Floats], scenes: Scenes) -> LabelledTrajectories:
-    first = scenes.recordings[0]
-    obstacle = first.obstacle.numpy() if len(first.obstacle) else None
-    material, gravity = first.material.numpy(), first.gravity.tolist()
-    return LabelledTrajectories.from_scene(scenes.scene, columns, material, obstacle, gravity=gravity)
 
 
 def _figure(width: float, height: float, dpi: int = _DPI) -> Figure:

@@ -1,8 +1,4 @@
-"""Choices: whatever predicts scenes in a comparison of time and error.
-
-Here are the interface, the simulator of the scenes, trivial predictors and those of other packages; `models.py` has the
-emulators.
-"""
+"""Choices: whatever predicts scenes in a comparison of time and error, be it an emulator, the simulator or another."""
 
 from __future__ import annotations
 
@@ -12,9 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import partial
 from importlib import import_module
-from types import MappingProxyType
 from typing import Any, Protocol
 
 import torch
@@ -22,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
+from nmpm.emulator import Emulator, rollout
 from nmpm.errors import ConfigError, DataError
-from nmpm.evaluation.comparison import free_fall, still
-from nmpm.evaluation.prediction_errors import energy_gain
+from nmpm.evaluation.prediction_errors import energy_gain, recorded_energy_gain
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -50,19 +45,6 @@ class Kind(StrEnum):
     FLOOR = "floor"
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """One predicted scene.
-
-    Args:
-        position: (1, T, N, D) of the recorded particles, in domain length.
-        gain: Energy gain of the choice's particles where these are others than the recorded ones, see `energy_gain`.
-    """
-
-    position: Tensor
-    gain: float | None = None
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Choice(ABC):
     """One way of predicting scenes, at one setting.
@@ -72,7 +54,6 @@ class Choice(ABC):
         name: Unique among the choices that are compared.
         settings: Its settings, by column of the table.
         batch: Scenes predicted at once when it is timed; predictions do not depend on it.
-        threads: Threads of torch when it is timed.
         device: Where it computes.
     """
 
@@ -80,7 +61,6 @@ class Choice(ABC):
     name: str
     settings: Settings = field(default_factory=dict)
     batch: int = 1
-    threads: int = 1
     device: torch.device = CPU
 
     @property
@@ -100,13 +80,17 @@ class Choice(ABC):
         """Frames that a rollout of so many frames computes: the time of a frame is its time over these."""
         return frames
 
-    def predict(self, scenes: Scenes, index: int) -> Prediction:
+    def predict(self, scenes: Scenes, index: int) -> tuple[Tensor, float]:
         """Predict all frames of one scene, which is not timed.
+
+        Returns:
+            (1, T, N, D) positions of the recorded particles, and the prediction's `energy_gain`.
 
         Raises:
             NmpmError: if it fails; a DataError if positions are not finite.
         """
-        return Prediction(require_finite(self.prepare(scenes, [index])(scenes.frames(index)).cpu().float()))
+        position = require_finite(self.prepare(scenes, [index])(scenes.frames(index)).cpu().float())
+        return position, recorded_energy_gain(scenes.scene, scenes.window([index]), position)
 
 
 def digest(plain: Any) -> str:
@@ -124,6 +108,30 @@ def require_finite(position: Tensor) -> Tensor:
     if bool(broken.any()):
         raise DataError(f"Positions are not finite from predicted frame {int(broken.nonzero()[0, 0]) + 1} on.")
     return position
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelChoice(Choice):
+    """A trained emulator, in evaluation mode, on the choice's device."""
+
+    emulator: Emulator
+    kind: Kind = Kind.MODEL
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        return {
+            "recipe": self.emulator.recipe.to_dict(),
+            "weights": weights_digest(self.emulator.state_dict()),
+            "device": self.device.type,
+            "runtime": self.emulator.runtime.name,
+        }
+
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        state = scenes.window(indices, 0).to(self.device).initial
+        return lambda frames: rollout(self.emulator, state, frames)
+
+    def computed_frames(self, frames: int) -> int:
+        return -(-frames // self.emulator.frames) * self.emulator.frames  # whole bundles
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,19 +165,20 @@ class SimulatorChoice(Choice):
     def computed_frames(self, frames: int) -> int:
         return frames + 1  # from the initial state on, of which a rollout leaves out two frames
 
-    def predict(self, scenes: Scenes, index: int) -> Prediction:
-        if self.preset is scenes.preset and not self.nudge:
-            return Prediction(scenes.window([index]).target)  # it made them
+    def predict(self, scenes: Scenes, index: int) -> tuple[Tensor, float]:
+        window = scenes.window([index])
+        if self.preset is scenes.preset and not self.nudge:  # it made the scenes
+            return window.target, recorded_energy_gain(scenes.scene, window, window.target)
         start, recording = self._draw(scenes, index), scenes.recordings[index]
         simulated = self._simulate(start, scenes.frames(index))
         first = recording.frames[0]
         position = require_finite(follow_nearest(first, start.position)(simulated)[2:].unsqueeze(0))
         if first.shape == simulated[0].shape:
-            return Prediction(position)
+            return position, recorded_energy_gain(scenes.scene, window, position)
         counts = torch.tensor(start.counts or (len(start.position),))
         material = torch.arange(len(counts)).repeat_interleave(counts)
         path = require_finite(simulated.unsqueeze(0))[0]
-        return Prediction(position, energy_gain(self.preset.scene, path, material, recording.gravity))
+        return position, energy_gain(self.preset.scene, path, material, recording.gravity)
 
     def _draw(self, scenes: Scenes, index: int) -> InitialState:
         start = self.preset.draw(scenes.seeds[index])
@@ -211,11 +220,7 @@ class Predictor(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictorChoice(Choice):
-    """A trivial predictor, or one of another package.
-
-    Args:
-        predictor: From particles and a number of frames to positions.
-    """
+    """A trivial predictor, or one of another package: from particles and a number of frames to positions."""
 
     predictor: Callable[[Particles, int], Tensor]
 
@@ -236,17 +241,6 @@ class PredictorChoice(Choice):
         return predict
 
 
-TRIVIAL: Mapping[str, Callable[[Scene, Particles, int], Tensor]] = MappingProxyType(
-    {"nothing moves": lambda _, state, frames: still(state, frames).contiguous(), "free fall": free_fall}
-)
-"""Trivial predictors, by name."""
-
-
-def trivial_choice(name: str, scene: Scene) -> PredictorChoice:
-    """A predictor of `TRIVIAL`."""
-    return PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=partial(TRIVIAL[name], scene))
-
-
 def find_factory(path: str) -> Callable[[Scene], Predictor]:
     """Import what makes a predictor for a scene; the code in its module runs.
 
@@ -254,25 +248,19 @@ def find_factory(path: str) -> Callable[[Scene], Predictor]:
         path: `module:factory`, called with the scene, or `module:factory:argument`, called with that text too.
 
     Raises:
-        ConfigError: if there is no such factory.
+        ConfigError: if there is no such factory; when called, if it makes no `Predictor`.
     """
     module, _, rest = path.partition(":")
-    factory, *argument = rest.split(":", 1)
+    name, *argument = rest.split(":", 1)
     try:
-        make = getattr(import_module(module), factory)
+        factory = getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"--predictors {path}: {one_line(error)}. Give module:factory[:argument].") from error
-    return lambda scene: make(scene, *argument)
 
+    def make(scene: Scene) -> Predictor:
+        predictor: Predictor = factory(scene, *argument)
+        if not callable(predictor) or not isinstance(getattr(predictor, "name", None), str):
+            raise ConfigError(f"--predictors {path}: it returned {predictor!r}, no callable with a name.")
+        return predictor
 
-def foreign_choice(make: Callable[[Scene], Predictor], scene: Scene) -> PredictorChoice:
-    """A predictor of another package as a choice.
-
-    Raises:
-        ConfigError: if it is no `Predictor`.
-    """
-    predictor = make(scene)
-    if not callable(predictor) or not isinstance(getattr(predictor, "name", None), str):
-        raise ConfigError(f"The factory of a predictor returned {predictor!r}, no callable with a name.")
-    settings = {"model": predictor.name}
-    return PredictorChoice(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor)
+    return make

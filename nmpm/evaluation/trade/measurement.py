@@ -11,36 +11,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import one_line
 from nmpm._support.progress import Step, progress_bar
 from nmpm.errors import NmpmError
-from nmpm.evaluation.bootstrap import Floats
 from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, peak_bytes
-from nmpm.evaluation.prediction_errors import (
-    Measures,
-    instability,
-    into_domain,
-    measure_errors,
-    recorded_energy_gain,
-    squared_errors,
-)
+from nmpm.evaluation.prediction_errors import Measures, instability, into_domain, measure_errors, squared_errors
 from nmpm.evaluation.trade.choices import Choice, digest
 from nmpm.evaluation.trade.ranking import Point, Times
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.sweep import Sweep, Timing
 
 _WARM_UP = 16  # frames: kernels are chosen and code is compiled in them
+_TIMES = "times, all choices in turn"
 
 
 class Store:
-    """Measurements in a folder.
-
-    Args:
-        folder: Made when something is written.
-    """
+    """Measurements in a folder, which is made when something is written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder)
@@ -82,18 +70,21 @@ def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Stor
 def _point(choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times, scenes: Scenes) -> Point:
     length = min(scenes.frames(index) for index in range(len(scenes)))
     names = dict.fromkeys(name for row in rows for name in row.get("errors", {}))
+    shown = None
+    if "frames" in rows[0]:
+        flat = np.frombuffer(base64.b64decode(rows[0]["frames"]), "<f4").astype(np.float64)
+        shown = flat.reshape(-1, *scenes.recordings[0].frames.shape[1:])
     return Point(
         kind=choice.kind,
         name=choice.name,
         settings=choice.settings,
         batch=choice.batch,
-        threads=choice.threads,
         device=choice.device.type,
         times=times,
         errors={name: np.array([row.get("errors", {}).get(name, np.nan) for row in rows]) for name in names},
         failures={index: row["failed"] for index, row in enumerate(rows) if "failed" in row},
         curves=np.array([row.get("curve", [np.nan] * length)[:length] for row in rows]),
-        frames=_unpack(rows[0].get("frames"), scenes),
+        frames=shown,
     )
 
 
@@ -114,41 +105,29 @@ def measure_accuracy(
 def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measures) -> dict[str, Any]:
     """Errors by name, squared error of each frame and, of the first scene, the shown frames; or why it failed.
 
-    A prediction that gains energy has both: "failed" with the reason, and errors.
+    A prediction that gains energy has both: "failed" with the reason, and errors. Frames (F, N, D) are base64 of
+    little-endian float32.
     """
     window = scenes.window([index])
     try:
-        prediction = choice.predict(scenes, index)
+        predicted, gain = choice.predict(scenes, index)
     except NmpmError as error:
         if is_machine_failure(error):
             raise
         return {"failed": one_line(error)}
-    predicted, gain = prediction.position, prediction.gain
     row: dict[str, Any] = {
         "errors": measure_errors(scenes.scene, window, predicted, measures),
         "curve": [float(f"{value:.5g}") for value in squared_errors(window, predicted).tolist()],
     }
-    if reason := instability(recorded_energy_gain(scenes.scene, window, predicted) if gain is None else gain):
+    if reason := instability(gain):
         row["failed"] = reason
     if index == 0:
-        row["frames"] = _pack(into_domain(scenes.scene, predicted[0][scenes.shown_frames()]))
+        shown = into_domain(scenes.scene, predicted[0][scenes.shown_frames()]).numpy().astype("<f4")
+        row["frames"] = base64.b64encode(shown.tobytes()).decode("ascii")
     return row
 
 
-def _pack(frames: Tensor) -> str:
-    """Positions (F, N, D) as base64 of little-endian float32."""
-    return base64.b64encode(frames.contiguous().numpy().astype("<f4").tobytes()).decode("ascii")
-
-
-def _unpack(text: str | None, scenes: Scenes) -> Floats | None:
-    if text is None:
-        return None
-    particles, dim = scenes.recordings[0].frames.shape[1:]
-    flat = np.frombuffer(base64.b64decode(text), "<f4").astype(np.float64)
-    return flat.reshape(-1, particles, dim)
-
-
-@dataclass
+@dataclass(eq=False)
 class _Runner:
     """A choice that is timed.
 
@@ -163,9 +142,6 @@ class _Runner:
     key: dict[str, Any]
     stored: dict[str, Any]
     warm: bool = False
-
-    def lacks(self, turn: int) -> bool:
-        return str(turn) not in self.stored and "failed" not in self.stored
 
 
 def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store, step: Step) -> list[Times]:
@@ -182,26 +158,21 @@ def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, sto
     runners: dict[str, _Runner] = {}  # one for choices that are the same, such as the twin and that many substeps
     for choice, key in zip(choices, keys, strict=True):
         runners.setdefault(digest(key), _Runner(choice, key, store.read("times", key)))
+    reference = next(iter(runners.values()))
     for turn in range(timing.rounds):
-        timed = _time_all(list(runners.values()), scenes, turn, timing, store, step)
-        step("times, all choices in turn", len(choices) - timed)
+        missing = [r for r in runners.values() if str(turn) not in r.stored and "failed" not in r.stored]
+        timed = list(dict.fromkeys([reference, *missing])) if missing else []
+        shift = turn % max(1, len(timed))
+        spent: dict[_Runner, float | None] = {}
+        for runner in timed[shift:] + timed[:shift]:
+            spent[runner] = _time_one(runner, scenes, turn, timing)
+            step(_TIMES)
+        for runner in missing:
+            if spent[runner] is not None:
+                runner.stored[str(turn)] = [spent[runner], spent[reference]]
+            store.write("times", runner.key, runner.stored)
+        step(_TIMES, len(choices) - len(timed))
     return [_times(runners[digest(key)], timing) for key in keys]
-
-
-def _time_all(runners: Sequence[_Runner], scenes: Scenes, turn: int, timing: Timing, store: Store, step: Step) -> int:
-    """Time the runners that lack a round, and the first for the ratio; returns how many were timed."""
-    missing = [runner for runner in runners if runner.lacks(turn)]
-    needed = [runner for runner in runners if runner in missing or (missing and runner is runners[0])]
-    shift = turn % max(1, len(needed))
-    spent: dict[int, float | None] = {}
-    for runner in needed[shift:] + needed[:shift]:
-        spent[id(runner)] = _time_one(runner, scenes, turn, timing)
-        step("times, all choices in turn")
-    for runner in missing:
-        if spent[id(runner)] is not None:
-            runner.stored[str(turn)] = [spent[id(runner)], spent[id(runners[0])]]
-        store.write("times", runner.key, runner.stored)
-    return len(needed)
 
 
 def _times(runner: _Runner, timing: Timing) -> Times:
@@ -222,23 +193,22 @@ def _times_key(choice: Choice, scenes: Scenes, timing: Timing) -> dict[str, Any]
         "scenes": list(scenes.digests[:used]),
         "frames": timing.frames,
         "batch": choice.batch,
-        "threads": choice.threads,
-        "clock": clock_for(choice.device, choice.threads)[0],
+        "clock": clock_for(choice.device)[0],
         "hardware": describe_device(choice.device),
         "torch": torch.__version__,
     }
 
 
 def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> float | None:
-    """Milliseconds per computed frame and scene; None where the choice fails, which is stored.
+    """Milliseconds per computed frame and scene, with one thread of torch; None where the choice fails.
 
-    Where the machine fails the error is raised, so that the round is repeated the next time.
+    The failure is stored, but where the machine fails the error is raised, so that the round is repeated later.
     """
     choice = runner.choice
     indices = [(turn + offset) % len(scenes) for offset in range(choice.batch)]
     frames = min(timing.frames, *(min(scenes.moving_frames(i), scenes.frames(i)) for i in indices))
     before = torch.get_num_threads()
-    torch.set_num_threads(choice.threads)
+    torch.set_num_threads(1)
     try:
         run = choice.prepare(scenes, indices)
         if not runner.warm:
@@ -247,7 +217,7 @@ def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> flo
         if "memory" not in runner.stored:
             memory = peak_bytes(lambda: run(frames), choice.device)
             runner.stored["memory"] = memory if memory == memory else None  # (NaN is no JSON)
-        _, clock = clock_for(choice.device, choice.threads)
+        _, clock = clock_for(choice.device)
         start = clock()
         run(frames)
         return 1e3 * (clock() - start) / (choice.computed_frames(frames) * choice.batch)

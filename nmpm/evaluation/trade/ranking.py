@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +46,7 @@ class Point:
     """A measured choice.
 
     Args:
-        kind: What it is.
-        name: Unique among the points.
-        settings: Of the choice, by name.
-        batch, threads, device: How it was timed.
+        kind, name, settings, batch, device: Of the choice.
         times: Its times.
         errors: (S,) of each scene by name; NaN where the prediction failed.
         failures: Reasons for which scenes have no errors, or are unstable, by the scene's number.
@@ -60,7 +58,6 @@ class Point:
     name: str
     settings: Settings
     batch: int
-    threads: int
     device: str
     times: Times
     errors: Mapping[str, Floats]
@@ -70,8 +67,9 @@ class Point:
 
     @cached_property
     def quartiles(self) -> tuple[float, float, float]:
-        """Milliseconds per frame and scene: lower quartile, median, upper quartile."""
-        return quartiles(self.times.milliseconds)
+        """Milliseconds per frame and scene: lower quartile, median, upper quartile; NaN where it was not timed."""
+        low, middle, high = np.percentile(self.times.milliseconds or [math.nan], (25, 50, 75)).tolist()
+        return low, middle, high
 
     @property
     def milliseconds(self) -> float:
@@ -81,7 +79,7 @@ class Point:
     @property
     def ratio(self) -> float:
         """Median over rounds of the time over the reference's."""
-        return quartiles(self.times.ratios)[1]
+        return float(np.median(self.times.ratios or [math.nan]))
 
     @property
     def stable(self) -> bool:
@@ -107,12 +105,6 @@ class Point:
     def of_other_scenes(self) -> bool:
         """Whether it is a model that was trained on other scenes."""
         return "scenes_differ_in" in self.settings
-
-
-def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    """Lower quartile, median and upper quartile; NaN where there are no values."""
-    low, middle, high = np.percentile(values or [math.nan], (25, 50, 75)).tolist()
-    return low, middle, high
 
 
 def measure_names(points: Sequence[Point]) -> list[str]:
@@ -177,36 +169,12 @@ def pareto_probabilities(times: Floats, errors: Floats) -> Floats:
     return np.asarray(np.concatenate(members).mean(axis=0))
 
 
-@dataclass(frozen=True)
-class Recommendation:
-    """The choice to run for budgets from `milliseconds` up to that of the next one.
-
-    Args:
-        milliseconds: Smallest budget per frame for which it holds.
-        name: Name of the choice.
-        sentence: The advice in words.
-    """
+class Recommendation(NamedTuple):
+    """The choice to run for budgets from so many milliseconds per frame up to those of the next one, in words."""
 
     milliseconds: float
     name: str
     sentence: str
-
-
-def recommend(points: Sequence[Point]) -> list[Recommendation]:
-    """Recommend a choice for any budget of milliseconds per frame of one scene: steps from the least budget on.
-
-    Args:
-        points: All of them; those that predict several scenes at once are left out, as a budget is for one scene.
-    """
-    ranks = rank(points)
-    usable = [point for point in points if point.competes and point.batch == 1 and point.name in ranks]
-    steps: list[Recommendation] = []
-    least = math.inf
-    for point in sorted(usable, key=lambda point: (point.milliseconds, ranks[point.name].mean)):
-        if ranks[point.name].mean < least:
-            least = ranks[point.name].mean
-            steps.append(Recommendation(point.milliseconds, point.name, _sentence(point, usable, ranks)))
-    return steps
 
 
 _DO = {
@@ -218,51 +186,56 @@ _DO = {
 _BEST = {Kind.MODEL: "the best emulator", Kind.SIMULATOR: "the best simulator setting"}
 
 
-def _sentence(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank]) -> str:
-    if point.exact:
-        return f"Run the simulator as it is ({point.milliseconds:.3g} ms per frame): it made these data."
+def recommend(points: Sequence[Point]) -> list[Recommendation]:
+    """Recommend a choice for any budget of milliseconds per frame of one scene: steps from the least budget on.
+
+    Args:
+        points: All of them; those that predict several scenes at once are left out, as a budget is for one scene.
+    """
+    ranks = rank(points)
     unit = Unit.of(one.mean for one in ranks.values())
-    competitor = _competitor(point, usable, ranks)
-    beside = f"; {_BEST[competitor.kind]} there, {competitor.name}, has " if competitor else ""
-    beside += _error(ranks[competitor.name], unit) if competitor else ""
-    return (
-        f"{_DO[point.kind]} {point.name}: MSE of the full rollout {_error(ranks[point.name], unit)}, "
-        f"{point.milliseconds:.3g} ms per frame{beside}."
-    )
 
+    def error_of(point: Point) -> str:
+        one = ranks[point.name]
+        return f"{unit.show(one.mean, 3)} ({unit.show(one.low, 3)} to {unit.show(one.high, 3)}){unit}"
 
-def _competitor(point: Point, usable: Sequence[Point], ranks: Mapping[str, Rank]) -> Point | None:
-    """The most accurate emulator or simulator, of another kind than the point, within the same time."""
-    others = [
-        other
-        for other in usable
-        if other.kind in _BEST and other.kind is not point.kind and other.milliseconds <= point.milliseconds
-    ]
-    return min(others, key=lambda other: ranks[other.name].mean, default=None)
+    def describe(point: Point, faster: Sequence[Point]) -> str:
+        if point.exact:
+            return f"Run the simulator as it is ({point.milliseconds:.3g} ms per frame): it made these data."
+        facts = f"MSE of the full rollout {error_of(point)}, {point.milliseconds:.3g} ms per frame"
+        others = [other for other in faster if other.kind in _BEST and other.kind is not point.kind]
+        if others:
+            best = min(others, key=lambda other: ranks[other.name].mean)
+            facts += f"; {_BEST[best.kind]} there, {best.name}, has {error_of(best)}"
+        return f"{_DO[point.kind]} {point.name}: {facts}."
 
-
-def _error(rank: Rank, unit: Unit) -> str:
-    return f"{unit.show(rank.mean, 3)} ({unit.show(rank.low, 3)} to {unit.show(rank.high, 3)}){unit}"
+    usable = [point for point in points if point.competes and point.batch == 1 and point.name in ranks]
+    usable.sort(key=lambda point: (point.milliseconds, ranks[point.name].mean))
+    steps: list[Recommendation] = []
+    least = math.inf
+    for index, point in enumerate(usable):
+        if ranks[point.name].mean < least:
+            least = ranks[point.name].mean
+            steps.append(Recommendation(point.milliseconds, point.name, describe(point, usable[:index])))
+    return steps
 
 
 def beside_simulator(points: Sequence[Point]) -> str:
     """The most accurate emulator beside the simulator's stable settings, in a sentence; empty without emulators."""
     timed = [point for point in points if point.competes and math.isfinite(point.mean("mse"))]
-    simulators = [point for point in timed if point.kind is Kind.SIMULATOR]
     models = [point for point in timed if point.kind is Kind.MODEL and point.batch == 1]
     if not models:
         return ""
     model = min(models, key=lambda model: model.mean("mse"))
-    as_fast = [point for point in simulators if point.milliseconds <= model.milliseconds]
-    as_good = [point for point in simulators if point.mean("mse") <= model.mean("mse")]
-    error = model.mean("mse")
+    time, error = model.milliseconds, model.mean("mse")
+    simulators = [(point.milliseconds, point.mean("mse"), point) for point in timed if point.kind is Kind.SIMULATOR]
+    as_fast = [(its_error / error, point.name) for its_time, its_error, point in simulators if its_time <= time]
+    as_good = [(its_time / time, point.name) for its_time, its_error, point in simulators if its_error <= error]
     fast, good = "no stable simulator setting is as fast", "none is as accurate"
     if as_fast:
-        best = min(as_fast, key=lambda point: point.mean("mse"))
-        fast = f"{best.name} is no slower and has {best.mean('mse') / error:.2g} × its error"
+        share, name = min(as_fast)
+        fast = f"{name} is no slower and has {share:.2g} × its error"
     if as_good:
-        cheapest = min(as_good, key=lambda point: point.milliseconds)
-        good = (
-            f"{cheapest.name} is no less accurate and takes {cheapest.milliseconds / model.milliseconds:.2g} × its time"
-        )
+        share, name = min(as_good)
+        good = f"{name} is no less accurate and takes {share:.2g} × its time"
     return f"The most accurate emulator, {model.name}, beside the simulator: {fast}; {good}."

@@ -6,11 +6,10 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -22,17 +21,7 @@ from nmpm.evaluation.trade.choices import Kind
 from nmpm.evaluation.trade.ranking import Point, beside_simulator, measure_names, rank, recommend
 from nmpm.evaluation.trade.scenes import Scenes
 
-SETTINGS = ("model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
-"""Columns of settings; empty where one does not apply."""
-
-COLUMNS = (
-    "dataset", "scenes", "particles", "kind", "name", *SETTINGS, "batch", "threads", "device", "hardware", "clock",
-    "ms_per_frame", "ms_lower_quartile", "ms_upper_quartile", "ratio_to_reference", "ms_per_second",
-    "frames_per_second", "memory_mb", "stable", "failed_scenes", "failure",
-    "error", "value", "low", "high", "pareto", "pareto_probability",
-)  # fmt: skip
-"""Columns of `csv_text`: one row for each point and error."""
-
+_SETTINGS = ("model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
 _NAME = 12  # least width of the names in a terminal
 _LIKELY = 0.05  # probability from which on a point may be in the Pareto set
 
@@ -65,23 +54,32 @@ def csv_text(points: Sequence[Point], scenes: Scenes) -> str:
 
     Points that failed in a scene have their errors' columns empty.
     """
-    out = io.StringIO()
-    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for measure in measure_names(points):
         ranks = rank(points, measure)
         for point in points:
-            row = _row(point, scenes) | {"error": measure}
-            if point.name in ranks:
-                one = ranks[point.name]
-                row |= {"value": one.mean, "low": one.low, "high": one.high}
-                if point.competes:
-                    row |= {"pareto": one.member, "pareto_probability": one.probability}
-            writer.writerow({name: _cell(value) for name, value in row.items()})
+            one = ranks.get(point.name)
+            rows.append(
+                {
+                    **_describe_row(point, scenes),
+                    "error": measure,
+                    "value": one.mean if one else "",
+                    "low": one.low if one else "",
+                    "high": one.high if one else "",
+                    "pareto": one.member if one and point.competes else "",
+                    "pareto_probability": one.probability if one and point.competes else "",
+                }
+            )
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(rows[0]) if rows else [], lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        figures = {name: _figure(value) for name, value in row.items() if isinstance(value, float)}
+        writer.writerow(row | {name: "" if value is None else f"{value:.5g}" for name, value in figures.items()})
     return out.getvalue()
 
 
-def _row(point: Point, scenes: Scenes) -> dict[str, object]:
+def _describe_row(point: Point, scenes: Scenes) -> dict[str, object]:
     low, middle, high = point.quartiles
     particles = sorted(recording.frames.shape[1] for recording in scenes.recordings)
     memory = point.times.memory
@@ -91,9 +89,8 @@ def _row(point: Point, scenes: Scenes) -> dict[str, object]:
         "particles": particles[len(particles) // 2],
         "kind": point.kind.value,
         "name": point.name,
-        **{name: point.settings.get(name, "") for name in SETTINGS},
+        **{name: point.settings.get(name, "") for name in _SETTINGS},
         "batch": point.batch,
-        "threads": point.threads,
         "device": point.device,
         "hardware": point.times.hardware,
         "clock": point.times.clock,
@@ -102,19 +99,12 @@ def _row(point: Point, scenes: Scenes) -> dict[str, object]:
         "ms_upper_quartile": high,
         "ratio_to_reference": point.ratio,
         "ms_per_second": middle / scenes.scene.dt,
-        "frames_per_second": 1e3 / middle if middle > 0 else math.nan,
+        "frames_per_second": 1e3 / middle if middle > 0 else "",
         "memory_mb": "" if memory is None else memory / 1e6,
         "stable": point.stable,
         "failed_scenes": len(point.failures),
         "failure": next(iter(point.failures.values()), ""),
     }
-
-
-def _cell(value: object) -> object:
-    """Floats with five digits, empty where they are not finite."""
-    if isinstance(value, float | np.floating):
-        return f"{value:.5g}" if math.isfinite(value) else ""
-    return value
 
 
 def describe(points: Sequence[Point], scenes: Scenes) -> dict[str, Any]:
@@ -167,7 +157,7 @@ def likely_points(points: Sequence[Point]) -> list[Point]:
 
 
 def summary_table(shown: Sequence[Point], points: Sequence[Point], scenes: Scenes) -> Table:
-    """The table of some of the points for a terminal, see `_summary`."""
+    """The table of some of the points for a terminal, see `_summary`; intervals stand on a line of their own."""
     title, caption, headings, rows = _summary(shown, points, scenes)
     table = Table(
         title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0,
@@ -175,9 +165,9 @@ def summary_table(shown: Sequence[Point], points: Sequence[Point], scenes: Scene
     )  # fmt: skip
     table.add_column(headings[0], min_width=_NAME)
     for heading in headings[1:]:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
+        table.add_column(heading.replace(" ", "\n"), justify="right", no_wrap=True)
+    for name, *figures in rows:
+        table.add_row(name, *(text.replace(" ", "\n") for text in figures))
     return table
 
 
@@ -200,19 +190,22 @@ def _summary(
     horizons = [name for name in measure_names(points) if name.startswith("mse@") and name != f"mse@{frames}"]
     ranks = rank(points)
     unit = Unit.of([point.mean(name) for point in shown for name in (*horizons, "mse", "emd")])
-    heads = [name.replace("mse", "MSE") for name in horizons]
-    ordered = sorted(shown, key=lambda point: (point.kind is Kind.FLOOR, point.milliseconds))
+
+    def show(value: float, digits: int = 3) -> str:
+        small = value != 0 and value < 1e-3 * 10.0**unit.exponent
+        return unit.show(value, 1 if small else digits) if math.isfinite(value) else ""
+
     rows = []
-    for point in ordered:
+    for point in sorted(shown, key=lambda point: (point.kind is Kind.FLOOR, point.milliseconds)):
         one, height = ranks.get(point.name), point.mean("height")
-        spread = f" ({_show(one.low, unit, 2)}–{_show(one.high, unit, 2)})" if one and one.low < one.high else ""
+        spread = f" ({show(one.low, 2)}–{show(one.high, 2)})" if one and one.low < one.high else ""
         rows.append(
             [
                 point.name + " *" * (one is not None and one.probability >= _LIKELY),
                 f"{point.milliseconds:.3g}" if math.isfinite(point.milliseconds) else "",
-                *(_show(point.mean(name), unit, 2) for name in horizons),
-                _show(point.mean("mse"), unit) + spread,
-                _show(point.mean("emd"), unit),
+                *(show(point.mean(name), 2) for name in horizons),
+                show(point.mean("mse")) + spread,
+                show(point.mean("emd")),
                 f"{height:.0%}" if math.isfinite(height) else "",
             ]
         )
@@ -220,31 +213,19 @@ def _summary(
         f"{scenes.name}: {len(scenes)} test scenes of {particles} particles",
         f"MSE{unit} of frames 1 to h. EMD{unit}: earth mover's distance in the last frame. Height: deviation of the"
         " particles' mean height in the last frame. ms: per frame, median. *: perhaps in the Pareto set.",
-        ["choice", "ms", *heads, f"MSE@{frames} (95%)", "EMD", "height"],
+        ["choice", "ms", *(name.replace("mse", "MSE") for name in horizons), f"MSE@{frames} (95%)", "EMD", "height"],
         rows,
     )
-
-
-def _show(value: float, unit: Unit, digits: int = 3) -> str:
-    if not math.isfinite(value):
-        return ""
-    return unit.show(value, digits if value == 0 or value >= 1e-3 * 10.0**unit.exponent else 1)
 
 
 def report_lines(points: Sequence[Point]) -> list[str]:
     """Recommendations by budget, the best emulator beside the simulator, models of other scenes, and failures."""
     lines = [f"from {step.milliseconds:.3g} ms per frame: {step.sentence}" for step in recommend(points)]
-    return [*lines, *filter(None, [beside_simulator(points)]), *_origins(points), *_failures(points)]
-
-
-def _origins(points: Sequence[Point]) -> Iterator[str]:
-    origins = {str(p.settings["model"]): p.settings["scenes_differ_in"] for p in points if p.of_other_scenes}
-    for model, differing in origins.items():
-        yield f"{model}: what differs from those of its training: {differing}"
-
-
-def _failures(points: Sequence[Point]) -> Iterator[str]:
+    lines += filter(None, [beside_simulator(points)])
+    origins = {p.settings["model"]: p.settings["scenes_differ_in"] for p in points if p.of_other_scenes}
+    lines += [f"{model}: what differs from those of its training: {facts}" for model, facts in origins.items()]
     for point in points:
         if not point.stable:
             scene, reason = next(iter(point.failures.items()))
-            yield f"{point.name}: unstable in {len(point.failures)} scenes, first in scene {scene}: {reason}"
+            lines.append(f"{point.name}: unstable in {len(point.failures)} scenes, first in scene {scene}: {reason}")
+    return lines

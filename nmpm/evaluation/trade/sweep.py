@@ -6,32 +6,38 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import resources
+from itertools import product
 from typing import Any, Literal
 
 import torch
 
 from nmpm._support.bounded_files import parse_yaml
+from nmpm._support.digests import short_digest
 from nmpm._support.messages import counted
 from nmpm._support.plain_data import from_plain
-from nmpm.emulator import Emulator
+from nmpm.emulator import NETWORK_PRECISIONS, Emulator
 from nmpm.errors import ConfigError
+from nmpm.evaluation.comparison import free_fall, still
 from nmpm.evaluation.prediction_errors import Measures
 from nmpm.evaluation.trade.choices import (
     CPU,
     Choice,
     Kind,
+    ModelChoice,
     Predictor,
+    PredictorChoice,
     SimulatorChoice,
     digest,
-    foreign_choice,
-    trivial_choice,
 )
-from nmpm.evaluation.trade.models import ModelSettings, model_choices
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.scene import Scene
 from nmpm.sim import Preset
 from nmpm.sim.predictability import twin_of
+
+OTHER_SCENES = " (of other scenes)"
+"""Ends the name of a model that was trained on other scenes, in the settings."""
 
 
 @dataclass(frozen=True)
@@ -48,44 +54,42 @@ class Timing:
 
 
 @dataclass(frozen=True)
+class ModelSettings:
+    """Settings of every model; all combinations of them are measured.
+
+    Args:
+        precision: Precisions of the network.
+        constraints: "held", with the model's constraints, and "free", without them.
+        runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
+        batch: Batch sizes, in scenes.
+    """
+
+    precision: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
+    constraints: tuple[Literal["held", "free"], ...] = ("held", "free")
+    runtime: tuple[str, ...] = ("eager",)
+    batch: tuple[int, ...] = (1, 8)
+
+
+@dataclass(frozen=True)
 class SimulatorSettings:
-    """Settings of the simulator, beside the shipped one.
+    """Settings of the simulator, beside the shipped one and its twin, see `nmpm.sim.predictability`.
 
     Args:
         coarser: Factors on the width of cells (SPH: on the spacing of particles); 1 is as shipped.
         substeps: Shares of the shipped number of substeps, which a coarser simulation divides by its factor. Those that
             turn out unstable are reported as such; `Preset.stable_substeps` is measured too.
+        nudge: Noise on the initial positions, as a share of the domain's longest side, that shows how sensitive the
+            scenes are; 0 for none.
     """
 
     coarser: tuple[int, ...] = (1, 2, 4)
     substeps: tuple[float, ...] = (1.0, 0.75, 0.5, 0.35, 0.25)
-
-
-@dataclass(frozen=True)
-class Floors:
-    """Limits of accuracy: errors of the simulator compared with itself.
-
-    Args:
-        nudge: Noise on the initial positions, as a share of the domain's longest side; 0 for none.
-        twin: Whether the simulator with half of its substeps is measured, see `nmpm.sim.predictability`.
-    """
-
     nudge: float = 1e-6
-    twin: bool = True
 
 
 @dataclass(frozen=True)
 class Sweep:
     """The choices to compare, and how they are measured.
-
-    Args:
-        scenes: Test scenes.
-        measures: Errors.
-        timing: Rounds and frames.
-        models: Settings of models.
-        simulator: Settings of the simulator.
-        trivial: Trivial predictors.
-        floors: Limits of accuracy.
 
     Raises:
         ConfigError: if a value is out of range.
@@ -96,8 +100,6 @@ class Sweep:
     timing: Timing = field(default_factory=Timing)
     models: ModelSettings = field(default_factory=ModelSettings)
     simulator: SimulatorSettings = field(default_factory=SimulatorSettings)
-    trivial: tuple[Literal["nothing moves", "free fall"], ...] = ("nothing moves", "free fall")
-    floors: Floors = field(default_factory=Floors)
 
     def __post_init__(self) -> None:
         positive: dict[str, Sequence[float]] = {
@@ -106,7 +108,6 @@ class Sweep:
             "timing.rounds": (self.timing.rounds,),
             "timing.frames": (self.timing.frames,),
             "models.batch": self.models.batch,
-            "models.threads": self.models.threads,
             "simulator.coarser": self.simulator.coarser,
             "simulator.substeps": self.simulator.substeps,
         }
@@ -162,20 +163,22 @@ def make_choices(
     """
     choices: list[Choice] = []
     if scenes.preset is not None:
-        choices += _simulators(sweep.simulator, scenes.preset)
-        choices += _floors(sweep.floors, scenes.preset)
+        choices += _simulator_choices(sweep.simulator, scenes.preset)
     for name, emulator in models.items():
-        choices += _without_repetitions(model_choices(sweep.models, name, emulator, scenes, device))
-    choices += [foreign_choice(make, scenes.scene) for make in predictors]
-    choices += [trivial_choice(name, scenes.scene) for name in sweep.trivial]
+        choices += _model_choices(sweep.models, name, emulator, scenes, device)
+    for predictor in (make(scenes.scene) for make in predictors):
+        settings = {"model": predictor.name}
+        choices.append(PredictorChoice(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor))
+    trivial = {"nothing moves": still, "free fall": partial(free_fall, scenes.scene)}
+    choices += [PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=each) for name, each in trivial.items()]
     names = [choice.name for choice in choices]
     if repeated := next((name for name in names if names.count(name) > 1), None):
         raise ConfigError(f"Two choices are called {repeated!r}: leave one out, or give it another name.")
     return choices
 
 
-def _simulators(settings: SimulatorSettings, preset: Preset) -> Iterator[Choice]:
-    """The simulator as shipped, then the others; settings that the preset itself refuses are left out."""
+def _simulator_choices(settings: SimulatorSettings, preset: Preset) -> Iterator[Choice]:
+    """The simulator as shipped, other settings but for those that the preset itself refuses, and the floors."""
     yield _simulator_choice(preset, 1)
     for factor in settings.coarser:
         try:
@@ -190,6 +193,10 @@ def _simulators(settings: SimulatorSettings, preset: Preset) -> Iterator[Choice]
                 yield _simulator_choice(dataclasses.replace(coarse, substeps=substeps), factor)
             except ConfigError:  # a wave would skip cells or particles
                 continue
+    twin = twin_of(preset)
+    yield _simulator_choice(twin, 1, f"twin: {twin.substeps} of {preset.substeps} substeps")
+    if settings.nudge:
+        yield _simulator_choice(preset, 1, f"simulator nudged by {settings.nudge:g}", settings.nudge)
 
 
 def _simulator_choice(preset: Preset, factor: int, name: str = "", nudge: float = 0.0) -> SimulatorChoice:
@@ -211,17 +218,41 @@ def _simulator_choice(preset: Preset, factor: int, name: str = "", nudge: float 
     )
 
 
-def _floors(floors: Floors, preset: Preset) -> Iterator[Choice]:
-    if floors.twin:
-        twin = twin_of(preset)
-        yield _simulator_choice(twin, 1, f"twin: {twin.substeps} of {preset.substeps} substeps")
-    if floors.nudge:
-        yield _simulator_choice(preset, 1, f"simulator nudged by {floors.nudge:g}", floors.nudge)
+def _model_choices(
+    settings: ModelSettings, model: str, emulator: Emulator, scenes: Scenes, device: torch.device
+) -> list[Choice]:
+    """All forms of a model, rebuilt for these scenes if it was trained on others, see `EmulatorRecipe.over`.
 
+    Forms that predict the same in the same way, such as those of a model without constraints, are listed once. The
+    first of each setting is not part of a form's name.
 
-def _without_repetitions(choices: Iterator[Choice]) -> Sequence[Choice]:
-    """The first of those that predict the same in the same way, such as a model without constraints with them off."""
-    first: dict[str, Choice] = {}
-    for choice in choices:
-        first.setdefault(digest([dict(choice.identity), choice.batch, choice.threads]), choice)
-    return list(first.values())
+    Raises:
+        ConfigError: if the model cannot take the scenes, naming it and the reason; if there is no such runtime.
+    """
+    differing = emulator.scene.differences(scenes.scene)
+    facts = {"model": model + OTHER_SCENES * bool(differing), "weights": short_digest(emulator.state_dict())}
+    if differing:
+        facts["scenes_differ_in"] = ", ".join(differing)
+        try:
+            emulator = emulator.over(scenes.scene)
+        except ConfigError as error:
+            raise ConfigError(f"The model {model} cannot predict the scenes of {scenes.name}. {error}") from error
+    forms: dict[str, Choice] = {}
+    for variant in product(settings.precision, settings.constraints, settings.runtime):
+        precision, constraints, runtime = variant
+        form = emulator.with_network(NETWORK_PRECISIONS[precision])
+        form = (form if constraints == "held" else form.unconstrained()).to(device).with_runtime(runtime)
+        first = settings.precision[0], settings.constraints[0], settings.runtime[0]
+        name = ", ".join([facts["model"], *(part for part, usual in zip(variant, first, strict=True) if part != usual)])
+        varied = {"precision": precision, "constraints": constraints, "runtime": runtime}
+        varied["cells"] = "×".join(map(str, form.grid.shape))
+        for batch in settings.batch:
+            choice = ModelChoice(
+                name=name if batch == 1 else f"{name}, batch {batch}",
+                emulator=form,
+                settings=facts | varied,
+                batch=batch,
+                device=device,
+            )
+            forms.setdefault(digest([dict(choice.identity), batch]), choice)
+    return list(forms.values())

@@ -73,4 +73,4 @@ def point(name, kind=Kind.MODEL, time=1.0, errors=(1.0, 1.0), batch=1, failures=
     times = Times((0.9 * time, time, 1.2 * time), (time,) * 3, 2e6, "CPU time", "a processor")
     measured = {"mse": values, "mse@8": values / 10, "emd": values}
     curves = np.repeat(values[:, None], 5, axis=1)
-    return Point(kind, name, settings, batch, 1, "cpu", times, measured, failures or {}, curves)
+    return Point(kind, name, settings, batch, "cpu", times, measured, failures or {}, curves)

@@ -38,7 +38,7 @@ def test_shipped_sweeps_are_read_and_that_of_trade_states_the_defaults():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("scene: 3", r"mine.yaml: unknown scene; keys: floors, measures"),
+        ("scene: 3", r"mine.yaml: unknown scene; keys: measures, models"),
         ("models: {batch: [0]}", r"models.batch: 0 must be a positive number"),
         ("models: {batch: 8}", r"mine.yaml, models: batch = 8 should be a list, each a whole number"),
         ("models: {precision: [float16]}", r"precision = .* should be a list, each one of float32, bfloat16"),

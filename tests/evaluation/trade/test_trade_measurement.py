@@ -11,7 +11,7 @@ import torch
 from nmpm.data.loading.recording import Recording
 from nmpm.emulator import rollout
 from nmpm.errors import ConfigError
-from nmpm.evaluation.comparison import free_fall
+from nmpm.evaluation.comparison import free_fall, still
 from nmpm.evaluation.prediction_errors import (
     field_error,
     into_domain,
@@ -19,7 +19,7 @@ from nmpm.evaluation.prediction_errors import (
     recorded_energy_gain,
 )
 from nmpm.evaluation.trade import Kind, Scenes, Store, measure
-from nmpm.evaluation.trade.choices import PredictorChoice, SimulatorChoice, trivial_choice
+from nmpm.evaluation.trade.choices import PredictorChoice, SimulatorChoice
 from nmpm.evaluation.trade.measurement import measure_accuracy, measure_times
 from nmpm.evaluation.trade.report import csv_text
 from nmpm.evaluation.trade.sweep import Timing
@@ -45,6 +45,10 @@ def made(name, scenes, make):
         return make(scenes.window([index], frames).target)
 
     return PredictorChoice(kind=Kind.OTHER, name=name, predictor=predict)
+
+
+def still_choice():
+    return PredictorChoice(kind=Kind.TRIVIAL, name="nothing moves", predictor=still)
 
 
 def ignore(*_):
@@ -77,7 +81,7 @@ def test_an_interrupted_measurement_goes_on_to_the_same_errors(scenes, choices, 
 def test_errors_are_measured_anew_where_a_fact_of_the_scene_is_another(facts, tmp_path):
     scenes, measures, store = flow(0.1, [0.01] * 8), tiny_sweep().measures, Store(tmp_path)
     other = dataclasses.replace(scenes, scene=dataclasses.replace(scenes.scene, **facts))
-    choice = trivial_choice("nothing moves", scenes.scene)
+    choice = still_choice()
     for measured in (scenes, other):
         measure_accuracy(choice, measured, measures, store, ignore)
     (path,) = (tmp_path / "points").iterdir()
@@ -202,7 +206,7 @@ def test_times_are_per_frame_that_is_computed(scenes, choices, monkeypatch, tmp_
 
 def test_another_choice_is_timed_beside_the_reference_alone(scenes, choices, tmp_path, monkeypatch):
     store, timing, prepared = Store(tmp_path), Timing(rounds=1, frames=3), []
-    reference, other = choices[0], trivial_choice("free fall", scenes.scene)
+    reference, other = choices[0], still_choice()
     new = PredictorChoice(kind=Kind.OTHER, name="new", predictor=Shifted(scenes.scene))
     first = measure_times([reference, other], scenes, timing, store, ignore)
     for kind in (SimulatorChoice, PredictorChoice):
@@ -256,9 +260,8 @@ def test_a_simulation_of_larger_particles_is_judged_by_their_own_energy(tmp_path
     crowded[: len(first) // 2] = start[np.argmin(start[:, 1])]  # half of them follow the one that rises
     scenes = drops(preset, crowded)
     simulate_as(rise_and_fall, monkeypatch)
-    predicted = coarser.predict(scenes, 0)
-    followed = recorded_energy_gain(scenes.scene, scenes.window([0]), predicted.position)
-    assert followed > 0.05 > abs(predicted.gain)
+    position, gain = coarser.predict(scenes, 0)
+    assert recorded_energy_gain(scenes.scene, scenes.window([0]), position) > 0.05 > abs(gain)
     (point,) = run([coarser], scenes, tmp_path / "stable")
     assert point.stable
     simulate_as(lambda start, frames: start + 0.002 * np.arange(frames + 1)[:, None, None] ** 2, monkeypatch)
