@@ -169,8 +169,10 @@ def make_choices(
     for predictor in (make(scenes.scene) for make in predictors):
         settings = {"model": predictor.name}
         choices.append(PredictorChoice(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor))
-    trivial = {"nothing moves": still, "free fall": partial(free_fall, scenes.scene)}
-    choices += [PredictorChoice(kind=Kind.TRIVIAL, name=name, predictor=each) for name, each in trivial.items()]
+    choices += [
+        PredictorChoice(kind=Kind.TRIVIAL, name="nothing moves", predictor=still),
+        PredictorChoice(kind=Kind.TRIVIAL, name="free fall", predictor=partial(free_fall, scenes.scene)),
+    ]
     names = [choice.name for choice in choices]
     if repeated := next((name for name in names if names.count(name) > 1), None):
         raise ConfigError(f"Two choices are called {repeated!r}: leave one out, or give it another name.")
