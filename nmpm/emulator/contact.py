@@ -2,8 +2,9 @@
 
 An obstacle is where the solid fraction of the grid, interpolated linearly, exceeds `SURFACE`. A path stops before it
 gets deeper than that, and goes on straight along the surface as far as it can; particles that an obstacle has moved
-over are pushed out. Frames are sampled in pieces of at most half a cell, so that nothing jumps over a wall of one cell;
-steps and slides of more than 32 cells fall into longer pieces, which bounds time and memory.
+over are pushed out. Positions that are NaN stay so: nothing hides them from later checks. Frames are sampled in pieces
+of at most half a cell, so that nothing jumps over a wall of one cell; steps and slides of more than 32 cells fall into
+longer pieces, which bounds time and memory.
 
 On a CPU only particles that touch an obstacle are treated, in as many pieces as the fastest needs. Elsewhere branching
 on values would halt the device: all particles are treated, in the largest number of pieces, with masks.
@@ -92,7 +93,8 @@ class Contact:
         finer = _pieces(longest.unsqueeze(1))[scene]
         held = _slid(depth, mine, touch, count, finer, int(finer.max()))
         if bool(stuck.any()):
-            held[stuck] = _pushed_out(partial(self._depth, scene[stuck]), begin[stuck], path.shape[1])
+            out = _pushed_out(partial(self._depth, scene[stuck]), begin[stuck], path.shape[1])
+            held[stuck] = torch.where(mine[stuck].isnan(), mine[stuck], out)
         path = path.clone()
         path[scene, :, particle] = held
         return path
@@ -124,7 +126,8 @@ class Contact:
         for (begin, mine, counts, inside), touch in zip(rows, touches, strict=True):
             held = _slid(self._depth_of_all, mine, touch, counts, _spread(finer, len(begin)), _MAX_PIECES)
             out = _pushed_out(self._depth_of_all, begin, frames)
-            held = torch.where(inside[:, None, None], out, torch.where(touch.hits[:, None, None], held, mine))
+            held = torch.where(touch.hits[:, None, None], held, mine)
+            held = torch.where(inside[:, None, None] & ~mine.isnan(), out, held)
             paths.append(held.unflatten(0, (batch, -1)).transpose(1, 2))
         return torch.cat(paths, dim=2)
 

@@ -7,7 +7,7 @@ kernels of `nmpm.emulator.fused`. `steps_for` chooses. Only the network is compu
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -160,14 +160,14 @@ def steps_for(emulator: Emulator, particles: Particles, solid: Tensor) -> Steps:
     parameters, is_float32 = emulator.kernel_parameters, emulator.precision == torch.float32
     if parameters is None or not is_float32 or not kernels_take(*motion, particles.gravity):
         return TensorSteps(emulator)
-    if torch.compiler.is_compiling() or _needs_gradients(*fixed):
+    if torch.compiler.is_compiling() or _need_gradients(fixed):
         return TensorSteps(emulator)
     if emulator.training:
         return TrainingSteps(emulator, parameters) if parameters.trains else TensorSteps(emulator)
-    if _needs_gradients(*motion, *emulator.parameters()):
+    if _need_gradients(motion) or _need_gradients(emulator.parameters()):
         return TensorSteps(emulator)
     return FusedSteps(emulator, parameters)
 
 
-def _needs_gradients(*tensors: Tensor) -> bool:
+def _need_gradients(tensors: Iterable[Tensor]) -> bool:
     return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)

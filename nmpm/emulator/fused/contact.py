@@ -212,7 +212,8 @@ def push_out(cells: Any, path: Any, obstacle: Any, grid: Any, bounds: Any, rows:
             for d in range(dim):
                 part = np.float32(frame + 1) / np.float32(frames)
                 place = cells[p, d] + (points[best, d] - cells[p, d]) * part
-                path[frame, p, d] = confine(place, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+                if not np.isnan(path[frame, p, d]):
+                    path[frame, p, d] = confine(place, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
 
 
 @jit

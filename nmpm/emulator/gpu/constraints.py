@@ -138,8 +138,8 @@ def hold(path, share, sums, free, way, lengths, frames, count, tiles, left, righ
         passed, time = frame * pieces - first, frame / frames
         gone = tl.minimum(passed / remaining, part)
         slides, stuck = (first >= 0) & (passed > 0), first == -2
-        x = tl.where(slides, last_x + along_x * gone, tl.where(stuck, start_x + out_x * time, x))
-        y = tl.where(slides, last_y + along_y * gone, tl.where(stuck, start_y + out_y * time, y))
+        x = tl.where(slides, last_x + along_x * gone, tl.where(stuck & (x == x), start_x + out_x * time, x))
+        y = tl.where(slides, last_y + along_y * gone, tl.where(stuck & (y == y), start_y + out_y * time, y))
         store(path, begin + frame * count, confine(x, left, right), confine(y, down, up), active)
 
 

@@ -34,14 +34,6 @@ class _Weight:
     address: int
     version: int
 
-    def is_unchanged(self) -> bool:
-        tensor = self.tensor
-        return (
-            self.store.get(self.name) is tensor
-            and tensor._version == self.version
-            and tensor.data_ptr() == self.address
-        )
-
 
 @dataclass(frozen=True)
 class _Compiled(Generic[P]):
@@ -50,6 +42,16 @@ class _Compiled(Generic[P]):
     network: nn.Module
     weights: list[_Weight]
     program: P
+
+    def is_current(self) -> bool:
+        """Whether the module has the same weights, unchanged: asked in each call, hence a loop without calls."""
+        for weight in self.weights:
+            tensor = weight.tensor
+            if weight.store.get(weight.name) is not tensor or tensor._version != weight.version:
+                return False
+            if tensor.data_ptr() != weight.address:
+                return False
+        return True
 
 
 def _weights(network: nn.Module) -> list[_Weight]:
@@ -75,7 +77,7 @@ class Programs(Generic[P]):
         key = id(network), settings
         with self._lock:
             compiled = self._compiled.get(key)
-            if compiled is None or not all(weight.is_unchanged() for weight in compiled.weights):
+            if compiled is None or not compiled.is_current():
                 compiled = self._compiled[key] = _Compiled(network, _weights(network), compile_program())
             self._compiled.move_to_end(key)
             while len(self._compiled) > _MOST:
