@@ -143,7 +143,7 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
 def data_options(options: argparse.Namespace) -> Options:
     """The values of the options of `add_data_options`; raises ConfigError, naming the option that cannot be read."""
     from nmpm.data.convert import Options
-    from nmpm.data.families import find_family
+    from nmpm.data.metadata import find_family
 
     if options.family is not None:
         find_family(options.family)

@@ -139,7 +139,7 @@ def _recorded(model: Pretrained, path: Path, index: int) -> Window:
 
 
 def _family(model: Pretrained) -> str | None:
-    from nmpm.data.families import FAMILIES
+    from nmpm.data.metadata import FAMILIES
 
     return "deepmind" if set(model.scene.materials) <= set(FAMILIES["deepmind"].types.values()) else None
 

@@ -83,7 +83,7 @@ def _simulate(options: argparse.Namespace) -> None:
         check_folder("--out", options.out)
     from nmpm.data import catalog
     from nmpm.data.generate import generate, generate_shard
-    from nmpm.data.simulation_request import Shard
+    from nmpm.data.simulation import Shard
     from nmpm.sim import load_preset
 
     shard = None if options.shard is None else Shard.parse(options.shard)

@@ -38,7 +38,8 @@ def write_trajectories(path: str | Path, trajectories: Iterable[Trajectory | np.
         DataError: if a trajectory does not fit the scene, its axes look swapped, existing metadata state another scene,
             or writing fails.
     """
-    path, metadata = Path(path), _metadata(scene)
+    path, types = Path(path), _types(scene)
+    metadata = scene_metadata(scene, types, len(scene.materials) if scene.obstacles else None)
     if path.name not in {f"{split}.h5" for split in SPLITS}:
         raise ConfigError(f"{path}: the file must be named {', '.join(f'{s}.h5' for s in SPLITS[:-1])} or test.h5.")
     if (path.parent / METADATA_FILE).is_file():
@@ -118,17 +119,19 @@ def _types(scene: Scene) -> dict[int, str]:
     return dict(enumerate(scene.materials + ((STATIC_NAME,) if scene.obstacles else ())))
 
 
-def _metadata(scene: Scene) -> Metadata:
+def scene_metadata(scene: Scene, types: dict[int, str], static_type: int | None) -> Metadata:
+    """The metadata of trajectories of a scene whose type ids have these names; their length is still to be set."""
     return Metadata(
         bounds=scene.bounds,
         dt=scene.dt,
         dim=scene.dim,
         sequence_length=1,
-        particle_types=_types(scene),
-        static_types=frozenset({len(scene.materials)} if scene.obstacles else ()),
+        particle_types=types,
+        static_types=frozenset() if static_type is None else frozenset({static_type}),
         periodic=scene.periodic,
         domain=scene.domain,
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,
+        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
         fields=scene.fields,
     )

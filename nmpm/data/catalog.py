@@ -16,7 +16,7 @@ from types import MappingProxyType
 from nmpm._support.shipped import user_home
 from nmpm.data.format import METADATA_FILE, read_metadata
 from nmpm.data.generate import generate
-from nmpm.data.simulation_request import SimulationRequest, same_trajectories
+from nmpm.data.simulation import SimulationRequest, same_trajectories
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.sim import load_preset, preset_names
@@ -24,12 +24,7 @@ from nmpm.sim import load_preset, preset_names
 
 @dataclass(frozen=True)
 class CatalogEntry:
-    """An embedded dataset, of the shipped preset of the same name.
-
-    Args:
-        counts: Trajectories in each of the splits train, valid and test.
-        paper: Trajectories per split in the paper's dataset of the same name, for `nmpm simulate`.
-    """
+    """Trajectories per split of an embedded dataset, and of the paper's of the same name, for `nmpm simulate`."""
 
     counts: Mapping[str, int]
     paper: Mapping[str, int]
@@ -40,8 +35,7 @@ def _splits(train: int, valid: int, test: int) -> Mapping[str, int]:
 
 
 _USUAL = CatalogEntry(counts=_splits(200, 10, 30), paper=_splits(1000, 100, 100))
-"""Numbers that are simulated within minutes; numbers of the paper (arXiv 2408.15753)."""
-
+"""Simulated within minutes; the paper's (arXiv 2408.15753)."""
 _OTHERS = {
     "goop": CatalogEntry(_USUAL.counts, _splits(1000, 30, 30)),
     "dambreak2d": CatalogEntry(_splits(50, 25, 25), _splits(50, 25, 25)),
@@ -61,11 +55,7 @@ def dataset_home() -> Path:
 
 
 def describe(name: str) -> CatalogEntry:
-    """The catalog's entry for an embedded dataset.
-
-    Raises:
-        DataError: if there is no dataset of that name.
-    """
+    """The catalog's entry for an embedded dataset; raises a DataError if there is none of that name."""
     if name not in catalog():
         raise DataError(
             f"No embedded dataset is called {name!r}; known: {', '.join(catalog())}. For your own data, give"

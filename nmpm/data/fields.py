@@ -58,22 +58,14 @@ class FieldFacts:
 def add_fields(
     facts: dict[str, FieldFacts], split: Split, index: int, metadata: Metadata, names: Iterable[str]
 ) -> None:
-    """Adds a trajectory's fields to the facts about the dataset's; names that it lacks are left out.
-
-    Raises:
-        DataError: as `read_fields`.
-    """
+    """Adds a trajectory's fields to the facts about the dataset's; names that it lacks are left out."""
     moving = metadata.is_moving(split.particle_type(index))
     for name, values in read_fields(split, index, names).items():
         facts.setdefault(name, FieldFacts(values.shape)).add(values if values.shape[1] == 1 else values[:, moving])
 
 
 def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """The fields of a trajectory that it has, (T, N), (1, N) or (1, 1) float32 by name.
-
-    Raises:
-        DataError: if one has another shape, or is no real number.
-    """
+    """The named fields that a trajectory has, (T, N), (1, N) or (1, 1) float32; a DataError for another shape."""
     fields: dict[str, np.ndarray] = {}
     where, sizes = split.where(index), (split.frames(index), split.particles(index))
     with open_hdf5(split.path) as file:
@@ -105,11 +97,7 @@ def _arrange(values: Any, sizes: tuple[int, int], where: str) -> np.ndarray:
 
 
 def require_fields(split: Split, names: Sequence[str]) -> None:
-    """Makes sure that every trajectory has the declared fields.
-
-    Raises:
-        DataError: naming the first that lacks one, and what it has.
-    """
+    """Raises a DataError that names the first trajectory that lacks one of the declared fields."""
     if not names:
         return
     with open_hdf5(split.path) as file:

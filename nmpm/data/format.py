@@ -27,8 +27,8 @@ from nmpm.data.hdf5 import (
 )
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
-from nmpm.data.metadata import read_metadata as read_metadata
-from nmpm.data.metadata import write_metadata as write_metadata
+from nmpm.data.metadata_json import read_metadata as read_metadata
+from nmpm.data.metadata_json import write_metadata as write_metadata
 from nmpm.errors import DataError
 
 SPLITS = ("train", "valid", "test")
@@ -73,11 +73,7 @@ class Trajectory:
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
-    """Writes trajectories, in order, into one file; equal trajectories give equal bytes.
-
-    Raises:
-        DataError: if there are no trajectories, or the file cannot be written, e.g. on a full disk.
-    """
+    """Writes trajectories, in order, into one file; equal trajectories give equal bytes."""
     path, count = Path(path), 0
     # The earliest format has no time stamps in groups.
     with writable_hdf5(path, libver=("earliest", "v108")) as (file, check_written):
@@ -171,11 +167,7 @@ class Split:
             return dict(file[self._entries[index].name].attrs)
 
     def fields(self, index: int) -> dict[str, np.ndarray]:
-        """All datasets of a trajectory except its positions and types, by name.
-
-        Raises:
-            DataError: if one does not hold numbers.
-        """
+        """All datasets of a trajectory except its positions and types by name; a DataError if one has no numbers."""
         fields: dict[str, np.ndarray] = {}
         with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
@@ -187,11 +179,7 @@ class Split:
         return fields
 
     def read_with_fields(self, index: int) -> Trajectory:
-        """Reads a trajectory with its fields.
-
-        Raises:
-            DataError: if it cannot be read or a position is not finite.
-        """
+        """Reads a trajectory with its fields."""
         return replace(self.read(index), fields=self.fields(index))
 
     def read(self, index: int, start: int = 0, stop: int | None = None) -> Trajectory:
@@ -285,11 +273,7 @@ def split_paths(folder: Path) -> Mapping[str, Path]:
 
 
 def find_split(folder: Path, *names: str) -> Path:
-    """The file of the first of the named splits that a dataset's folder has.
-
-    Raises:
-        DataError: if it has none of them; names those there are, and files to rename.
-    """
+    """The file of the first of the named splits that a folder has; if none, a DataError names those there are."""
     paths = split_paths(folder)
     for name in names:
         if name in paths:

@@ -25,6 +25,7 @@ from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import usable_cores
 from nmpm._support.version import __version__
+from nmpm.data.arrays import scene_metadata
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,
@@ -35,8 +36,7 @@ from nmpm.data.format import (
     write_metadata,
     write_split,
 )
-from nmpm.data.simulation import DRAWS, seed_of_draw, simulate_all
-from nmpm.data.simulation_request import Shard, SimulationRequest
+from nmpm.data.simulation import DRAWS, Shard, SimulationRequest, seed_of_draw, simulate_all
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import DataError
 from nmpm.sim import Preset, SimulatedTrajectory
@@ -253,17 +253,9 @@ def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[st
 def preset_metadata(preset: Preset) -> Metadata:
     """The metadata of the trajectories that a preset simulates."""
     scene = preset.scene
-    return Metadata(
-        bounds=scene.bounds,
-        dt=scene.dt,
-        dim=scene.dim,
+    return dataclasses.replace(
+        scene_metadata(scene, preset.type_names, BOUNDARY),
         sequence_length=preset.frames,
-        particle_types=preset.type_names,
-        static_types=frozenset({BOUNDARY}),
-        domain=scene.domain,
-        gravity=scene.gravity,
-        particle_volume=scene.particle_volume,
-        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
         extra={
             "default_connectivity_radius": round(1.8 * scene.particle_spacing, 6),
             "num_particles_max": preset.max_particles,

@@ -56,11 +56,7 @@ def _same(one: Gravity, other: Gravity) -> bool:
 
 
 def check_gravity(given: Sequence[float], stated: Gravity | None, path: Path) -> None:
-    """Compares a user's gravity with that of a file, if it states one.
-
-    Raises:
-        ConfigError: naming both, if they differ.
-    """
+    """Raises a ConfigError if a user's gravity contradicts that of a file, which may state none."""
     values = tuple(map(float, given))
     if stated is not None and not _same(values, stated):
         raise ConfigError(

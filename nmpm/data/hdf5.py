@@ -68,11 +68,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
 
 def check_self_contained(file: Any, path: Path) -> None:
-    """Raises an error if an open HDF5 file takes content from other files.
-
-    Raises:
-        DataError: names the file and the link or dataset.
-    """
+    """Raises a DataError that names the link or dataset by which an open HDF5 file takes content from other files."""
     # By hand: h5py's `visititems` recurses in C, and crashes the process in deep groups.
     pending, visited = [file], {file}
     while pending:
@@ -98,11 +94,7 @@ def _elsewhere_error(path: Path, problem: str) -> DataError:
 
 
 def check_stored_size(dataset: Any, where: str) -> None:
-    """Refuses a dataset that declares far more than its file stores, before anything of its size is allocated.
-
-    Raises:
-        DataError: naming `where` and both sizes.
-    """
+    """Refuses, with a DataError, a dataset that declares far more than its file stores, before memory is taken."""
     declared, chunk = (math.prod(shape) * dataset.dtype.itemsize for shape in (dataset.shape, dataset.chunks or (0,)))
     stored = int(dataset.id.get_storage_size())
     if max(declared, chunk) > expansion_limit(stored):

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from nmpm._support.version import __version__
-from nmpm.data.families import FAMILIES
 from nmpm.data.format import TRUTH, Trajectory
+from nmpm.data.metadata import FAMILIES
 from nmpm.errors import DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene

@@ -13,8 +13,7 @@ from nmpm.data.convert import Options
 from nmpm.data.fields import read_fields
 from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.json_keys import JsonKeys, parse_ids, parse_names
-from nmpm.data.metadata import parse_json
+from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene

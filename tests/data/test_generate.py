@@ -13,8 +13,7 @@ import pytest
 
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.generate import generate
-from nmpm.data.simulation import seed_of_draw
-from nmpm.data.simulation_request import SimulationRequest
+from nmpm.data.simulation import SimulationRequest, seed_of_draw
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import MpmPreset
 from tests.data.tiny_goop import COUNTS, GOOP, TINY, fingerprints

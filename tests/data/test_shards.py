@@ -12,7 +12,7 @@ import pytest
 from nmpm.cli import main
 from nmpm.data.format import Split
 from nmpm.data.generate import generate, generate_shard
-from nmpm.data.simulation_request import Shard
+from nmpm.data.simulation import Shard
 from nmpm.errors import ConfigError, DataError
 from tests.data import tiny_goop
 from tests.data.tiny_goop import COUNTS, fingerprints
@@ -23,7 +23,7 @@ SIMULATE = """
 import json, sys
 from pathlib import Path
 from nmpm.data.generate import generate_shard
-from nmpm.data.simulation_request import Shard
+from nmpm.data.simulation import Shard
 from nmpm.sim import preset_from_dict
 preset, folder, counts, index, count = sys.argv[1:]
 shard = Shard(int(index), int(count))

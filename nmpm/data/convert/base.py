@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from nmpm.data.families import STATIC_NAMES
 from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.metadata import STATIC_NAMES
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, check_field_names
 
@@ -96,21 +96,17 @@ class Rereadable(Iterable[Trajectory]):
 
 @dataclass(frozen=True)
 class ForeignDataset:
-    """An opened dataset of another format.
+    """An opened dataset of another format."""
 
-    Args:
-        metadata: Facts that all trajectories share.
-        splits: Trajectories of the splits "train", "valid" and "test" that exist; read one by one, in each iteration.
-        notes: Sentences for the user, on assumptions and inconsistencies.
-        counts: Trajectories per split; None where only reading them all would tell.
-        assumed: Fields of the metadata that the files do not state.
-    """
-
-    metadata: Metadata
-    splits: Mapping[str, Iterable[Trajectory]]
-    notes: tuple[str, ...] = ()
-    counts: Mapping[str, int | None] = field(default_factory=dict)
-    assumed: frozenset[str] = frozenset()
+    metadata: Metadata  # facts that all trajectories share
+    splits: Mapping[
+        str, Iterable[Trajectory]
+    ]  # trajectories of the splits "train", "valid" and "test" that exist; read one by one, in each iteration
+    notes: tuple[str, ...] = ()  # sentences for the user, on assumptions and inconsistencies
+    counts: Mapping[str, int | None] = field(
+        default_factory=dict
+    )  # trajectories per split; None where only reading them all would tell
+    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
 
 
 class DatasetFormat(abc.ABC):

@@ -18,8 +18,8 @@ import numpy as np
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
 from nmpm._support.messages import one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
-from nmpm.data.families import find_family
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.metadata import find_family
 from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError, NmpmError
 

@@ -118,11 +118,7 @@ class _ArrayUnpickler(pickle._Unpickler):
 
 
 def load_pickled(data: bytes, where: str) -> Any:
-    """Reads a pickle of arrays, numbers, texts and containers of them.
-
-    Raises:
-        DataError: if it is damaged, or requests anything but the constructors of arrays.
-    """
+    """Reads a pickle of arrays, numbers, texts and containers of them; a DataError if it requests anything else."""
     try:
         return _ArrayUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # a damaged pickle is a damaged program
@@ -132,11 +128,7 @@ def load_pickled(data: bytes, where: str) -> Any:
 
 
 def number_array(value: Any, where: str) -> np.ndarray:
-    """An array of numbers, from an array of numbers or of objects that are numbers, or from one number.
-
-    Raises:
-        DataError: if there is anything else.
-    """
+    """An array of numbers, from one, from an array of objects that are numbers, or from a number; else a DataError."""
     if not isinstance(value, np.ndarray | np.generic | int | float):
         raise DataError(f"{where}: expected an array of numbers, found {type(value).__name__}.")
     array = np.asarray(value)

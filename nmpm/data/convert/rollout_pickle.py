@@ -12,7 +12,7 @@ from nmpm._support.bounded_files import read_bounded
 from nmpm.data.convert.base import FileFormat, Options
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.metadata import parse_metadata
+from nmpm.data.metadata_json import parse_metadata
 from nmpm.errors import DataError
 
 _BYTES = 2**31

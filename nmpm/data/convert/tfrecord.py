@@ -27,23 +27,14 @@ Feature = list[bytes] | NDArray[np.float32] | NDArray[np.int64]
 
 @dataclass(frozen=True)
 class SequenceExample:
-    """One record.
+    """One record."""
 
-    Args:
-        context: Features of the whole sequence, by name.
-        steps: For each name, a feature per time step.
-    """
-
-    context: dict[str, Feature]
-    steps: dict[str, list[Feature]]
+    context: dict[str, Feature]  # features of the whole sequence, by name
+    steps: dict[str, list[Feature]]  # for each name, a feature per time step
 
 
 def record_offsets(path: Path) -> list[int]:
-    """Byte offsets of the records of a file; lengths are checked, payloads are skipped.
-
-    Raises:
-        DataError: if the file is empty or cut off, or a length is damaged.
-    """
+    """Byte offsets of a file's records; raises a DataError if it is empty or cut off, or a length is damaged."""
     check_regular(path)
     size = path.stat().st_size
     offsets: list[int] = []

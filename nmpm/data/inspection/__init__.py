@@ -35,76 +35,42 @@ _DIFFERS: Mapping[Kind, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class SplitFacts:
-    """Facts about one split.
-
-    Args:
-        trajectories: Number of trajectories in the file.
-        inspected: Number of those that were read.
-        frames: Frames of a trajectory.
-        particles: Moving particles of a trajectory.
-        static: Static particles of a trajectory.
-    """
+    """Facts about one split."""
 
     trajectories: int
-    inspected: int
-    frames: Range
-    particles: Range
+    inspected: int  # trajectories that were read
+    frames: Range  # of a trajectory, as the following
+    particles: Range  # those that move
     static: Range
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """The results of an inspection; lengths in domain length, times in seconds.
-
-    Args:
-        path: Of the dataset.
-        dim: Number of axes.
-        dt: Time between frames.
-        splits: By name.
-        materials: Particles of each material in a trajectory, by name.
-        stated_bounds: The metadata's.
-        observed: Extent of all positions.
-        domain: Extent that a grid should cover.
-        boundary: "wall" or "periodic" per axis.
-        gravity: In length/s², where it is known and the same for all trajectories.
-        first_acceleration: Median in the first frames, in length/s²; equals gravity where particles start in free fall.
-        spacing: Median distance to the nearest neighbour in first frames.
-        varies: What differs between trajectories: "gravity", "materials", "particles", "frames", "obstacles", fields.
-        fields: Shape of each further array, in the first trajectory.
-        grids: Candidate grids.
-        recommended: Recommended cells along the longest side.
-        occupied: Fraction of the domain that a particle ever visits, in all trajectories together.
-        occupied_each: The same in one trajectory, median.
-        rest: First frame from which a trajectory is at rest: median, smallest, largest; None where none comes to rest.
-        restless: Trajectories that still move at their end.
-        notes: Notes that need no action.
-        findings: Anomalies.
-        channels: For each field how it differs, and which channels of a model that makes.
-    """
+    """The results of an inspection; lengths in domain length, times in seconds."""
 
     path: str
     dim: int
     dt: float
     splits: dict[str, SplitFacts]
-    materials: dict[str, Range]
+    materials: dict[str, Range]  # particles of each in a trajectory
     stated_bounds: tuple[Interval, ...]
-    observed: tuple[Interval, ...]
-    domain: tuple[Interval, ...]
-    boundary: tuple[str, ...]
-    gravity: tuple[float, ...] | None
-    first_acceleration: tuple[float, ...]
-    spacing: float
-    varies: tuple[str, ...]
-    fields: dict[str, tuple[int, ...]]
+    observed: tuple[Interval, ...]  # extent of all positions
+    domain: tuple[Interval, ...]  # extent that a grid should cover
+    boundary: tuple[str, ...]  # "wall" or "periodic" per axis
+    gravity: tuple[float, ...] | None  # in length/s², where it is known and the same for all trajectories
+    first_acceleration: tuple[float, ...]  # median in the first frames, in length/s²; gravity in free fall
+    spacing: float  # median distance to the nearest neighbour in first frames
+    varies: tuple[str, ...]  # between trajectories: gravity, materials, particles, frames, obstacles, or a field
+    fields: dict[str, tuple[int, ...]]  # shape of each further array, in the first trajectory
     grids: tuple[GridFacts, ...]
-    recommended: int
-    occupied: float
-    occupied_each: float
-    rest: tuple[int, int, int] | None
-    restless: int
-    notes: tuple[str, ...]
-    findings: tuple[str, ...]
-    channels: dict[str, str]
+    recommended: int  # cells along the longest side
+    occupied: float  # fraction of the domain that a particle ever visits, in all trajectories together
+    occupied_each: float  # the same in one trajectory, median
+    rest: tuple[int, int, int] | None  # first frame at rest: median, smallest, largest; None where none comes to rest
+    restless: int  # trajectories that still move at their end
+    notes: tuple[str, ...]  # they need no action
+    findings: tuple[str, ...]  # anomalies
+    channels: dict[str, str]  # for each field how it differs, and the input channels that it makes
 
 
 def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection:

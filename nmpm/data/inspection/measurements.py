@@ -26,23 +26,14 @@ _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 
 
 @dataclass(frozen=True)
 class GridFacts:
-    """Facts about the data on one grid.
+    """Facts about the data on one grid."""
 
-    Args:
-        cells: Cells along the longest side.
-        shape: Cells along each axis.
-        per_cell: Particles per occupied cell, median over frames.
-        median_speed: Median speed of the moving particles, in cells per frame.
-        high_speed: 99.9% quantile of their speeds, in cells per frame.
-        most_speed: Largest speed, in cells per frame.
-    """
-
-    cells: int
-    shape: tuple[int, ...]
-    per_cell: float
-    median_speed: float
-    high_speed: float
-    most_speed: float
+    cells: int  # cells along the longest side
+    shape: tuple[int, ...]  # cells along each axis
+    per_cell: float  # particles per occupied cell, median over frames
+    median_speed: float  # median speed of the moving particles, in cells per frame
+    high_speed: float  # 99.9% quantile of their speeds, in cells per frame
+    most_speed: float  # largest speed, in cells per frame
 
 
 class Measurements:

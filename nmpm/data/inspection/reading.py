@@ -9,40 +9,27 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.families import FAMILIES
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
 from nmpm.data.loading.sources import FolderSource
-from nmpm.data.metadata import load_json, parse_metadata
+from nmpm.data.metadata import FAMILIES
+from nmpm.data.metadata_json import load_json, parse_metadata
 from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
 class OpenedDataset:
-    """A dataset, as far as it can be read.
+    """A dataset, as far as it can be read."""
 
-    Args:
-        source: The dataset, with a guessed family where neither metadata nor user state the particle types.
-        splits: Those that can be opened; at least one.
-        metadata: With values from the trajectories where the file has none or wrong ones. Types without a name are
-            called "type 9" and taken for moving.
-        problems: Sentences on what is wrong with the files.
-        wrong_metadata: Whether some of them are about the metadata.
-    """
-
-    source: FolderSource
-    splits: dict[str, Split]
-    metadata: Metadata
+    source: FolderSource  # with a guessed family where neither metadata nor user state the particle types
+    splits: dict[str, Split]  # those that can be opened; at least one
+    metadata: Metadata  # with values from the trajectories where the file has none; types without a name move
     problems: list[str]
-    wrong_metadata: bool
+    wrong_metadata: bool  # whether some of the problems are about the metadata
 
 
 def open_dataset(source: FolderSource) -> OpenedDataset:
-    """Opens a dataset as far as it can be read.
-
-    Raises:
-        DataError: if no split can be opened.
-    """
+    """Opens a dataset as far as it can be read; raises a DataError if no split can be opened."""
     folder, problems = source.folder, list[str]()
     splits: dict[str, Split] = {}
     for name, path in split_paths(folder).items():

@@ -75,17 +75,11 @@ def _window_distances(recording: Recording, scene: Scene, length: int) -> np.nda
 
 @dataclass(frozen=True)
 class _BufferContents:
-    """The trajectories of one buffer.
+    """The trajectories of one buffer."""
 
-    Args:
-        padded: All of them, one per row, in the order of `recordings`.
-        recordings: Views by index of the trajectory, without padding, in host memory.
-        motion: Draws windows in proportion to motion; None where the plan has no emphasis.
-    """
-
-    padded: PaddedRecordings
-    recordings: Mapping[int, Recording]
-    motion: MotionSampler | None
+    padded: PaddedRecordings  # all of them, one per row, in the order of `recordings`
+    recordings: Mapping[int, Recording]  # views by index of the trajectory, without padding, in host memory
+    motion: MotionSampler | None  # draws windows in proportion to motion; None where the plan has no emphasis
 
     def size(self, trajectory: int) -> int:
         """Number of particles of a trajectory."""

@@ -37,11 +37,7 @@ class PaddedRecordings:
 
     @classmethod
     def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
-        """Copies recordings into padded tensors.
-
-        Raises:
-            DataError: if not all have the same fields, of the same kind.
-        """
+        """Copies recordings into padded tensors; raises a DataError if not all have the same kinds of fields."""
         centre = [(low + high) / 2 for low, high in scene.domain]
         frames, mask = _pad_and_stack([recording.frames for recording in recordings], centre)
         obstacle, obstacle_mask = _pad_and_stack([recording.obstacle[None] for recording in recordings], centre)

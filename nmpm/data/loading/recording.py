@@ -43,15 +43,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """Converts trajectories to recordings and validates them.
+    """Converts trajectories to recordings and validates them."""
 
-    Args:
-        metadata: Names the type ids.
-        scene: The trajectories' scene.
-    """
-
-    metadata: Metadata
-    scene: Scene
+    metadata: Metadata  # names the type ids
+    scene: Scene  # the trajectories' scene
 
     def recording(self, trajectory: Trajectory, where: str) -> Recording:
         """Converts a trajectory, with its fields as `read_fields` gives them; `where` names it in errors.

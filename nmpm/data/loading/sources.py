@@ -105,11 +105,7 @@ class HubSource(FolderSource):
 def make_source(
     path: str | None, name: str | None, source: SourceName, options: Options, generate: Mapping[str, Any] | None
 ) -> DataSource:
-    """The source that the arguments of `TrajectoryDataModule` mean.
-
-    Raises:
-        ConfigError: if neither `path` nor `name` is given, or arguments contradict each other.
-    """
+    """The source that the arguments of `TrajectoryDataModule` mean; a ConfigError if they contradict each other."""
     if path == _OPEN and name is None:
         raise ConfigError("data.path is not set, the configuration leaves it open (???): give --data.path FOLDER.")
     if path is None and name is None:

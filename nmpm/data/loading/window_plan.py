@@ -36,17 +36,11 @@ OPENING = 16
 
 @dataclass(frozen=True)
 class PlanStart:
-    """Where the batches of the current size start in the sequence of windows.
+    """Where the batches of the current size start in the sequence of windows."""
 
-    Args:
-        batch: Index of the first of them.
-        buffer: Index of the buffer that it is drawn from.
-        drawn: Windows of that buffer that were drawn before.
-    """
-
-    batch: int = 0
-    buffer: int = 0
-    drawn: int = 0
+    batch: int = 0  # index of the first of them
+    buffer: int = 0  # index of the buffer that it is drawn from
+    drawn: int = 0  # windows of that buffer that were drawn before
 
 
 @dataclass(frozen=True)

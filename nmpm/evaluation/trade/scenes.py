@@ -18,7 +18,7 @@ from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
-from nmpm.data.simulation_request import SimulationRequest
+from nmpm.data.simulation import SimulationRequest
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Scene

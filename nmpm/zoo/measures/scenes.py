@@ -14,7 +14,7 @@ from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import Recording, RecordingReader, SplitRecordings
-from nmpm.data.simulation_request import SimulationRequest, same_test_scenes
+from nmpm.data.simulation import SimulationRequest, same_test_scenes
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
 from nmpm.sim import Preset, SimulatedTrajectory, preset_from_dict
