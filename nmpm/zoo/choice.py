@@ -1,8 +1,8 @@
-"""Choose among the variants of a model by what their cards say of error and time."""
+"""Choose among the variants of a model by error and time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -13,32 +13,40 @@ from nmpm.zoo.card import stated_error, stated_milliseconds
 
 @dataclass(frozen=True)
 class Limits:
-    """What a chosen model must keep to.
+    """What a chosen model must keep to, and whose times count.
 
     Args:
         max_mse: Largest full-rollout MSE on the test scenes, in length².
         max_ms_per_frame: Largest time per frame of one scene.
-        hardware: Whose times count, as cards name it; those of this machine when left out.
+        hardware: Whose stated times count; those of this machine when left out.
+        calibrate: Whether the variants are timed now instead.
 
     Raises:
-        ConfigError: if a limit is not a positive number.
+        ConfigError: if a limit is not a positive number, or whose times count is ambiguous or of no use.
     """
 
     max_mse: float | None = None
     max_ms_per_frame: float | None = None
     hardware: str | None = None
+    calibrate: bool = False
 
     def __post_init__(self) -> None:
         for name in ("max_mse", "max_ms_per_frame"):
             value = getattr(self, name)
             if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not float(value) > 0):
                 raise ConfigError(f"{name} = {value!r} must be a positive number, or be left out.")
+        if not self and (self.calibrate or self.hardware is not None):
+            raise ConfigError("calibrate and hardware are of use with a limit: give max_mse or max_ms_per_frame too.")
+        if self.calibrate and self.hardware is not None:
+            raise ConfigError(
+                f"calibrate times the models here, hardware = {self.hardware!r} takes stated times: give one."
+            )
 
     def __bool__(self) -> bool:
         return self.max_mse is not None or self.max_ms_per_frame is not None
 
 
-def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds: Callable[[str], float | None]) -> str:
+def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, times: Mapping[str, float]) -> str:
     """The model within the limits: the most accurate if time is limited, else the fastest, else the most accurate.
 
     Models whose cards state no error are left out; so are those of unknown times where the others' are known.
@@ -46,13 +54,12 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
     Args:
         cards: Of the variants, by name.
         limits: What it must keep to.
-        milliseconds: The time per frame of a model of that name; None where it is not known.
+        times: Milliseconds per frame, of the variants of which they are known.
 
     Raises:
         ZooError: if none is within the limits, or times are needed of which none is known.
     """
     errors = {name: mse for name, card in cards.items() if (mse := stated_error(card)) is not None}
-    times = {name: time for name in errors if (time := milliseconds(name)) is not None}
     if limits.max_ms_per_frame is not None and errors and not times:
         hardware = sorted({hardware for name in errors for hardware in stated_milliseconds(cards[name])})
         elsewhere = f", but on {'; '.join(hardware)} (hardware=…)" if hardware else ""
@@ -73,4 +80,4 @@ def choose(cards: Mapping[str, Mapping[str, Any]], limits: Limits, milliseconds:
         )
         raise ZooError(f"No model is within the limits. {figures or 'None states an error.'}")
     by_time = limits.max_ms_per_frame is None and bool(timed)
-    return min(within, key=lambda name: times[name] if by_time else errors[name])
+    return min(within, key=times.__getitem__ if by_time else errors.__getitem__)

@@ -30,7 +30,12 @@ from nmpm.zoo.pretrained import Pretrained
 if TYPE_CHECKING:
     from nmpm.training.module import EmulatorModule
 
-CONFIG, WEIGHTS = "config.yaml", "model.safetensors"
+CONFIG, WEIGHTS, SCENES = "config.yaml", "model.safetensors", "scenes.csv"
+TABLES_AND_PICTURES = ("README.md", SCENES, "errors.csv", "training.csv", "chart.png", "rollout.png", "worst.png")
+FILES = (CARD, CONFIG, WEIGHTS, *TABLES_AND_PICTURES)
+"""All files of an entry; the tables and pictures may be missing."""
+BEST = Path("checkpoints") / "best.ckpt"
+"""The best checkpoint within a run's folder."""
 WEIGHT_BYTES = 2**33
 INTEGER = 2**24
 """Largest integer in a model's recipe; some are exponents."""
@@ -38,23 +43,6 @@ CELLS, FRAMES = 2**24, 2**12
 """Cells of a model's grid, 4096² or 256³, and frames that one call predicts."""
 PARAMETERS, LAYERS = 10**9, 5_000
 """Parameters of a network; its modules, and tensors of parameters."""
-SCENES = "scenes.csv"
-"""The errors of each test scene, a row each in their order."""
-FILES = (
-    CARD,
-    CONFIG,
-    WEIGHTS,
-    "README.md",
-    SCENES,
-    "errors.csv",
-    "training.csv",
-    "chart.png",
-    "rollout.png",
-    "worst.png",
-)
-"""All files of an entry; the tables and pictures after its README may be missing."""
-BEST = Path("checkpoints") / "best.ckpt"
-"""The best checkpoint within a run's folder."""
 REAL = frozenset({torch.float16, torch.bfloat16, torch.float32, torch.float64})
 """Types of stored weights that are converted to the model's own."""
 Rows = list[dict[str, float]]
@@ -62,11 +50,7 @@ Rows = list[dict[str, float]]
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """The content of an entry's card.
-
-    Raises:
-        ZooError: if it is missing or damaged, or of another format, such as a newer nmpm's.
-    """
+    """The content of an entry's card; raises ZooError if it is missing, damaged or of another format."""
     try:
         card = read_yaml(folder / CARD)
     except DataError as error:
@@ -80,11 +64,7 @@ def read_card(folder: Path) -> dict[str, Any]:
 
 
 def read_scenes(folder: Path) -> Rows:
-    """The errors of an entry's test scenes, from `scenes.csv`.
-
-    Raises:
-        ZooError: if it is missing or damaged.
-    """
+    """The errors of each test scene, from `scenes.csv`; raises ZooError if it is missing or damaged."""
     try:
         lines = csv.DictReader(io.StringIO(read_text(folder / SCENES)), strict=True)
         rows = [{name: float(value) for name, value in line.items() if value} for line in lines]
@@ -131,11 +111,7 @@ def _read_weights(path: Path, card: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def _check_weights(path: Path, expected: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:
-    """Compare names, shapes and types with the model's.
-
-    Raises:
-        ZooError: naming the first tensor that differs or is not finite.
-    """
+    """Raise ZooError for the first tensor whose name, shape or type is not the model's, or that is not finite."""
     for problem, names in (("lacks", set(expected) - set(stored)), ("has the unknown", set(stored) - set(expected))):
         if names:
             raise ZooError(
@@ -228,7 +204,7 @@ def read_recipe(plain: Mapping[str, Any]) -> EmulatorRecipe:
 
 
 def build(recipe: EmulatorRecipe) -> Emulator:
-    """The emulator of a recipe; raises as `bounded_network` where its network is too large."""
+    """The emulator of a recipe; raises ConfigError where its network is too large."""
     with bounded_network():
         return recipe.build()
 

@@ -12,22 +12,20 @@ import re
 import shutil
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import read_bounded, read_yaml, to_yaml
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.card import CARD, SIMULATED
-from nmpm.zoo.entries import FILES, WEIGHT_BYTES, WEIGHTS, load_entry, read_card
+from nmpm.zoo.entries import FILES, WEIGHT_BYTES, WEIGHTS, load_entry
 
-if TYPE_CHECKING:
-    from huggingface_hub import HfApi
-
-ID = re.compile(r"(?P<repository>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})@(?P<revision>[\w./-]{1,100})")
-REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
+REPOSITORY = r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}"
+REVISION = r"[\w./-]{1,100}"
 
 
 @dataclass(frozen=True)
@@ -45,8 +43,8 @@ class HubId:
     @classmethod
     def parse(cls, text: str) -> Self | None:
         """The id that "owner/repository@revision" means; None for other texts."""
-        match = ID.fullmatch(text)
-        return None if match is None else cls(match["repository"], match["revision"])
+        match = re.fullmatch(f"({REPOSITORY})@({REVISION})", text)
+        return None if match is None else cls(*match.groups())
 
     def __str__(self) -> str:
         return f"{self.repository}@{self.revision}"
@@ -88,11 +86,7 @@ def _is_whole(folder: Path) -> bool:
 
 
 def _snapshot(identifier: HubId, force_download: bool = False) -> Path:
-    """The folder of a model's files in the hub's cache, downloaded where they are not there.
-
-    Raises:
-        ZooError: if there is no such model or revision, or it cannot be reached.
-    """
+    """The folder of a model's files in the hub's cache, downloaded where they are not there; raises as `download`."""
     from huggingface_hub import errors, snapshot_download
 
     name, revision = identifier.repository, identifier.revision
@@ -122,8 +116,7 @@ def pull(identifier: HubId, target: Path, name: str) -> Path:
         ZooError: as `download`; if the model cannot be loaded.
     """
     folder = download(identifier)
-    load_entry(folder)
-    card = read_card(folder) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
+    card = dict(load_entry(folder).card) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
     with atomic_folder(target) as new:
         if target.is_dir():  # variants lie within it
             shutil.copytree(target, new, dirs_exist_ok=True)
@@ -150,47 +143,43 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
         ZooError: if the entry is damaged, the name is malformed, the repository is public though a private one is asked
             for, or the hub refuses.
     """
-    from huggingface_hub import HfApi
-
-    if REPOSITORY.fullmatch(repository) is None:
+    if re.fullmatch(REPOSITORY, repository) is None:
         raise ZooError(f"{one_line(repository, 100)} is not owner/repository.")
-    load_entry(entry)
+    card = load_entry(entry).card
     with tempfile.TemporaryDirectory() as folder:
         for name in FILES:
             if (entry / name).is_file():
                 shutil.copyfile(entry / name, Path(folder) / name)
-        card = read_card(entry)
         page = _page(card, entry, f"{repository}@main")
         (Path(folder) / "README.md").write_text(f"---\n{to_yaml(hub_metadata(card))}---\n\n{page}", encoding="utf-8")
-        api = HfApi()
         try:
-            public = private and _is_public(api, repository)
-            if not public:
-                api.create_repo(repository, private=private, exist_ok=True)
-                commit = api.upload_folder(
-                    repo_id=repository,
-                    folder_path=folder,
-                    commit_message=f"nmpm: {card.get('name', entry.name)}",
-                    delete_patterns=list(FILES),  # of a former entry that had more of them
-                )
+            return HubId(repository, _upload(folder, repository, private, f"nmpm: {card.get('name', entry.name)}"))
+        except ZooError:
+            raise
         except Exception as error:  # the client's transport raises errors of its own
             raise ZooError(f"{repository} cannot be uploaded ({type(error).__name__}): {one_line(error)}") from error
-    if public:
-        raise ZooError(
-            f"{repository} exists and is public: push to another repository, make it private in its settings, or leave"
-            " --private out."
-        )
-    return HubId(repository, str(commit.oid))
 
 
-def _is_public(api: HfApi, repository: str) -> bool:
-    """Whether a repository exists that anyone can see."""
+def _upload(folder: str, repository: str, private: bool, message: str) -> str:
+    """Upload a folder's files as one commit, whose id is returned."""
+    from huggingface_hub import HfApi
     from huggingface_hub.errors import RepositoryNotFoundError
 
-    try:
-        return not api.model_info(repository).private
-    except RepositoryNotFoundError:
-        return False
+    api = HfApi()
+    with suppress(RepositoryNotFoundError):
+        if private and not api.model_info(repository).private:
+            raise ZooError(
+                f"{repository} exists and is public: push to another repository, make it private in its settings, or"
+                " leave --private out."
+            )
+    api.create_repo(repository, private=private, exist_ok=True)
+    commit = api.upload_folder(
+        repo_id=repository,
+        folder_path=folder,
+        commit_message=message,
+        delete_patterns=list(FILES),  # of a former entry that had more of them
+    )
+    return str(commit.oid)
 
 
 def _page(card: Mapping[str, Any], entry: Path, load: str) -> str:

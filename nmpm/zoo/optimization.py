@@ -77,9 +77,12 @@ def _check_deviation(emulator: Emulator, faster: Emulator, state: Particles) -> 
 
     In bfloat16 a runtime may be twice as far from float32 as torch's bfloat16 is: each rounds in places of its own.
     """
-    moving = _stirred(emulator, state)
-    exact = _positions(emulator.with_network(torch.float32), moving)
-    reference, other = (_distance(_positions(form, moving), exact) for form in (emulator, faster))
+    noise = torch.randn(state.velocity.shape, generator=torch.Generator().manual_seed(0)).to(state.velocity)
+    cell = state.velocity.new_tensor(emulator.grid.spacing)
+    moving = dataclasses.replace(state, velocity=state.velocity + _SPEED * cell * noise)
+    forms = (emulator.with_network(torch.float32), emulator, faster)
+    exact, *paths = (_positions(form, moving) for form in forms)
+    reference, other = (float((path - exact).norm(dim=-1).max()) for path in paths)
     limit = TOLERANCE + 2 * reference
     name, precision = faster.runtime.name, str(emulator.network_precision).removeprefix("torch.")
     _LOG.info("The runtime %s, %s: within %.1e cells of torch in float32 after a bundle.", name, precision, other)
@@ -90,19 +93,8 @@ def _check_deviation(emulator: Emulator, faster: Emulator, state: Particles) -> 
         )
 
 
-def _stirred(emulator: Emulator, state: Particles) -> Particles:
-    """The state with random velocities."""
-    noise = torch.randn(state.velocity.shape, generator=torch.Generator().manual_seed(0)).to(state.velocity)
-    cell = state.velocity.new_tensor(emulator.grid.spacing)
-    return dataclasses.replace(state, velocity=state.velocity + _SPEED * cell * noise)
-
-
 @torch.no_grad()
 def _positions(emulator: Emulator, state: Particles) -> Tensor:
     """(B, m, N, D) after one bundle, in cells."""
     position: Tensor = emulator.unconstrained()(state).position
     return position / position.new_tensor(emulator.grid.spacing)
-
-
-def _distance(one: Tensor, other: Tensor) -> float:
-    return float((one - other).norm(dim=-1).max())

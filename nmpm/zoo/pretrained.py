@@ -36,7 +36,7 @@ class Pretrained:
 
     Args:
         emulator: In evaluation mode.
-        card: What `card.yaml` of the zoo says, or what is known of a checkpoint.
+        card: The content of `card.yaml`, or what is known of a checkpoint.
     """
 
     emulator: Emulator
@@ -141,15 +141,11 @@ class Pretrained:
             raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
         if gravity is None:
             return with_usual_gravity(self.emulator, state)
-        own = StateBuilder(self.emulator, state.position, state.position.dtype).gravity(gravity)
-        return dataclasses.replace(state, gravity=own)
+        builder = StateBuilder(self.emulator, state.position, state.position.dtype)
+        return dataclasses.replace(state, gravity=builder.gravity(gravity))
 
     def with_network(self, precision: str) -> Pretrained:
-        """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16".
-
-        Raises:
-            ConfigError: if there is no such precision, or the network cannot have it.
-        """
+        """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16"."""
         if precision not in NETWORK_PRECISIONS:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
@@ -184,10 +180,11 @@ class Pretrained:
             ConfigError: if the runtime is not installed, cannot run the model here, or computes something else.
         """
         model = self if precision is None else self.with_network(precision)
-        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, model._small_example))
 
-    def _small_example(self) -> Particles:
-        return self.example(count=self.fitting_count(_EXAMPLE)).to(self.emulator.device)
+        def make_example() -> Particles:
+            return model.example(count=model.fitting_count(_EXAMPLE)).to(model.emulator.device)
+
+        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, make_example))
 
     def fitting_count(self, count: int, blocks: int | None = None) -> int:
         """The number of particles, halved until an example of so many blocks fits into the box."""
@@ -214,10 +211,7 @@ class Pretrained:
         return dataclasses.replace(self, emulator=copy.deepcopy(self.emulator).to(target))
 
     def rollout(self, state: Particles, frames: int) -> Tensor:
-        """Predict from a state, which is moved to the model's device.
-
-        Returns:
-            (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
+        """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
 
         Warns:
             UserWarning: if particles start outside of the bounds, into which the first frame moves them.
@@ -231,12 +225,9 @@ class Pretrained:
         return predict_rollout(self.emulator, there, frames)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
-        """Predict with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
+        """As `rollout`, with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
 
         Memory grows by one state per bundle; backward passes compute each bundle again.
-
-        Returns:
-            (B, frames, N, D) positions in domain length, without the state's own frame, on the model's device.
         """
         there = state.to(self.emulator.device)
         warn_of_start_outside(self.emulator, there)

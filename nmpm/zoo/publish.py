@@ -30,8 +30,8 @@ from nmpm.zoo.refresh import write_card, write_index, writing
 from nmpm.zoo.registry import check_name
 from nmpm.zoo.verification import golden_distance, golden_rollout
 
-STRESS_REPORTS = {"stress": "stress.json", "stress_free": "stress_free.json"}
-"""Files of `nmpm stress --report`, with and without constraints, by the key of the card."""
+STRESS_REPORTS = ("stress", "stress_free")
+"""Keys of the card, and with .json files of `nmpm stress --report`, with and without constraints."""
 COPIED = ("rollout.png", "errors.csv")
 """Files of a run that its entry keeps."""
 NOTICED = 0.02
@@ -68,7 +68,7 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
         raise ZooError(f"{report} is of other weights than {checkpoint}: test these by `nmpm test {run}`.")
     emulator = round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
     weights = serialise(emulator)
-    stress = {key: _read_json(run / file) for key, file in STRESS_REPORTS.items() if (run / file).is_file()}
+    stress = {key: _read_json(run / f"{key}.json") for key in STRESS_REPORTS if (run / f"{key}.json").is_file()}
     try:
         rows = figures["per_trajectory"]["model"]
         card = _card(name, about, figures, rows, emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
@@ -102,8 +102,7 @@ def new_entry_folder(name: str, root: str | Path | None) -> Path:
     """The folder of a new entry, of the user's own zoo where `root` is None.
 
     Raises:
-        ZooError: if the name is malformed or taken, also by a shipped model, which the new one would hide; or if the
-            folder is part of the installed package.
+        ZooError: if the name is malformed or taken, also by a shipped model, or the zoo is the installed package's.
     """
     check_name(name)
     zoo = user_zoo() if root is None else Path(root)

@@ -82,15 +82,9 @@ def refresh(
 
 
 def add_facts(folder: Path, weights: str, facts: Mapping[str, Any]) -> None:
-    """Write facts about an entry's weights to its card, beside what others wrote to it meanwhile.
+    """Write facts, keys of the card, to an entry's card, beside what others wrote to it meanwhile.
 
-    Args:
-        folder: Of the entry.
-        weights: SHA-256 of the weights that the facts are about.
-        facts: Keys of the card, with their values; keys with an empty text are removed.
-
-    Raises:
-        ZooError: if the entry has other weights by now.
+    Keys with an empty text are removed. Raises ZooError if the entry has other weights, of this SHA-256, by now.
     """
     with writing():
         card = read_card(folder)

@@ -44,11 +44,7 @@ class Zoo:
 
     @staticmethod
     def list(root: Root = None) -> builtins.list[str]:
-        """Names of the models.
-
-        Raises:
-            ZooError: if `root` is given and is not a folder.
-        """
+        """Names of the models; raises ZooError if `root` is given and is not a folder."""
         names = {
             card.parent.relative_to(folder).as_posix()
             for folder in _roots(root)
@@ -58,11 +54,7 @@ class Zoo:
 
     @staticmethod
     def folder(name: str, root: Root = None) -> Path:
-        """The folder of a model's entry.
-
-        Raises:
-            ZooError: if there is no model of that name; names similar ones.
-        """
+        """The folder of a model's entry; raises ZooError, naming similar ones, if there is none of that name."""
         check_name(name)
         for zoo in _roots(root):
             if (zoo / name / CARD).exists():
@@ -71,20 +63,12 @@ class Zoo:
 
     @staticmethod
     def card(name: str, root: Root = None) -> dict[str, Any]:
-        """What a model is, how it was trained and what its errors are.
-
-        Raises:
-            ZooError: if there is no such model or its card is damaged.
-        """
+        """What a model is, how it was trained and what its errors are; raises ZooError if the card is damaged."""
         return read_card(Zoo.folder(name, root))
 
     @staticmethod
     def variants(name: str, root: Root = None) -> builtins.list[str]:
-        """Names of the models of a dataset: `name` itself and `name/…`.
-
-        Raises:
-            ZooError: if there is none.
-        """
+        """Names of the models of a dataset, `name` itself and `name/…`; raises ZooError if there is none."""
         variants = [other for other in Zoo.list(root) if other == name or other.startswith(f"{name}/")]
         if not variants:
             raise _unknown_model(name, root)
@@ -108,9 +92,9 @@ class Zoo:
         within an error.
 
         Args:
-            name: As for `load_model`.
-            root: As for `load_model`.
-            device: As for `load_model`.
+            name: As for `load_model`, and so are the next two.
+            root: Folder of a zoo.
+            device: Where to compute.
             variant: "fast" for `name/fast`.
             max_mse: Largest full-rollout MSE of its card, in length².
             max_ms_per_frame: Largest time per frame of one scene, as the cards state it for `hardware`.
@@ -122,17 +106,13 @@ class Zoo:
             ConfigError: if a limit is not a positive number; if `hardware` or `calibrate` is given without a limit, or
                 both are; if `variant` or a limit is given for a path or an id.
         """
-        limits = Limits(max_mse, max_ms_per_frame, hardware)
-        if not limits and (calibrate or hardware is not None):
-            raise ConfigError("calibrate and hardware are of use with a limit: give max_mse or max_ms_per_frame too.")
-        if calibrate and hardware is not None:
-            raise ConfigError(f"calibrate times the models here, hardware = {hardware!r} takes stated times: give one.")
+        limits = Limits(max_mse, max_ms_per_frame, hardware, calibrate)
         if variant is None and not limits:
             return load_model(name, device, root)
         _check_variants(name, root)
         full_name = str(name) if variant is None else f"{name}/{variant}"
         if limits:
-            full_name = _choose_variant(full_name, limits, root, find_device(device), calibrate)
+            full_name = _choose_variant(full_name, limits, root, find_device(device))
         return load_model(full_name, device, root)
 
 
@@ -164,11 +144,7 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
 
 
 def find_model(model: str | Path, root: Root = None) -> Path:
-    """The folder or checkpoint that a name, a path or an id means, as for `load_model`; an id is downloaded.
-
-    Raises:
-        ZooError: if there is no such model.
-    """
+    """The folder or checkpoint that a name, a path or an id means, as for `load_model`; an id is downloaded."""
     name, path = str(model), Path(model)
     # `Path("goop")` is always a path.
     in_zoo = isinstance(model, str) and _is_name(model) and any((zoo / model / CARD).exists() for zoo in _roots(None))
@@ -183,11 +159,7 @@ def find_model(model: str | Path, root: Root = None) -> Path:
 
 
 def find_entry(model: str | Path, root: Root = None) -> Path:
-    """As `find_model`, for what needs a card: the folder of an entry.
-
-    Raises:
-        ZooError: if there is no such model, or it is a run or a checkpoint.
-    """
+    """As `find_model`, for what needs a card: raises ZooError for a run or a checkpoint."""
     folder = find_model(model, root)
     if not (folder / CARD).exists():
         raise ZooError(
@@ -197,11 +169,7 @@ def find_entry(model: str | Path, root: Root = None) -> Path:
 
 
 def check_name(name: str) -> None:
-    """Check that an entry can have this name.
-
-    Raises:
-        ZooError: if not, such as one that would lead out of the zoo.
-    """
+    """Raise ZooError for a name that an entry cannot have, such as one that would lead out of the zoo."""
     if not _is_name(name):
         raise ZooError(
             f"{one_line(repr(name), NAME_LENGTH)} cannot name a model: use at most {NAME_LENGTH} lower-case letters,"
@@ -209,7 +177,7 @@ def check_name(name: str) -> None:
         )
 
 
-def _choose_variant(name: str, limits: Limits, root: Root, device: torch.device, calibrate: bool) -> str:
+def _choose_variant(name: str, limits: Limits, root: Root, device: torch.device) -> str:
     """The variant within the limits; damaged ones are left out.
 
     Raises:
@@ -223,27 +191,22 @@ def _choose_variant(name: str, limits: Limits, root: Root, device: torch.device,
             damaged.append(error)
     if damaged and not cards:
         raise damaged[0]
-    machine = limits.hardware or device_name(device)
-
-    def milliseconds(variant: str) -> float | None:
-        if not calibrate:
-            return stated_milliseconds(cards[variant]).get(machine)
-        with suppress(ZooError):  # damaged
-            return float(measure_speed(load_model(variant, device, root))["ms_per_frame"])
-        return None
-
-    return choose(cards, limits, milliseconds)
+    machine, times = limits.hardware or device_name(device), {}
+    for variant, card in cards.items():
+        if limits.calibrate:
+            with suppress(ZooError):  # damaged
+                times[variant] = float(measure_speed(load_model(variant, device, root))["ms_per_frame"])
+        elif machine in (stated := stated_milliseconds(card)):
+            times[variant] = stated[machine]
+    return choose(cards, limits, times)
 
 
 def _check_variants(model: str | Path, root: Root) -> None:
-    """Check that a model is given by a name, of which there may be variants.
-
-    Raises:
-        ConfigError: if it is a path or an id.
-    """
-    if root is not None or (isinstance(model, str) and any(f"{name}/".startswith(f"{model}/") for name in Zoo.list())):
-        return
-    if _exists(Path(model)) or HubId.parse(str(model)) is not None:
+    """Raise ConfigError for a model that is given by a path or an id, not by a name, of which there may be variants."""
+    named = root is not None or (
+        isinstance(model, str) and any(f"{name}/".startswith(f"{model}/") for name in Zoo.list())
+    )
+    if not named and (_exists(Path(model)) or HubId.parse(str(model)) is not None):
         raise ConfigError(
             f"{one_line(model)} is one model: variant, max_mse and max_ms_per_frame choose among those of a name in the"
             " zoo. Leave them out; or, for a folder of several models, give root=FOLDER and a name within it."
@@ -252,12 +215,12 @@ def _check_variants(model: str | Path, root: Root) -> None:
 
 def _unknown_model(name: str, root: Root = None) -> ZooError:
     names = Zoo.list(root)
+    datasets = {other: other.partition("/")[0] for other in names}
     dataset = name.partition("/")[0]
-    variants = [other for other in names if other.partition("/")[0] == dataset]
-    if variants and dataset != name:
+    if variants := [other for other in names if datasets[other] == dataset != name]:
         near = f" Of {dataset} it has {', '.join(variants)}."
     else:
-        near = suggestion(name[:NAME_LENGTH], sorted({*names, *(other.partition("/")[0] for other in names)}))
+        near = suggestion(name[:NAME_LENGTH], sorted({*names, *datasets.values()}))
     path = " No such path exists either." if root is None and not _exists(Path(name)) else ""
     shown = one_line(repr(name), NAME_LENGTH)
     return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(names) or 'none'}.{near}{path}")

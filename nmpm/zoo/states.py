@@ -60,22 +60,17 @@ class StateBuilder:
         material: Any,
         obstacle: Any,
         gravity: Any,
-        fields: Mapping[str, Any] | None = None,
-        bodies: Bodies | None = None,
+        fields: Mapping[str, Any] | None,
+        bodies: Bodies | None,
     ) -> Particles:
-        """The state, with velocities and gravity converted to frames.
-
-        Raises:
-            DataError: as `Pretrained.state`.
-        """
-        dt, solid = self.scene.dt, self._obstacle(obstacle)
-        share = None
+        """The state, with velocities and gravity converted to frames; raises as `Pretrained.state`."""
+        solid, share = self._obstacle(obstacle), None
         if bodies:
             solid, share = self._add_bodies(solid, bodies)
         kind, speed = self._material(material), self._velocity(velocity)
         state = Particles(
             position=self.position.to(self.dtype),
-            velocity=(speed * dt).to(self.dtype),
+            velocity=(speed * self.scene.dt).to(self.dtype),
             material=kind,
             mask=torch.ones_like(kind, dtype=torch.bool),
             obstacle=solid.to(self.dtype),
@@ -145,10 +140,7 @@ class StateBuilder:
         points = _numbers("obstacle", given)
         count = points.shape[-2] if points.dim() > 1 else 0
         shape = (self.batch, count, dim)
-        points = self._expand("obstacle", points, [shape[1:], shape], shape)
-        if not points.isfinite().all():
-            raise DataError("obstacle has values that are not finite.")
-        return points
+        return self._expand("obstacle", points, [shape[1:], shape], shape)
 
     def _add_bodies(self, solid: Tensor, given: Bodies) -> tuple[Tensor, Tensor]:
         """(B, M, D) obstacle particles with those of bodies, and their shares (B, M)."""
@@ -173,22 +165,18 @@ class StateBuilder:
         Raises:
             DataError: if it is not the model's, or needed.
         """
-        return (self._gravity_per_second(given) * self.scene.dt**2).to(self.dtype)
-
-    def _gravity_per_second(self, given: Any) -> Tensor:
         scene, shape = self.scene, (self.batch, self.scene.dim)
-        if given is None:
-            if scene.gravity_varies:
-                raise DataError("gravity is needed, in length/s²: this model's scenes differ in it.")
-            return self._expand("gravity", scene.gravity or (0.0,) * scene.dim, [shape[1:]], shape)
-        values = self._expand("gravity", given, [shape[1:], shape], shape)
+        if given is None and scene.gravity_varies:
+            raise DataError("gravity is needed, in length/s²: this model's scenes differ in it.")
+        stated = scene.gravity or (0.0,) * scene.dim
+        values = self._expand("gravity", stated if given is None else given, [shape[1:], shape], shape)
         if not values.isfinite().all():
             raise DataError(f"gravity = {values.tolist()} must be finite.")
         if scene.gravity_varies:
             self._check_gravity_range(values)
-        else:
+        elif given is not None:
             self._check_fixed_gravity(values)
-        return values
+        return (values * scene.dt**2).to(self.dtype)
 
     def _check_fixed_gravity(self, values: Tensor) -> None:
         if self.scene.gravity is None:

@@ -22,16 +22,12 @@ from nmpm.emulator import Emulator, rollout
 from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
-from nmpm.particles import Window
 from nmpm.zoo.entries import Rows, load_entry, read_scenes
 from nmpm.zoo.measures.scenes import iterate_test_scenes
 from nmpm.zoo.pretrained import Pretrained
 
-FRAMES, COUNT = 32, 300
-PROBES = 8
-"""Number of particles of the golden rollout whose last positions are stored."""
-SEEDS = 8
-"""Number of scenes to choose from."""
+FRAMES, COUNT, PROBES, SEEDS = 32, 300, 8, 8
+"""Of the golden rollout: frames, particles, those whose last positions are stored, and scenes to choose from."""
 TOLERANCE = 1e-3
 """Largest distance from a stated position, in cells: other processors and versions of torch round differently."""
 SHORT_SCENES, SHORT_FRAMES = 2, 100
@@ -82,7 +78,7 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
     """Measure a model's figures again.
 
     Args:
-        model: Of the zoo.
+        model: With its card.
         rows: The stated errors of its test scenes, in their order.
         full: All test scenes to their end, the mean within the 95% interval over scenes, instead of the first 100
             frames of the first few, each within 10%.
@@ -97,9 +93,11 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
     yield Check("golden rollout, largest distance in cells", 0.0, distance, 0.0, TOLERANCE)
     yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
-    windows = iterate_test_scenes(f"Verifying {model.name}", model, data, count, frames)
-    errors = [_errors(model, window) for window in windows]
-    checks = list(_means(rows, errors) if full else _scenes(rows, errors))
+    metric = MSE()
+    for window in iterate_test_scenes(f"Verifying {model.name}", model, data, count, frames):
+        metric.update(window, model.rollout(window.initial, window.target.shape[1]).cpu())
+    compare = _means if full else _scenes
+    checks = list(compare(rows, metric.per_trajectory()))
     if not checks:
         more = "" if full else "; --full measures the whole scenes"
         raise ZooError(f"{model.name}: no error of a test scene is stated that was measured{more}.")
@@ -107,11 +105,7 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
 
 
 def _headline(model: Pretrained, rows: Rows) -> Iterator[Check]:
-    """The figures that cards, tables and choices show beside the means of those of single test scenes.
-
-    Raises:
-        ZooError: if the card states none.
-    """
+    """Compare the figures that cards, tables and choices show with the means over single test scenes."""
     test = model.card.get("test")
     figures = {name: value for name, value in test.items() if "/" not in name} if isinstance(test, Mapping) else {}
     if "mse" not in figures or not all(map(is_number, figures.values())):
@@ -140,13 +134,6 @@ def _means(rows: Rows, errors: Rows) -> Iterator[Check]:
         yield Check(f"{name} over {len(stated)} test scenes", float(np.mean(stated)), mean, low, high)
 
 
-def _errors(model: Pretrained, window: Window) -> dict[str, float]:
-    metric = MSE()
-    device = model.emulator.device
-    metric.update(window, model.rollout(window.initial.to(device), window.target.shape[1]).cpu())
-    return metric.per_trajectory()[0]
-
-
 def golden_rollout(emulator: Emulator) -> dict[str, Any]:
     """The last positions of some particles in a rollout of a thrown block, with what determines it.
 
@@ -155,7 +142,11 @@ def golden_rollout(emulator: Emulator) -> dict[str, Any]:
     """
     count = Pretrained(emulator, {}).fitting_count(COUNT, blocks=1)
     paths = [_positions(emulator, seed, count, FRAMES) for seed in range(SEEDS)]
-    seed = max(range(SEEDS), key=lambda seed: _deformation(emulator, seed, count, paths[seed]))
+    deformation = []
+    for seed, last in enumerate(paths):
+        first = thrown_blocks(emulator.scene, count, seed=seed).position[0].double()
+        deformation.append(float((last - _probes(first)).std(0).norm()))
+    seed = int(np.argmax(deformation))
     return {"seed": seed, "count": count, "frames": FRAMES, "position": paths[seed].tolist()}
 
 
@@ -189,12 +180,6 @@ def _positions(emulator: Emulator, seed: int, count: int, frames: int) -> Tensor
     state = thrown_blocks(emulator.scene, count, seed=seed)  # weightless where gravity varies, as cards state it
     last = rollout(emulator, state.to(emulator.device), frames)[0, -1].double().cpu()
     return _probes(last).mul(1e7).round().div(1e7)
-
-
-def _deformation(emulator: Emulator, seed: int, count: int, last: Tensor) -> float:
-    """How far the displacements of the probes to their last positions (PROBES, D) differ from each other."""
-    first = thrown_blocks(emulator.scene, count, seed=seed).position[0].double()
-    return float((last - _probes(first)).std(0).norm())
 
 
 def _probes(position: Tensor) -> Tensor:

@@ -49,15 +49,7 @@ class Format:
     def difference(self, part: Part, path: Path, batch: int, count: int, seed: int = 0) -> float:
         """The largest difference between a written file's outputs and the part's own, on random inputs.
 
-        Args:
-            part: The part that was written.
-            path: The file.
-            batch: Scenes.
-            count: Particles.
-            seed: Of the inputs.
-
-        Returns:
-            The difference in cells for the step, else in the output's own units; inf where either is NaN.
+        In cells for the step, else in the output's own units; inf where either is NaN.
         """
         inputs = part.example(batch, count, seed)
         worst = 0.0
@@ -68,13 +60,7 @@ class Format:
 
 
 def description(part: Part, model: str, training_data: str) -> dict[str, str]:
-    """Metadata of an exported file, as keys and texts; lists and mappings are JSON.
-
-    Args:
-        part: The exported part.
-        model: The model's name.
-        training_data: What it was trained on, in words; simulated data must be called simulated.
-    """
+    """Metadata of an exported file, as keys and texts: the model's name, its data in words, and what it computes."""
     emulator = part.emulator
     return {
         "model": model,
@@ -129,11 +115,7 @@ def _reason(error: BaseException) -> str:
 
 
 def write_onnx(part: Part, metadata: Mapping[str, str], path: Path) -> None:
-    """Write a part as an ONNX file.
-
-    Raises:
-        ConfigError: naming a package that is missing, or an operation of the network that ONNX lacks.
-    """
+    """Write a part as an ONNX file; ConfigError names a missing package, or an operation that ONNX lacks."""
     _check_onnx()
     import onnx
 
@@ -163,11 +145,7 @@ def write_onnx(part: Part, metadata: Mapping[str, str], path: Path) -> None:
 
 
 def run_onnx(path: Path, inputs: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
-    """The outputs of an ONNX file, by ONNX Runtime.
-
-    Raises:
-        ConfigError: if a package is missing.
-    """
+    """The outputs of an ONNX file, by ONNX Runtime."""
     _check_onnx()
     import onnxruntime
 

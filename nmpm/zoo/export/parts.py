@@ -69,13 +69,7 @@ class Part(nn.Module, ABC):
 
     @abstractmethod
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
-        """Random inputs on the part's device, for tracing and for comparing programs with the emulator.
-
-        Args:
-            batch: Scenes.
-            count: Particles, of obstacles too.
-            seed: Of the numbers.
-        """
+        """Random inputs on the part's device, for tracing and comparing: of scenes, and particles of each kind."""
 
 
 class Step(Part):
@@ -141,16 +135,11 @@ class Step(Part):
 
     def _state(self, position: Tensor, velocity: Tensor, material: Tensor | None, gravity: Tensor | None) -> Particles:
         batch, count, dim = position.shape
-        one = torch.zeros(batch, count, dtype=torch.int64, device=position.device)
-        return Particles(
-            position=position,
-            velocity=velocity,
-            material=one if material is None else material,
-            mask=torch.ones(batch, count, dtype=torch.bool, device=position.device),
-            obstacle=position.new_zeros(batch, 0, dim),
-            obstacle_mask=torch.ones(batch, 0, dtype=torch.bool, device=position.device),
-            gravity=self.known_gravity.expand(batch, dim) if gravity is None else gravity,
-        )
+        if material is None:
+            material = torch.zeros(batch, count, dtype=torch.int64, device=position.device)
+        if gravity is None:
+            gravity = self.known_gravity.expand(batch, dim)
+        return _real_state(position, velocity, material, position.new_zeros(batch, 0, dim), gravity)
 
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
         random = torch.Generator().manual_seed(seed)
@@ -214,18 +203,23 @@ class Solid(Part):
 
     def forward(self, obstacle: Tensor) -> tuple[Tensor]:
         """(B, M, D) → (B, 1, *S)."""
-        batch, count, dim = obstacle.shape
-        none = obstacle.new_zeros(batch, 0, dim)
-        empty = torch.zeros(batch, 0, dtype=torch.bool, device=obstacle.device)
-        real = torch.ones(batch, count, dtype=torch.bool, device=obstacle.device)
-        gravity = obstacle.new_zeros(batch, dim)
-        return (self.emulator.solid(Particles(none, none, empty.long(), empty, obstacle, real, gravity)),)
+        batch, _, dim = obstacle.shape
+        none, gravity = obstacle.new_zeros(batch, 0, dim), obstacle.new_zeros(batch, dim)
+        return (self.emulator.solid(_real_state(none, none, none[..., 0].long(), obstacle, gravity)),)
 
     def example(self, batch: int, count: int, seed: int = 0) -> dict[str, Tensor]:
         scene, random = self.emulator.scene, torch.Generator().manual_seed(seed)
         low, high = torch.tensor(scene.bounds).T
         obstacle = low + (high - low) * torch.rand(batch, count, scene.dim, generator=random)
         return {"obstacle": obstacle.to(self.device)}
+
+
+def _real_state(position: Tensor, velocity: Tensor, material: Tensor, obstacle: Tensor, gravity: Tensor) -> Particles:
+    """A state of which all particles are real."""
+    mask, obstacle_mask = (
+        torch.ones(points.shape[:2], dtype=torch.bool, device=points.device) for points in (position, obstacle)
+    )
+    return Particles(position, velocity, material, mask, obstacle, obstacle_mask, gravity)
 
 
 def _check_constraints(emulator: Emulator) -> None:
