@@ -1,19 +1,31 @@
-"""Initial states: ranges from which rectangular blocks are drawn, the same keys for every solver, and gravity."""
+"""Initial states: the layout of moving material, and ranges from which rectangular blocks of it are drawn."""
 
 from __future__ import annotations
 
+import abc
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from nmpm.sim.state import Array, check
+from nmpm.sim.state import Array, check, check_numbers
+
+
+class Layout(abc.ABC):
+    """How the initial state is drawn."""
+
+    @abc.abstractmethod
+    def faster(self, factor: float) -> Self:
+        """The same at initial speeds times a factor."""
+
+    @abc.abstractmethod
+    def multiplied(self, times: int) -> Self:
+        """For a box so many times as wide: up to as many times as many particles."""
 
 
 @dataclass(frozen=True)
-class BlockRanges:
+class BlockRanges(Layout):
     """How blocks are drawn; lengths in metres.
 
     Args:
@@ -38,19 +50,16 @@ class BlockRanges:
     jitter: float
 
     def __post_init__(self) -> None:
-        for key in ("number", "particles", "aspect"):
-            low, high = getattr(self, key)
-            check(0 < low <= high, f"blocks.{key} = {[low, high]} needs two positive numbers, the lower first.")
-        check(0 < self.share * self.number[1] <= 1, f"blocks.share = {self.share} is too large for the blocks.")
-        check(0 <= self.jitter < 0.5, f"blocks.jitter = {self.jitter} must be at least 0 and below 0.5.")
-        check(self.gap >= 0 and self.speed >= 0, "blocks.gap and blocks.speed must not be negative.")
+        check_numbers(
+            self, "blocks.", positive=("number", "particles", "share", "aspect"), at_least_0=("gap", "speed", "jitter")
+        )
+        check(self.share * self.number[1] <= 1, f"blocks.share = {self.share} is too large for the blocks.")
+        check(self.jitter < 0.5, f"blocks.jitter = {self.jitter} must be below 0.5.")
 
     def faster(self, factor: float) -> Self:
-        """The same at initial speeds times a factor."""
         return dataclasses.replace(self, speed=factor * self.speed)
 
     def multiplied(self, times: int) -> Self:
-        """For a box so many times as large: up to as many times as many particles and blocks."""
         return dataclasses.replace(
             self,
             particles=(self.particles[0], times * self.particles[1]),
@@ -70,12 +79,3 @@ def lattice(low: Array, shape: tuple[int, ...], spacing: float, shift: Array | f
     """
     nodes = np.stack(np.meshgrid(*(np.arange(number) for number in shape), indexing="ij"), axis=-1)
     return np.asarray(low + spacing * (nodes.reshape(-1, len(shape)) + 0.5 + shift))
-
-
-def draw_gravity(gravity: tuple[float, ...], max_turn: float, rng: np.random.Generator) -> tuple[float, ...]:
-    """A gravity of two axes, turned by a random angle of at most `max_turn` degrees; unchanged for 0."""
-    if not max_turn:
-        return gravity
-    angle = math.radians(rng.uniform(-max_turn, max_turn))
-    (x, y), cos, sin = gravity, math.cos(angle), math.sin(angle)
-    return cos * x - sin * y, sin * x + cos * y

@@ -9,18 +9,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+import numpy as np
+
 from nmpm._support.bounded_files import FILE_NAME
 from nmpm._support.messages import one_line
-from nmpm._support.plain_data import to_plain
+from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory, check
+from nmpm.sim.blocks import Layout
+from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory, check, check_numbers
 
 BOUNDARY = 3
 """Type id of particles that never move, as in DeepMind's scenes."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Preset(abc.ABC):
     """A family of simulated scenes; each solver has a subclass with its own parameters.
 
@@ -29,8 +32,11 @@ class Preset(abc.ABC):
         frames: Simulated frames of a trajectory after its initial state.
         frame_dt: Time between frames, in seconds.
         substeps: Substeps of a frame.
-        box: Where particles may be, (lower, upper) along each axis, in length.
+        box: Where material is put, (lower, upper) along each axis, in length.
         domain: What an emulator's grid covers, likewise.
+        spacing: Distance between particles at rest, in length.
+        gravity: Acceleration, in length per second squared.
+        gravity_turn: Largest angle by which a trajectory's gravity is turned either way, in degrees; in 2-D only.
 
     Raises:
         ConfigError: if a number is out of range.
@@ -51,6 +57,9 @@ class Preset(abc.ABC):
     substeps: int
     box: tuple[Interval, ...]
     domain: tuple[Interval, ...]
+    spacing: float
+    gravity: tuple[float, ...]
+    gravity_turn: float = 0.0
 
     def __post_init__(self) -> None:
         check(
@@ -58,19 +67,9 @@ class Preset(abc.ABC):
             f"name = {one_line(repr(self.name), 80)} names files and folders: give letters, digits, - _ and ., the"
             " first a letter or digit.",
         )
-        self._check_positive("frames", "frame_dt", "substeps")
-        self._check_whole("frames", "substeps")
-
-    def _check_whole(self, *keys: str) -> None:
-        for key in keys:
-            check(isinstance(getattr(self, key), int), f"{key} = {getattr(self, key)} must be a whole number.")
-
-    def _check_positive(self, *keys: str) -> None:
-        for key in keys:
-            value = getattr(self, key)
-            check(
-                isinstance(value, int | float) and 0 < value < math.inf, f"{key} = {value} must be positive and finite."
-            )
+        check_numbers(self, "", positive=("frames", "frame_dt", "substeps", "spacing"))
+        check(all(low < high for low, high in self.box), f"box = {self.box} needs (lower, upper) along each axis.")
+        check(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
 
     @abc.abstractmethod
     def draw(self, seed: int) -> InitialState:
@@ -112,14 +111,28 @@ class Preset(abc.ABC):
         return trajectory
 
     @property
-    @abc.abstractmethod
     def scene(self) -> Scene:
-        """What the preset's trajectories have in common, known without simulating."""
+        """The facts that all trajectories share, known without simulating."""
+        return Scene(
+            bounds=self.reach,
+            domain=self.domain,
+            dt=self.frame_dt,
+            materials=tuple(name for number, name in self.type_names.items() if number != BOUNDARY),
+            particle_volume=self.spacing ** len(self.box),
+            gravity=None if self.gravity_turn else self.gravity,
+            gravity_varies=self.gravity_turn > 0,
+            obstacles=BOUNDARY in self.type_names,
+        )
+
+    @property
+    def reach(self) -> tuple[Interval, ...]:
+        """How far particles can get, (lower, upper) along each axis."""
+        return self.box
 
     @property
     @abc.abstractmethod
     def type_names(self) -> dict[int, str]:
-        """Name of each particle type id that the trajectories may hold."""
+        """Name of each particle type id that the trajectories may hold, materials in their order."""
 
     @property
     @abc.abstractmethod
@@ -131,12 +144,21 @@ class Preset(abc.ABC):
     def stable_substeps(self) -> int:
         """Fewest substeps of a frame with which the preset's scenes are stable."""
 
+    @property
     @abc.abstractmethod
+    def _layouts(self) -> Mapping[str, Layout]:
+        """How the initial state is drawn, by the name of its field."""
+
     def varied(self, *, speed: float = 1.0, gravity: float = 1.0) -> Self:
         """The same scenes with initial speeds and gravity times a factor; with more substeps where stability asks it.
 
-        A negative factor reverses gravity.
+        A negative factor reverses gravity. SPH's speed of sound stays, so that flows which come near it fail as
+        unstable.
         """
+        layouts = {key: layout.faster(speed) for key, layout in self._layouts.items()}
+        return self._with_stable_substeps(
+            self.substeps, gravity=tuple(gravity * pull for pull in self.gravity), **layouts
+        )
 
     @abc.abstractmethod
     def widened(self, times: int) -> Self:
@@ -150,22 +172,31 @@ class Preset(abc.ABC):
             ConfigError: if the preset's resolution cannot be divided so.
         """
 
-    def _widened_sides(self, times: int, step: float) -> tuple[Interval, Interval, int]:
-        """Box and domain along x in a domain so many times as wide, and how many steps of a length fill that box.
+    def _with_stable_substeps(self, least: int, **changes: Any) -> Self:
+        """The same but for changes, with `stable_substeps`, or `least` if that is more."""
+        many = dataclasses.replace(self, substeps=2**31, **changes)  # accepted whatever the cells and speeds
+        return dataclasses.replace(many, substeps=max(least, many.stable_substeps))
+
+    def _widened_sides(self, times: int, step: float) -> tuple[tuple[Interval, ...], tuple[Interval, ...], int]:
+        """Box and domain so many times as wide along x, and how many steps of a length fill that box.
 
         The box is as wide as whole steps allow, its wall layer on the right at least what it was.
         """
         (left, right), (low, high) = self.domain[0], self.box[0]
         edge = left + times * (right - left)
         steps = math.floor((edge - (right - high) - low) / step + 1e-9)
-        return (low, low + steps * step), (left, edge), steps
+        return ((low, low + steps * step), *self.box[1:]), ((left, edge), *self.domain[1:]), steps
+
+    def _draw_gravity(self, rng: np.random.Generator) -> tuple[float, ...]:
+        """Gravity, turned by a random angle of at most `gravity_turn`."""
+        if not self.gravity_turn:
+            return self.gravity
+        angle = math.radians(rng.uniform(-self.gravity_turn, self.gravity_turn))
+        (x, y), cos, sin = self.gravity, math.cos(angle), math.sin(angle)
+        return cos * x - sin * y, sin * x + cos * y
 
     def with_frames(self, frames: int) -> Self:
-        """The same with another number of frames.
-
-        Raises:
-            ConfigError: if it is not a positive whole number.
-        """
+        """The same with another number of frames."""
         return dataclasses.replace(self, frames=frames)
 
     def to_dict(self) -> dict[str, Any]:
@@ -174,10 +205,10 @@ class Preset(abc.ABC):
         return {"solver": self.solver} | {key: to_plain(value) for key, value in values.items() if value is not None}
 
     @classmethod
-    @abc.abstractmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
         """The preset that `to_dict` described.
 
         Raises:
             ConfigError: if a key is unknown, missing or of the wrong kind.
         """
+        return from_plain(cls, plain, "the preset")

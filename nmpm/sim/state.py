@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,22 @@ def check(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
+def check_numbers(
+    owner: object, section: str, *, positive: tuple[str, ...] = (), at_least_0: tuple[str, ...] = ()
+) -> None:
+    """Check that attributes, numbers or ranges (lower, upper) of them, are positive or at least 0, and finite.
+
+    Raises:
+        ConfigError: naming `section` and the attribute.
+    """
+    for key in (*positive, *at_least_0):
+        value = getattr(owner, key)
+        low, high = value if isinstance(value, tuple) else (value, value)
+        kind, enough = ("positive", low > 0) if key in positive else ("at least 0", low >= 0)
+        order = ", the lower number first" if isinstance(value, tuple) else ""
+        check(enough and low <= high < math.inf, f"{section}{key} = {value} must be {kind} and finite{order}.")
+
+
 class Obstacle(abc.ABC):
     """A body within the box that does not move."""
 
@@ -36,6 +53,9 @@ class Obstacle(abc.ABC):
     @abc.abstractmethod
     def moved(self, shift: Array) -> Self:
         """The same body shifted by (D,), in length."""
+
+
+AnyObstacle = TypeVar("AnyObstacle", bound=Obstacle)
 
 
 @dataclass(frozen=True)
@@ -61,11 +81,7 @@ class InitialState:
     obstacles: tuple[Obstacle, ...] = ()
 
     def check_particles(self, reach: tuple[Interval, ...], obstacles: tuple[Obstacle, ...] = ()) -> None:
-        """Check the arrays' shapes, and that there are particles, finite, within `reach` and in no obstacle.
-
-        Raises:
-            DataError: if they are not.
-        """
+        """Raise a DataError unless there are particles, finite, within `reach` and in no obstacle."""
         position, velocity = self.position, self.velocity
         if position.ndim != 2 or position.shape[1] != len(reach) or velocity.shape != position.shape:
             raise DataError(
@@ -83,6 +99,21 @@ class InitialState:
                 f"Particle {worst} at {position[worst].tolist()} with velocity {velocity[worst].tolist()} is not"
                 f" finite, not within {reach} or in an obstacle."
             )
+
+    def counts_of(self, materials: int) -> tuple[int, ...]:
+        """Particles of each material; raises a DataError unless they add up to all."""
+        count = len(self.position)
+        counts = self.counts or (count,) + (0,) * (materials - 1)
+        if len(counts) != materials or sum(counts) != count:
+            raise DataError(f"Counts {counts} do not divide {count} particles among {materials} materials.")
+        return counts
+
+    def obstacles_of(self, kind: type[AnyObstacle]) -> tuple[AnyObstacle, ...]:
+        """The obstacles; raises a DataError unless all are of the kind that a solver simulates."""
+        obstacles = tuple(obstacle for obstacle in self.obstacles if isinstance(obstacle, kind))
+        if len(obstacles) != len(self.obstacles):
+            raise DataError(f"This solver simulates a {kind.__name__}; other obstacles are not implemented.")
+        return obstacles
 
 
 @dataclass(frozen=True)

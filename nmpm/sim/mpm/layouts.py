@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
 from nmpm.sim.blocks import BlockRanges, lattice
-from nmpm.sim.state import Array, Obstacle, check
+from nmpm.sim.state import Array, Obstacle, check, check_numbers
 
 _BLOCK_ATTEMPTS = 10_000
 _RESTARTS = 20
@@ -57,8 +57,8 @@ class MpmBlockRanges(BlockRanges):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = self.height or (0.0, 0.0)
-        check(0 <= low <= high, f"blocks.height = {self.height} needs two numbers, the lower first.")
+        if self.height is not None:
+            check_numbers(self, "blocks.", at_least_0=("height",))
 
     def draw(self, box: tuple[Interval, ...], spacing: float, materials: int, rng: np.random.Generator) -> DrawnBlocks:
         """Random blocks within a box.
@@ -226,11 +226,9 @@ class RampRanges:
     gap: float
 
     def __post_init__(self) -> None:
-        check(0 <= self.number[0] <= self.number[1], f"ramps.number = {list(self.number)} needs least and most.")
-        check(0 < self.length[0] <= self.length[1], f"ramps.length = {list(self.length)} needs least and largest.")
-        check(0 <= self.angle[0] <= self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
-        check(0 < self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is not 0 < … ≤ the length.")
-        check(self.gap >= 0, f"ramps.gap = {self.gap} must not be negative.")
+        check_numbers(self, "ramps.", positive=("length", "thickness"), at_least_0=("number", "angle", "gap"))
+        check(self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
+        check(self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is more than the length.")
 
     def max_particles(self, spacing: float) -> int:
         """Upper bound of the particles that the ramps of a scene are made of."""

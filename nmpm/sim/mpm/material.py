@@ -22,10 +22,6 @@ class Material(abc.ABC):
     density: float
     """Mass per area at rest, in kg / m²."""
 
-    @abc.abstractmethod
-    def to_dict(self) -> dict[str, float]:
-        """The parameters, as a preset's file gives them."""
-
     @property
     @abc.abstractmethod
     def wave_speed(self) -> float:

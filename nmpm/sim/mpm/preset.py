@@ -7,18 +7,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from nmpm._support.plain_data import from_plain
-from nmpm.errors import ConfigError, DataError
+from nmpm._support.plain_data import from_plain, to_plain
+from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.blocks import draw_gravity
+from nmpm.sim.blocks import Layout
 from nmpm.sim.mpm.layouts import MpmBlockRanges, RampRanges, SimulatedRamp, distance_to_ramps
 from nmpm.sim.mpm.material import Material
-from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
-from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.mpm.solids import Goop, Sand
 from nmpm.sim.mpm.stability import (
@@ -31,16 +29,15 @@ from nmpm.sim.mpm.stability import (
 from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
 from nmpm.sim.mpm.water import Water
 from nmpm.sim.preset import BOUNDARY, Preset
-from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, check, record_frames
+from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, check, check_numbers, record_frames
 
 MATERIALS: dict[str, type[Material]] = {kind.name: kind for kind in (Water, Sand, Goop)}
 """The constitutive models by name; a new one is added here."""
 
 _ARRANGEMENTS = 20
-_STEPPERS: dict[int, type[MpmStepper]] = {2: Stepper2d, 3: Stepper3d}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MpmPreset(Preset):
     """A family of scenes of the material point method; `presets/goop.yaml` comments every entry.
 
@@ -48,13 +45,10 @@ class MpmPreset(Preset):
 
     Args:
         cells: Grid cells along x, from side to side of the box.
-        spacing: Distance between particles in the initial lattice, in length.
-        gravity: Acceleration, in length per second squared.
         wall_friction: Coulomb friction at the walls.
         materials: What blocks are made of.
         blocks: How the initial state is drawn.
         walls: What the walls do with material that leaves them, a value of `Walls`.
-        gravity_turn: Largest angle by which a trajectory's gravity is turned, in degrees; in two dimensions only.
         ramps: Obstacles; in two dimensions only.
 
     Raises:
@@ -66,25 +60,19 @@ class MpmPreset(Preset):
     revision: ClassVar[int] = 1
 
     cells: int
-    spacing: float
-    gravity: tuple[float, ...]
     wall_friction: float
     materials: tuple[Material, ...]
     blocks: MpmBlockRanges
     walls: str = Walls.SEPARATE.value
-    gravity_turn: float = 0.0
     ramps: RampRanges | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_positive("cells", "spacing")
-        self._check_whole("cells")
-        check(self.wall_friction >= 0, f"wall_friction = {self.wall_friction} must not be negative.")
+        check_numbers(self, "", positive=("cells",), at_least_0=("wall_friction",))
         kinds = [kind.value for kind in Walls]
         check(self.walls in kinds, f"walls = {self.walls} is not one of {', '.join(map(repr, kinds))}.")
         check(bool(self.materials), f"materials is empty; known are {', '.join(MATERIALS)}.")
         self._check_axes()
-        self._check_dimension()
         least, fastest = self._wave_substeps, max(material.wave_speed for material in self.materials)
         check(
             self.substeps >= least,
@@ -94,7 +82,6 @@ class MpmPreset(Preset):
 
     def _check_axes(self) -> None:
         check(self.dim in (2, 3), f"box = {self.box} has {self.dim} axes; 2 or 3 are possible.")
-        check(all(low < high for low, high in self.box), f"box = {self.box} needs (lower, upper) along each axis.")
         for key in ("domain", "gravity"):
             check(len(getattr(self, key)) == self.dim, f"{key} = {getattr(self, key)} needs {self.dim} entries.")
         for low, high in self.box:
@@ -104,9 +91,6 @@ class MpmPreset(Preset):
                 abs(cells - round(cells)) < 1e-6,
                 f"cells = {self.cells} along x make {cells:.3f} from {low} to {high}, not a whole number.",
             )
-
-    def _check_dimension(self) -> None:
-        check(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
         needs_2d = self.ramps is not None or self.gravity_turn or self.walls == Walls.OPEN_CORNERS.value
         check(
             self.dim == 2 or not needs_2d,
@@ -127,7 +111,7 @@ class MpmPreset(Preset):
 
     @property
     def reach(self) -> tuple[Interval, ...]:
-        """How far particles can get: the box, and a cell and a half beyond it where walls hold what touches them."""
+        """The box, and a cell and a half beyond it where walls hold what touches them."""
         layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
         ends = ((low - layer, high + layer) for low, high in self.box)
         return tuple(_snap(pair, edges) for pair, edges in zip(ends, self.domain, strict=True))
@@ -153,16 +137,9 @@ class MpmPreset(Preset):
         bounds += [longest_particle_substep(material, size, dim, speed) for material in self.materials]
         return max(self._wave_substeps, math.ceil(self.frame_dt / min(bounds) - 1e-9))
 
-    def _with_stable_substeps(self, least: int) -> MpmPreset:
-        """The same with `stable_substeps`, or `least` if that is more."""
-        many = dataclasses.replace(self, substeps=2**31)  # accepted whatever the cells and speeds
-        return dataclasses.replace(many, substeps=max(least, many.stable_substeps))
-
-    def varied(self, *, speed: float = 1.0, gravity: float = 1.0) -> MpmPreset:
-        changed = dataclasses.replace(
-            self, blocks=self.blocks.faster(speed), gravity=tuple(gravity * pull for pull in self.gravity)
-        )
-        return changed._with_stable_substeps(self.substeps)
+    @property
+    def _layouts(self) -> dict[str, Layout]:
+        return {"blocks": self.blocks}
 
     def coarsened(self, factor: int) -> MpmPreset:
         """The same particles on a grid with cells `factor` times as large, with `stable_substeps` substeps.
@@ -171,23 +148,16 @@ class MpmPreset(Preset):
             ConfigError: if the cells do not divide by the factor.
         """
         check(self.cells % factor == 0, f"{self.cells} cells cannot be coarsened {factor} times.")
-        many = dataclasses.replace(self, substeps=2**31, cells=self.cells // factor)
-        return many._with_stable_substeps(1)
+        return self._with_stable_substeps(1, cells=self.cells // factor)
 
     def widened(self, times: int) -> MpmPreset:
         """Scenes in a domain so many times as wide, with up to as many times as many particles and blocks."""
         box, domain, cells = self._widened_sides(times, self.cell_size)
-        return dataclasses.replace(
-            self,
-            box=(box, *self.box[1:]),
-            domain=(domain, *self.domain[1:]),
-            cells=cells,
-            blocks=self.blocks.multiplied(times),
-        )
+        return dataclasses.replace(self, box=box, domain=domain, cells=cells, blocks=self.blocks.multiplied(times))
 
     def draw(self, seed: int) -> InitialState:
         rng = np.random.default_rng(seed)
-        gravity = draw_gravity(self.gravity, self.gravity_turn, rng)
+        gravity = self._draw_gravity(rng)
         for _ in range(_ARRANGEMENTS):
             drawn = self.blocks.draw(self.box, self.spacing, len(self.materials), rng)
             try:
@@ -200,11 +170,11 @@ class MpmPreset(Preset):
 
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
         start.check_particles(self.reach)
-        counts, ramps = self._counts_of(start), _ramps_of(start)
+        counts, ramps = start.counts_of(len(self.materials)), start.obstacles_of(SimulatedRamp)
         gravity = self.gravity if start.gravity is None else start.gravity
         groups = tuple(zip(self.materials, counts, strict=True))
         particles = MpmParticles(start.position, start.velocity, groups, self.spacing**self.dim)
-        stepper = _STEPPERS[self.dim](self._grid(gravity, ramps), self.frame_dt / self.substeps)
+        stepper = MpmStepper(self._grid(gravity, ramps), self.frame_dt / self.substeps)
         stepper.enclose(particles)
 
         def advance(frame: int) -> Array:
@@ -222,13 +192,6 @@ class MpmPreset(Preset):
             attributes["gravity"] = np.array(gravity)
         return SimulatedTrajectory(position, particle_type, attributes)
 
-    def _counts_of(self, start: InitialState) -> tuple[int, ...]:
-        count, materials = len(start.position), len(self.materials)
-        counts = start.counts or (count,) + (0,) * (materials - 1)
-        if len(counts) != materials or sum(counts) != count:
-            raise DataError(f"Counts {counts} do not divide {count} particles among {materials} materials.")
-        return counts
-
     def _grid(self, gravity: tuple[float, ...], ramps: tuple[SimulatedRamp, ...]) -> MpmGrid:
         low, high = np.array(self.reach).T
         shape = tuple(round(cells) for cells in (high - low) / self.cell_size)
@@ -242,17 +205,8 @@ class MpmPreset(Preset):
 
     @property
     def scene(self) -> Scene:
-        return Scene(
-            bounds=self.reach,
-            domain=self.domain,
-            dt=self.frame_dt,
-            materials=tuple(material.name for material in self.materials),
-            particle_volume=self.spacing**self.dim,
-            gravity=None if self.gravity_turn else self.gravity,
-            gravity_varies=self.gravity_turn > 0,
-            obstacles=self.ramps is not None,
-            densities=tuple(material.density for material in self.materials) if len(self.materials) > 1 else (),
-        )
+        densities = tuple(material.density for material in self.materials) if len(self.materials) > 1 else ()
+        return dataclasses.replace(super().scene, densities=densities)
 
     @property
     def type_names(self) -> dict[int, str]:
@@ -265,27 +219,18 @@ class MpmPreset(Preset):
         return self.blocks.particles[1] + static
 
     def to_dict(self) -> dict[str, Any]:
-        return super().to_dict() | {"materials": {material.name: material.to_dict() for material in self.materials}}
+        return super().to_dict() | {"materials": {material.name: to_plain(material) for material in self.materials}}
 
     @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> MpmPreset:
-        materials = {"materials": _read_materials(plain["materials"])} if "materials" in plain else {}
-        return from_plain(cls, {**plain, **materials}, "the preset")
-
-
-def _read_materials(section: Any) -> tuple[Material, ...]:
-    """The materials of a preset's section, which maps their names to parameters."""
-    check(isinstance(section, Mapping), "materials must map names to parameters.")
-    unknown = sorted(set(section) - set(MATERIALS))
-    check(not unknown, f"Unknown material {', '.join(map(str, unknown))}; known are {', '.join(MATERIALS)}.")
-    return tuple(from_plain(MATERIALS[name], parameters, f"materials.{name}") for name, parameters in section.items())
-
-
-def _ramps_of(start: InitialState) -> tuple[SimulatedRamp, ...]:
-    ramps = tuple(obstacle for obstacle in start.obstacles if isinstance(obstacle, SimulatedRamp))
-    if len(ramps) != len(start.obstacles):
-        raise DataError("The material point method simulates ramps; other obstacles are not implemented.")
-    return ramps
+    def from_dict(cls, plain: Mapping[str, Any]) -> Self:
+        if "materials" not in plain:
+            return super().from_dict(plain)
+        section = plain["materials"]
+        check(isinstance(section, Mapping), "materials must map names to parameters.")
+        unknown = sorted(set(section) - set(MATERIALS))
+        check(not unknown, f"Unknown material {', '.join(map(str, unknown))}; known are {', '.join(MATERIALS)}.")
+        read = {name: from_plain(MATERIALS[name], entries, f"materials.{name}") for name, entries in section.items()}
+        return super().from_dict({**plain, "materials": tuple(read.values())})
 
 
 def _snap(ends: Interval, edges: Interval) -> Interval:

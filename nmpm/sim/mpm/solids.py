@@ -29,7 +29,6 @@ viscoplasticity: Perzyna, "Fundamental problems in viscoplasticity", 1966).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -37,7 +36,7 @@ from typing import ClassVar
 from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
 from nmpm.sim.mpm.material import Material
-from nmpm.sim.state import Array
+from nmpm.sim.state import Array, check, check_numbers
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,8 @@ class PlaneStrainSolid(Material):
     poisson: float
 
     def __post_init__(self) -> None:
-        for key in ("density", "young"):
-            if not 0 < getattr(self, key) < math.inf:
-                raise ConfigError(f"{self.name}.{key} = {getattr(self, key)} must be positive and finite.")
-        if not 0 <= self.poisson < 0.5:
-            raise ConfigError(f"{self.name}.poisson = {self.poisson} must be at least 0 and below 0.5.")
-
-    def to_dict(self) -> dict[str, float]:
-        return dataclasses.asdict(self)
+        check_numbers(self, f"{self.name}.", positive=("density", "young"), at_least_0=("poisson",))
+        check(self.poisson < 0.5, f"{self.name}.poisson = {self.poisson} must be below 0.5.")
 
     @property
     def shear_modulus(self) -> float:
@@ -111,8 +104,8 @@ class Sand(PlaneStrainSolid):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.friction_angle < 90:
-            raise ConfigError(f"sand.friction_angle = {self.friction_angle} must be at least 0 and below 90 degrees.")
+        angle = self.friction_angle
+        check(0 <= angle < 90, f"sand.friction_angle = {angle} must be at least 0 and below 90 degrees.")
 
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         friction = math.sin(math.radians(self.friction_angle))
@@ -142,10 +135,7 @@ class Goop(PlaneStrainSolid):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.viscosity < math.inf:
-            raise ConfigError(f"goop.viscosity = {self.viscosity} must be positive and finite.")
-        if not 0 <= self.yield_stress < math.inf:
-            raise ConfigError(f"goop.yield_stress = {self.yield_stress} must not be negative.")
+        check_numbers(self, "goop.", positive=("viscosity",), at_least_0=("yield_stress",))
 
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         remaining = math.exp(-self.shear_modulus * dt / self.viscosity)

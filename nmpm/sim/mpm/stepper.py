@@ -14,7 +14,6 @@ particles then stop; the box's sides are a cell further out.
 
 from __future__ import annotations
 
-import abc
 import enum
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.errors import DataError, UnstableError
+from nmpm._support.jit import jit
+from nmpm.errors import ConfigError, DataError, UnstableError
+from nmpm.sim.mpm import kernels_2d, kernels_3d
 from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.state import Array
@@ -98,26 +99,34 @@ class MpmParticles:
         """Each material with the slice of its particles."""
 
 
-class MpmStepper(abc.ABC):
+class MpmStepper:
     """Advances particles by substeps of one length.
 
     Args:
         grid: On which they move.
         dt: Length of a substep, in seconds.
+
+    Raises:
+        ConfigError: if the grid has three dimensions, and obstacles or open corners.
     """
 
     def __init__(self, grid: MpmGrid, dt: float) -> None:
+        dim, in_corners = len(grid.shape), grid.walls is Walls.OPEN_CORNERS
+        if dim == 3 and (grid.obstacles is not None or in_corners):
+            raise ConfigError("Obstacles and open corners are implemented in two dimensions, not in three.")
         self.grid = grid
         self.dt = dt
         self.held_back = 0
         """Particles clamped at the box's sides so far; the walls should make this unnecessary."""
         self.pushed_out = 0
         """Particles moved back to an obstacle's surface so far."""
-        self._nodes: Array = np.zeros((*(cells + 2 for cells in grid.shape), len(grid.shape) + 1))
+        self._kernels: Any = kernels_2d if dim == 2 else kernels_3d
+        self._nodes: Array = np.zeros((*(cells + 2 for cells in grid.shape), dim + 1))
+        self._window: NDArray[np.int64] = np.zeros((2, dim), np.int64)
         self._lower = grid.low + _MARGIN * grid.size
         self._upper = grid.low + (np.array(grid.shape) - _MARGIN) * grid.size
         holds = grid.walls is not Walls.SEPARATE
-        self._walls = (holds, int(holds), grid.walls is Walls.OPEN_CORNERS)
+        self._walls = (holds, int(holds), in_corners)
 
     def enclose(self, particles: MpmParticles) -> None:
         """Clamp particles to the box and push them out of obstacles; call it once before the first step.
@@ -142,23 +151,28 @@ class MpmStepper(abc.ABC):
         Raises:
             FloatingPointError: if a position is no longer finite.
         """
-        grid, dt = self.grid, self.dt
+        grid, dt, nodes, window = self.grid, self.dt, self._nodes, self._window
         for material, part in particles.parts:
             material.respond(particles.strain[part], particles.gradient[part], particles.stress[part], dt)
-        self._scatter(particles)
+        position, velocity, gradient = particles.position, particles.velocity, particles.gradient
+        _find_window(position, grid.low, grid.size, window)
+        self._kernels.scatter(
+            nodes, window, grid.low, grid.size, dt * particles.volume,
+            position, velocity, gradient, particles.stress, particles.mass,
+        )  # fmt: skip
         before = None
         if grid.obstacles is not None:
-            before = particles.position.copy()
-            grid.obstacles.brake(self._nodes, dt * grid.gravity)
-        self._update_nodes()
-        held_back = self._gather(particles)
+            before = position.copy()
+            grid.obstacles.brake(nodes, dt * grid.gravity)
+        self._kernels.update_nodes(nodes, window, dt * grid.gravity, grid.friction, *self._walls)
+        held_back = self._kernels.gather(
+            nodes, grid.low, grid.size, dt, self._lower, self._upper, position, velocity, gradient
+        )
         if held_back < 0:
             raise FloatingPointError("The state is not finite")
         self.held_back += held_back
         if grid.obstacles is not None and before is not None:
-            self.pushed_out += grid.obstacles.push_out(
-                before, particles.position, particles.velocity, self._lower, self._upper
-            )
+            self.pushed_out += grid.obstacles.push_out(before, position, velocity, self._lower, self._upper)
 
     def advance_frame(self, particles: MpmParticles, substeps: int, frame: int) -> None:
         """The substeps of a frame, in place.
@@ -175,18 +189,12 @@ class MpmStepper(abc.ABC):
                     "particles or a softer material."
                 ) from error
 
-    @abc.abstractmethod
-    def _scatter(self, particles: MpmParticles) -> None:
-        """Sum mass and momentum of the particles at the nodes."""
 
-    @abc.abstractmethod
-    def _update_nodes(self) -> None:
-        """Turn the nodes' momenta into velocities, under gravity and the walls."""
-
-    @abc.abstractmethod
-    def _gather(self, particles: MpmParticles) -> int:
-        """Take velocities and their gradients from the nodes, and move the particles.
-
-        Returns:
-            How many particles were clamped to the box, or -1 if a position is not finite.
-        """
+@jit
+def _find_window(position: Array, low: Array, size: float, window: NDArray[np.int64]) -> None:
+    """Write the first node of the particles along each axis, and the one after the last."""
+    for axis in range(position.shape[1]):
+        least = most = position[0, axis]
+        for p in range(1, position.shape[0]):
+            least, most = min(least, position[p, axis]), max(most, position[p, axis])
+        window[0, axis], window[1, axis] = int((least - low[axis]) / size), int((most - low[axis]) / size) + 3

@@ -17,15 +17,13 @@ al., "Multi-species simulation of porous sand and water mixtures", 2017.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from nmpm._support.jit import jit
-from nmpm.errors import ConfigError
 from nmpm.sim.mpm.material import Material
-from nmpm.sim.state import Array
+from nmpm.sim.state import Array, check, check_numbers
 
 # Of the volume at rest: smaller, Tait's pressure would overflow. Stable simulations stay far above it.
 _LEAST_VOLUME = 0.1
@@ -56,18 +54,12 @@ class Water(Material):
     tension: float = 1.0
 
     def __post_init__(self) -> None:
-        for key in ("density", "bulk_modulus"):
-            if not 0 < getattr(self, key) < math.inf:
-                raise ConfigError(f"water.{key} = {getattr(self, key)} must be positive and finite.")
-        if not -1 <= self.exponent < math.inf or self.exponent == 0:
-            raise ConfigError(f"water.exponent = {self.exponent} must be at least -1, finite and not 0.")
-        if not 0 <= self.viscosity < math.inf:
-            raise ConfigError(f"water.viscosity = {self.viscosity} must not be negative.")
-        if not 0 <= self.tension <= 1:
-            raise ConfigError(f"water.tension = {self.tension} must be from 0 to 1.")
-
-    def to_dict(self) -> dict[str, float]:
-        return dataclasses.asdict(self)
+        check_numbers(self, "water.", positive=("density", "bulk_modulus"), at_least_0=("viscosity", "tension"))
+        check(self.tension <= 1, f"water.tension = {self.tension} must be from 0 to 1.")
+        exponent = self.exponent
+        check(
+            -1 <= exponent < math.inf and exponent != 0, f"water.exponent = {exponent} must be at least -1 and not 0."
+        )
 
     @property
     def wave_speed(self) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nmpm._support.jit import jit
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.state import Array, Obstacle, check
+from nmpm.sim.state import Array, Obstacle, check_numbers
 
 LAYERS = 3
 """Layers of dummy particles below a surface: the kernel's reach."""
@@ -50,16 +50,11 @@ class PolygonObstacle(Obstacle):
         """(V,) such that a point x is inside where normals @ x < offsets."""
         return np.asarray((self.normals * self.corners).sum(-1))
 
-    def depth(self, points: NDArray[np.floating]) -> Array:
-        """(N,) distance of each point to the nearest edge's line, positive inside and negative outside."""
-        return np.asarray((self.offsets - points @ self.normals.T).min(-1))
-
-    def distance(self, points: Array) -> Array:
-        """As the base class says, but to the nearest edge's line: too small beyond corners."""
-        return -self.depth(points)
+    def distance(self, points: NDArray[np.floating]) -> Array:
+        """(K,) signed distance of points (K, 2) from the nearest edge's line: too small beyond corners."""
+        return np.asarray((points @ self.normals.T - self.offsets).max(-1))
 
     def moved(self, shift: Array) -> Self:
-        """The same polygon shifted by (2,), in length."""
         return replace(self, corners=self.corners + shift)
 
 
@@ -81,9 +76,7 @@ class ObstacleRanges:
     gap: float
 
     def __post_init__(self) -> None:
-        check(0 <= self.number[0] <= self.number[1], f"obstacles.number = {list(self.number)} needs least and most.")
-        check(0 < self.size[0] <= self.size[1], f"obstacles.size = {list(self.size)} needs least and largest.")
-        check(self.gap >= 0, f"obstacles.gap = {self.gap} must not be negative.")
+        check_numbers(self, "obstacles.", positive=("size",), at_least_0=("number", "gap"))
 
     def max_particles(self, spacing: float) -> int:
         """Upper bound of their dummy particles."""
@@ -160,7 +153,7 @@ def _ring(obstacle: PolygonObstacle, depth: float, spacing: float) -> Array:
     # Each inner corner is where two neighbouring edges, moved inwards, meet.
     planes = np.stack([np.roll(normals, 1, axis=0), normals], axis=1)
     corners = np.linalg.solve(planes, np.stack([np.roll(offsets, 1), offsets], -1)[..., None])[..., 0]
-    if np.any(obstacle.depth(corners) < depth * (1 - 1e-9)):
+    if np.any(-obstacle.distance(corners) < depth * (1 - 1e-9)):
         return np.empty((0, 2))
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     length = sides.sum()
@@ -209,7 +202,7 @@ class SolidBoundary:
         low, high = self._box
         wrong = ~np.all((points >= low) & (points <= high), axis=1)
         for obstacle in self._obstacles:
-            wrong |= obstacle.depth(points) > 0
+            wrong |= obstacle.distance(points) < 0
         return int(wrong.sum())
 
 
@@ -220,7 +213,7 @@ def _particles_of_all(obstacles: tuple[PolygonObstacle, ...], low: Array, high: 
         points = obstacle_particles(obstacle, spacing)
         mine = np.all((points > low) & (points < high), axis=1)
         for earlier in obstacles[:index]:
-            mine &= earlier.depth(points) < 0
+            mine &= earlier.distance(points) > 0
         kept.append(points[mine])
     return np.concatenate(kept)
 

@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
-from nmpm.sim.blocks import BlockRanges, lattice
+from nmpm.sim.blocks import BlockRanges, Layout, lattice
 from nmpm.sim.sph import sums
 from nmpm.sim.sph.boundary import PolygonObstacle, SolidBoundary
 from nmpm.sim.sph.neighbours import PairLists, Pairs, WallPairs
 from nmpm.sim.sph.sums import SUPPORT
-from nmpm.sim.state import Array, check
+from nmpm.sim.state import Array, check_numbers
 
 Rectangle = tuple[Interval, Interval]
 
 _ATTEMPTS = 10_000
 
 
-class FluidLayout(abc.ABC):
+class FluidLayout(Layout):
     """How the fluid's initial state is drawn."""
 
     @abc.abstractmethod
@@ -41,14 +41,6 @@ class FluidLayout(abc.ABC):
     @abc.abstractmethod
     def max_particles(self, spacing: float) -> int:
         """Upper bound of a state's particles."""
-
-    @abc.abstractmethod
-    def faster(self, factor: float) -> Self:
-        """The same at initial speeds times a factor."""
-
-    @abc.abstractmethod
-    def multiplied(self, times: int) -> Self:
-        """For a box so many times as wide: up to as many times as many particles."""
 
     @abc.abstractmethod
     def coarsened(self, factor: int) -> Self:
@@ -75,8 +67,7 @@ class Column(FluidLayout):
     relaxation: int
 
     def __post_init__(self) -> None:
-        check(self.width > 0 and self.height > 0, "column.width and column.height must be positive.")
-        check(self.noise >= 0 and self.relaxation >= 0, "column.noise and column.relaxation must not be negative.")
+        check_numbers(self, "column.", positive=("width", "height"), at_least_0=("noise", "relaxation"))
 
     def faster(self, factor: float) -> Self:  # noqa: ARG002  # (it is at rest)
         return self
@@ -163,7 +154,7 @@ def _clear_of(points: Array, obstacles: tuple[PolygonObstacle, ...], spacing: fl
     """(N,) whether points (N, 2) are no nearer to an obstacle than half a spacing."""
     free = np.ones(len(points), np.bool_)
     for obstacle in obstacles:
-        free &= obstacle.depth(points) < -0.5 * spacing
+        free &= obstacle.distance(points) > 0.5 * spacing
     return free
 
 
@@ -172,7 +163,7 @@ _STEP = 0.1
 _LIMIT = 0.1
 
 
-def relax(position: Array, box: tuple[tuple[float, float], tuple[float, float]], spacing: float, sweeps: int) -> Array:
+def relax(position: Array, box: Rectangle, spacing: float, sweeps: int) -> Array:
     """Move particles, sweep by sweep, from where they are dense to where they are not.
 
     A sweep shifts each by −D ∇C, where C is the concentration Σ V W (Lind, Xu, Stansby & Rogers 2012, equation 24),
@@ -190,7 +181,7 @@ def relax(position: Array, box: tuple[tuple[float, float], tuple[float, float]],
     identity, still = np.arange(len(x)), np.zeros_like(x)
     for _ in range(sweeps):
         boundary.clamp(x, y, still, still)
-        order, starts = lists.grid.sort_by_cell(x, y)
+        order, starts = lists.sort_by_cell(x, y)
         x, y, identity = x[order], y[order], identity[order]
         pairs, wall_pairs = lists.near(x, y, starts)
         sums.pair_geometry(np.stack([x, y]), pairs, spacing)

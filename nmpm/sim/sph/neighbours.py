@@ -7,7 +7,6 @@ each row of cells around it, and every pair is found once, from the particle tha
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -50,45 +49,10 @@ class WallPairs(NamedTuple):
     w: Array
 
 
-@dataclass(frozen=True)
-class CellGrid:
-    """Square cells that cover a rectangle, with one more ring of cells that stay empty.
-
-    Args:
-        low: (2,) lower corner of the ring.
-        size: Side of a cell, the reach within which pairs are found.
-        shape: Cells along x and y, the ring included.
-    """
-
-    low: Array
-    size: float
-    shape: tuple[int, int]
-
-    @property
-    def inverse(self) -> float:
-        """Cells per length, reduced slightly so that rounding never puts a pair two cells apart."""
-        return (1.0 - 1e-9) / self.size
-
-    @classmethod
-    def covering(cls, low: Array, high: Array, size: float) -> CellGrid:
-        """The grid that covers the rectangle from low to high."""
-        columns, rows = (int(n) + 4 for n in (high - low) / size)
-        return cls(np.asarray(low, np.float64) - 1.001 * size, size, (columns, rows))
-
-    def sort_by_cell(self, x: Array, y: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Order of the particles by cell, and where each cell's run of them starts (cells + 1 numbers).
-
-        Particles must lie in the rectangle; within a cell they keep their order.
-        """
-        columns, rows = self.shape
-        order = np.empty(len(x), np.int64)
-        starts = np.zeros(columns * rows + 2, np.int64)
-        _sort(x, y, self.low[0], self.low[1], self.inverse, columns, order, starts)
-        return order, starts[:-1]
-
-
 class PairLists:
     """Lists pairs of particles near each other and near the walls, in memory that it reuses.
+
+    The cells cover the walls, with one more ring of cells that stay empty.
 
     Args:
         walls: (M, 2) positions of the wall particles, which surround all others.
@@ -96,16 +60,30 @@ class PairLists:
     """
 
     def __init__(self, walls: Array, reach: float) -> None:
-        self.grid = CellGrid.covering(walls.min(0), walls.max(0), reach)
-        order, self._wall_starts = self.grid.sort_by_cell(*np.ascontiguousarray(walls.T))
+        low, high = walls.min(0), walls.max(0)
+        self._columns, self._rows = (int(n) + 4 for n in (high - low) / reach)
+        self._left, self._bottom = (low - 1.001 * reach).tolist()
+        self._reach = reach
+        # Reduced slightly so that rounding never puts a pair two cells apart.
+        self._cells_per_length = (1.0 - 1e-9) / reach
+        order, self._wall_starts = self.sort_by_cell(*np.ascontiguousarray(walls.T))
         self.wall_x, self.wall_y = np.ascontiguousarray(walls[order].T)
         """(M,) positions of the wall particles in the order that pairs refer to."""
         self._memory, self._wall_memory = np.empty((2, 1024), np.uint32), np.empty((2, 1024), np.uint32)
 
+    def sort_by_cell(self, x: Array, y: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Order of the particles by cell, and where each cell's run of them starts (cells + 1 numbers).
+
+        Particles must lie within the walls; within a cell they keep their order.
+        """
+        order = np.empty(len(x), np.int64)
+        starts = np.zeros(self._columns * self._rows + 2, np.int64)
+        _sort(x, y, self._left, self._bottom, self._cells_per_length, self._columns, order, starts)
+        return order, starts[:-1]
+
     def near(self, x: Array, y: Array, starts: NDArray[np.int64]) -> tuple[Pairs, WallPairs]:
         """Every pair of sorted particles once, and every pair of one and a wall particle; valid until the next call."""
-        low, grid = self.grid.low, self.grid
-        cells = float(low[0]), float(low[1]), grid.inverse, grid.size, grid.shape[0]
+        cells = self._left, self._bottom, self._cells_per_length, self._reach, self._columns
         between = self.wall_x, self.wall_y, self._wall_starts, *cells
         self._memory, count = _fill(self._memory, lambda memory: _pairs_within(x, y, starts, *cells, memory))
         self._wall_memory, wet = _fill(self._wall_memory, lambda memory: _pairs_between(x, y, *between, memory))

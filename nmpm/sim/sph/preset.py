@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm._support.plain_data import from_plain
-from nmpm.errors import DataError
-from nmpm.scene import Interval, Scene
-from nmpm.sim.blocks import draw_gravity
+from nmpm.scene import Interval
 from nmpm.sim.preset import BOUNDARY, Preset
 from nmpm.sim.sph.boundary import ObstacleRanges, PolygonObstacle, SolidBoundary, box_particles
 from nmpm.sim.sph.layouts import Column, FluidBlocks, FluidLayout
@@ -31,16 +27,13 @@ at 0.42 too.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SphPreset(Preset):
     """A family of scenes of WCSPH; `presets/dambreak2d.yaml` and `presets/wbcsph.yaml` comment every entry.
 
     Arguments beside those of `Preset`:
 
     Args:
-        spacing: Distance between particles at rest, in length.
-        gravity: Acceleration, in length per second squared.
-        gravity_turn: Largest angle by which a trajectory's gravity is turned either way, in degrees.
         fluid: Its parameters.
         column: The initial state, if it is a column at rest.
         blocks: The initial state, if it is moving blocks.
@@ -56,9 +49,7 @@ class SphPreset(Preset):
 
     box: tuple[Interval, Interval]
     domain: tuple[Interval, Interval]
-    spacing: float
     gravity: tuple[float, float]
-    gravity_turn: float
     fluid: Fluid
     column: Column | None = None
     blocks: FluidBlocks | None = None
@@ -66,10 +57,7 @@ class SphPreset(Preset):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_positive("spacing")
-        check(0 <= self.gravity_turn <= 180, f"gravity_turn = {self.gravity_turn} must be within 0 and 180 degrees.")
         (left, right), (bottom, top) = self.box
-        check(left < right and bottom < top, f"box = {self.box} needs (lower, upper) along each axis.")
         check((self.column is None) != (self.blocks is None), "give either column or blocks, as the initial state.")
         if self.column is not None:
             columns, rows = self.column.shape(self.spacing)
@@ -84,7 +72,12 @@ class SphPreset(Preset):
     @property
     def layout(self) -> FluidLayout:
         """How the initial state is drawn."""
-        return next(layout for layout in (self.column, self.blocks) if layout is not None)
+        return next(iter(self._layouts.values()))
+
+    @property
+    def _layouts(self) -> dict[str, FluidLayout]:
+        layouts = {"column": self.column, "blocks": self.blocks}
+        return {key: layout for key, layout in layouts.items() if layout is not None}
 
     @property
     def _substep_bounds(self) -> dict[str, int]:
@@ -105,21 +98,11 @@ class SphPreset(Preset):
         """
         return max(self._substep_bounds.values())
 
-    def varied(self, *, speed: float = 1.0, gravity: float = 1.0) -> SphPreset:
-        """As `Preset.varied`; a column starts at rest whatever the factor.
-
-        The speed of sound stays, so that flows which come near it fail as unstable.
-        """
-        x, y = self.gravity
-        many = dataclasses.replace(self._with_layout(self.layout.faster(speed)), substeps=2**31)
-        many = dataclasses.replace(many, gravity=(gravity * x, gravity * y))
-        return dataclasses.replace(many, substeps=max(self.substeps, many.stable_substeps))
-
     def widened(self, times: int) -> SphPreset:
         """Scenes in a domain so many times as wide; a column becomes as many times as wide, too."""
-        box, domain, _ = self._widened_sides(times, self.spacing)
-        wide = dataclasses.replace(self, box=(box, self.box[1]), domain=(domain, self.domain[1]))
-        return wide._with_layout(self.layout.multiplied(times))
+        changes: dict[str, Any] = {key: layout.multiplied(times) for key, layout in self._layouts.items()}
+        changes["box"], changes["domain"], _ = self._widened_sides(times, self.spacing)
+        return dataclasses.replace(self, **changes)
 
     def coarsened(self, factor: int) -> SphPreset:
         """The same scenes in particles `factor` times as wide apart, with `stable_substeps` substeps.
@@ -130,27 +113,20 @@ class SphPreset(Preset):
         Raises:
             ConfigError: if the scene has no room for particles of that size.
         """
-        many = dataclasses.replace(self, substeps=2**31, spacing=factor * self.spacing)
-        many = many._with_layout(self.layout.coarsened(factor))
-        return dataclasses.replace(many, substeps=many.stable_substeps)
-
-    def _with_layout(self, layout: FluidLayout) -> SphPreset:
-        changed: dict[str, Any] = {"blocks" if self.column is None else "column": layout}
-        return dataclasses.replace(self, **changed)
+        layouts = {key: layout.coarsened(factor) for key, layout in self._layouts.items()}
+        return self._with_stable_substeps(1, spacing=factor * self.spacing, **layouts)
 
     def draw(self, seed: int) -> InitialState:
         rng = np.random.default_rng(seed)
-        gravity = draw_gravity(self.gravity, self.gravity_turn, rng)
+        gravity = self._draw_gravity(rng)
         obstacles = () if self.obstacles is None else self.obstacles.draw(self.box, rng)
         position, velocity = self.layout.draw(self.box, self.spacing, obstacles, rng)
         return InitialState(position, velocity, gravity, (len(position),), obstacles)
 
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
-        """As `Preset.simulate_from`; densities start at rest, and accelerations follow from the state."""
-        obstacles = _polygons_of(start)
+        obstacles = start.obstacles_of(PolygonObstacle)
         start.check_particles(self.box, obstacles)
-        if start.counts not in ((), (len(start.position),)):
-            raise DataError(f"Counts {start.counts} are not those of {len(start.position)} particles of one fluid.")
+        start.counts_of(1)
         gravity = np.array(self.gravity if start.gravity is None else start.gravity)
         boundary = SolidBoundary(self.box, obstacles, self.spacing)
         particles = SphParticles(start.position, start.velocity, self.fluid.density)
@@ -169,19 +145,6 @@ class SphPreset(Preset):
         return SimulatedTrajectory(position, particle_type, attributes)
 
     @property
-    def scene(self) -> Scene:
-        return Scene(
-            bounds=self.box,
-            domain=self.domain,
-            dt=self.frame_dt,
-            materials=("water",),
-            particle_volume=self.spacing**2,
-            gravity=None if self.gravity_turn else self.gravity,
-            gravity_varies=self.gravity_turn > 0,
-            obstacles=True,
-        )
-
-    @property
     def type_names(self) -> dict[int, str]:
         return {BOUNDARY: "boundary", WATER: "water"}
 
@@ -190,14 +153,3 @@ class SphPreset(Preset):
         _, layer = box_particles(self.box, self.spacing)
         in_obstacles = 0 if self.obstacles is None else self.obstacles.max_particles(self.spacing)
         return int((layer == 0).sum()) + in_obstacles + self.layout.max_particles(self.spacing)
-
-    @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> SphPreset:
-        return from_plain(cls, plain, "the preset")
-
-
-def _polygons_of(start: InitialState) -> tuple[PolygonObstacle, ...]:
-    polygons = tuple(obstacle for obstacle in start.obstacles if isinstance(obstacle, PolygonObstacle))
-    if len(polygons) != len(start.obstacles):
-        raise DataError("WCSPH simulates polygons as obstacles; others are not implemented.")
-    return polygons

@@ -28,7 +28,7 @@ from nmpm.sim.sph import sums
 from nmpm.sim.sph.boundary import SolidBoundary
 from nmpm.sim.sph.neighbours import PairLists
 from nmpm.sim.sph.sums import SUPPORT
-from nmpm.sim.state import Array, check
+from nmpm.sim.state import Array, check_numbers
 
 # Margin of the list of pairs, in spacings: a larger one lists more pairs, a smaller one lists them more often.
 _SKIN = 0.4
@@ -67,10 +67,8 @@ class Fluid:
     diffusion: float
 
     def __post_init__(self) -> None:
-        for key in ("density", "speed_of_sound", "exponent"):
-            check(getattr(self, key) > 0, f"{key} = {getattr(self, key)} must be positive.")
-        for key in ("alpha", "viscosity", "diffusion"):
-            check(getattr(self, key) >= 0, f"{key} = {getattr(self, key)} must not be negative.")
+        positive, at_least_0 = ("density", "speed_of_sound", "exponent"), ("alpha", "viscosity", "diffusion")
+        check_numbers(self, "fluid.", positive=positive, at_least_0=at_least_0)
 
     def kinematic_viscosity(self, spacing: float) -> float:
         """Artificial and physical viscosity together, in m² / s."""
@@ -200,7 +198,7 @@ class SphStepper:
 
     def _list_pairs(self, particles: SphParticles) -> None:
         x, y = particles.table[:2]
-        order, starts = self._lists.grid.sort_by_cell(x, y)
+        order, starts = self._lists.sort_by_cell(x, y)
         particles.sort(order)
         self._listed_at = particles.table[:2].copy()
         self._pairs, self._wall_pairs = self._lists.near(x, y, starts)

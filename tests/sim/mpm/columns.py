@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
-from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, Walls
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
 
 GRAVITY = np.array([0.0, -9.81])
 
@@ -26,7 +25,7 @@ def tank(width, height, size, wave_speed, gravity=GRAVITY, friction=0.0, walls=W
     rows = 1 if walls is Walls.SEPARATE else 3
     low = np.full(2, -0.5 * rows * size)
     shape = (round(width / size) + rows, round(height / size) + rows)
-    return Stepper2d(MpmGrid(low, size, shape, friction, np.asarray(gravity, float), walls), cfl * size / wave_speed)
+    return MpmStepper(MpmGrid(low, size, shape, friction, np.asarray(gravity, float), walls), cfl * size / wave_speed)
 
 
 def run(stepper, state, seconds):

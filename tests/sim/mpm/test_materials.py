@@ -1,5 +1,6 @@
 """Constitutive models of single particles against closed forms."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -186,4 +187,4 @@ def test_a_nan_volume_stays_nan():
 )  # fmt: skip
 def test_parameters_out_of_range_are_named(material, key, value):
     with pytest.raises(ConfigError, match=rf"{material.name}\.{key}"):
-        type(material)(**{**material.to_dict(), key: value})
+        dataclasses.replace(material, **{key: value})

@@ -6,10 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import DataError
-from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.mpm.solids import Goop, Sand
-from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper
 from nmpm.sim.mpm.water import Water
 
 SIZE, CELLS, DT = 0.0125, 48, 2e-4
@@ -33,7 +32,7 @@ def strip(centre, angle, length, thickness):
 
 def stepper(distance, friction=0.3, gravity=(0.0, -9.81)):
     field = ObstacleField.sample(distance, np.zeros(2), SIZE, (CELLS, CELLS), friction)
-    return Stepper2d(MpmGrid(np.zeros(2), SIZE, (CELLS, CELLS), friction, np.array(gravity), obstacles=field), DT)
+    return MpmStepper(MpmGrid(np.zeros(2), SIZE, (CELLS, CELLS), friction, np.array(gravity), obstacles=field), DT)
 
 
 def block(columns, rows, low):

@@ -7,10 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
-from nmpm.sim.mpm.mls_mpm_2d import Stepper2d
-from nmpm.sim.mpm.mls_mpm_3d import Stepper3d
 from nmpm.sim.mpm.solids import Goop, Sand
-from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, Walls
+from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
 from nmpm.sim.mpm.water import Water
 
 SIZE = 0.025
@@ -18,7 +16,6 @@ WATER = Water(density=1000.0, bulk_modulus=7e4)
 SAND = Sand(density=1600.0, young=3.5e5, poisson=0.3, friction_angle=30.0)
 GOOP = Goop(density=1200.0, young=4e5, poisson=0.4, yield_stress=200.0, viscosity=60.0)
 MATERIALS = [WATER, SAND, GOOP]
-STEPPERS = {2: Stepper2d, 3: Stepper3d}
 GRAVITY = np.array([1.0, -9.81, 0.5])
 
 
@@ -54,7 +51,7 @@ def mixed(blocks):
 def test_free_fall_is_exact(dim, material):
     position = cloud((0.2,) * dim, (5,) * dim)
     particles = state(position, 0.3, material)
-    stepper = STEPPERS[dim](grid(dim, GRAVITY[:dim]), 1e-4)
+    stepper = MpmStepper(grid(dim, GRAVITY[:dim]), 1e-4)
     for _ in range(200):
         stepper.step(particles)
     time = 200 * 1e-4
@@ -79,7 +76,7 @@ def test_momentum_and_angular_momentum_are_conserved_away_from_walls(dim, materi
         carried = SIZE**2 / 4 * np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
         return momentum(particles), (particles.mass[:, None] * (np.cross(place, velocity) + carried)).sum(axis=0)
 
-    stepper = STEPPERS[dim](grid(dim), 1e-4)
+    stepper = MpmStepper(grid(dim), 1e-4)
     stepper.step(particles)
     linear, angular = momenta()
     for _ in range(60):
@@ -136,7 +133,7 @@ def test_only_walls_that_hold_stop_material_that_leaves(walls, speed):
 def test_a_thin_layer_slides_to_a_stop_by_coulomb_friction(friction, expected):
     position = lattice((3 * SIZE, 0.5 * SIZE), (0.5 + 3 * SIZE, 1.5 * SIZE), SIZE / 2)
     particles = state(position, [1.0, 0.0], GOOP)
-    stepper = Stepper2d(grid(2, (0.0, -9.81), 32, friction), 2e-4)
+    stepper = MpmStepper(grid(2, (0.0, -9.81), 32, friction), 2e-4)
     for _ in range(500):
         stepper.step(particles)
     assert momentum(particles)[0] / particles.mass.sum() == pytest.approx(expected, abs=0.1)
@@ -147,7 +144,7 @@ def test_friction_in_three_dimensions_brakes_along_the_velocity():
     speeds = []
     for friction in (0.0, 0.5):
         stepper, particles = (
-            Stepper3d(grid(3, (0.0, -9.81, 0.0), friction=friction), 2e-4),
+            MpmStepper(grid(3, (0.0, -9.81, 0.0), friction=friction), 2e-4),
             state(start, [1.0, 0.0, 0.5]),
         )
         for _ in range(300):
@@ -161,7 +158,7 @@ def test_the_axes_of_three_dimensions_are_equal():
     """Walls act one after the other, so that only rounding may tell the axes apart where there is no friction."""
     start, runs = cloud((0.0, 0.0, 0.0), (8, 10, 6)), []
     for turn in (0, 1, 2):
-        stepper = Stepper3d(grid(3, np.roll([0.3, -9.81, 0.1], turn), cells=12), 2e-4)
+        stepper = MpmStepper(grid(3, np.roll([0.3, -9.81, 0.1], turn), cells=12), 2e-4)
         particles = state(np.roll(start, turn, axis=1), 0.0)
         stepper.enclose(particles)
         for _ in range(100):
@@ -174,8 +171,8 @@ def test_a_slab_that_fills_the_depth_moves_as_in_two_dimensions():
     flat = lattice((0, 0), (0.125, 0.175), SIZE / 2)
     layers = SIZE / 2 * (np.arange(16) + 0.5)
     deep = np.concatenate([np.repeat(flat, 16, axis=0), np.tile(layers, len(flat))[:, None]], axis=1)
-    two = Stepper2d(MpmGrid(np.zeros(2), SIZE, (16, 12), 0.0, np.array([0.0, -9.81])), 2e-4)
-    three = Stepper3d(MpmGrid(np.zeros(3), SIZE, (16, 12, 8), 0.0, np.array([0.0, -9.81, 0.0])), 2e-4)
+    two = MpmStepper(MpmGrid(np.zeros(2), SIZE, (16, 12), 0.0, np.array([0.0, -9.81])), 2e-4)
+    three = MpmStepper(MpmGrid(np.zeros(3), SIZE, (16, 12, 8), 0.0, np.array([0.0, -9.81, 0.0])), 2e-4)
     plane, box = state(flat, 0.0), state(deep, 0.0)
     for _ in range(400):
         two.step(plane)
@@ -191,7 +188,7 @@ def test_a_slab_that_fills_the_depth_moves_as_in_two_dimensions():
 def test_fast_particles_stay_in_a_box_of_three_dimensions(walls):
     rng = np.random.default_rng(0)
     particles = state(rng.uniform(0.08, 0.42, (400, 3)), rng.normal(scale=10.0, size=(400, 3)))
-    stepper = Stepper3d(grid(3, walls=walls), 2e-4)
+    stepper = MpmStepper(grid(3, walls=walls), 2e-4)
     for _ in range(100):
         stepper.step(particles)
         assert np.all((particles.position >= 0) & (particles.position <= 0.5))
@@ -202,9 +199,9 @@ def test_non_finite_states_are_detected(dim):
     particles = state(cloud((0.2,) * dim, (4,) * dim), 0.0)
     particles.velocity[4, 1] = np.nan
     with pytest.raises(FloatingPointError):
-        STEPPERS[dim](grid(dim), 1e-4).step(particles)
+        MpmStepper(grid(dim), 1e-4).step(particles)
 
 
 def test_open_corners_are_implemented_in_two_dimensions():
     with pytest.raises(ConfigError, match="in two dimensions, not in three"):
-        Stepper3d(grid(3, walls=Walls.OPEN_CORNERS), 1e-4)
+        MpmStepper(grid(3, walls=Walls.OPEN_CORNERS), 1e-4)

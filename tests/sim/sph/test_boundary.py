@@ -28,9 +28,9 @@ STREWN = ObstacleRanges((1, 3), (0.06, 0.1), 0.02)
 
 def test_depth_and_distance_of_polygons():
     points = np.array([[0.5, 0.5], [0.41, 0.5], [0.4, 0.45], [0.3, 0.5], [0.9, 0.9]])
-    np.testing.assert_allclose(SQUARE.depth(points), [0.1, 0.01, 0.0, -0.1, -0.3], atol=1e-12)
+    np.testing.assert_allclose(SQUARE.distance(points), [-0.1, -0.01, 0.0, 0.1, 0.3], atol=1e-12)
     shift = np.array([3.0, -0.5])
-    np.testing.assert_allclose(TRIANGLE.moved(shift).distance(points + shift), -TRIANGLE.depth(points), atol=1e-12)
+    np.testing.assert_allclose(TRIANGLE.moved(shift).distance(points + shift), TRIANGLE.distance(points), atol=1e-12)
 
 
 def test_box_particles_continue_the_lattice():
@@ -48,7 +48,7 @@ def test_box_particles_continue_the_lattice():
 def test_obstacle_particles_lie_in_rings_of_even_spacing(obstacle):
     spacing = 0.01
     points = obstacle_particles(obstacle, spacing)
-    depth = obstacle.depth(points)
+    depth = -obstacle.distance(points)
     rings = np.round(depth / spacing - 0.5)
     np.testing.assert_allclose(depth, spacing * (rings + 0.5), atol=1e-9)
     assert set(rings) == {0.0, 1.0, 2.0}
@@ -59,9 +59,9 @@ def test_obstacle_particles_lie_in_rings_of_even_spacing(obstacle):
 
 def test_thin_obstacles_have_fewer_rings_and_overlapping_ones_are_not_doubled():
     plank = PolygonObstacle(np.array([[0.2, 0.5], [0.8, 0.5], [0.8, 0.518], [0.2, 0.518]]))
-    np.testing.assert_allclose(plank.depth(obstacle_particles(plank, 0.01)), 0.005, atol=1e-9)
+    np.testing.assert_allclose(plank.distance(obstacle_particles(plank, 0.01)), -0.005, atol=1e-9)
     boundary = SolidBoundary(UNIT, (SQUARE, TRIANGLE), 0.01)
-    inside = boundary.position[SQUARE.depth(boundary.position) > 0]
+    inside = boundary.position[SQUARE.distance(boundary.position) < 0]
     assert len(inside) == len(obstacle_particles(SQUARE, 0.01))
     # A trajectory shows the first layer and the obstacles.
     shown = boundary.position[boundary.visible]
@@ -85,7 +85,7 @@ def test_clamped_particles_are_outside_of_solids_and_do_not_move_into_them(seed)
     kept = np.all(before[:, :2] == np.stack([x, y], -1), axis=1)
     np.testing.assert_array_equal(np.stack([vx, vy], -1)[kept], before[kept, 2:])
     assert np.all(np.hypot(vx, vy) <= np.hypot(*before[:, 2:].T) + 1e-12)
-    put = ~kept & (TRIANGLE.depth(before[:, :2]) > 0)
+    put = ~kept & (TRIANGLE.distance(before[:, :2]) < 0)
     edge = np.argmin(np.abs(TRIANGLE.offsets - np.stack([x, y], -1) @ TRIANGLE.normals.T), axis=1)
     along = (np.stack([vx, vy], -1) * TRIANGLE.normals[edge]).sum(-1)
     assert np.all(along[put] >= -1e-9)
@@ -126,13 +126,13 @@ def test_blocks_and_obstacles_keep_to_the_preset(seed):
     for k, obstacle in enumerate(obstacles):
         assert np.all((obstacle.corners > [0.12, 0.22]) & (obstacle.corners < [0.88, 0.78]))
         assert len(obstacle.corners) in (3, 4)
-        assert obstacle.depth(obstacle.corners.mean(0)[None]) > 0, "The corners should run counter-clockwise."
-        assert all(np.all(other.depth(obstacle.corners) < 0) for other in obstacles[:k])
+        assert obstacle.distance(obstacle.corners.mean(0)[None]) < 0, "The corners should run counter-clockwise."
+        assert all(np.all(other.distance(obstacle.corners) > 0) for other in obstacles[:k])
     position, velocity = draw(THROW, seed, obstacles)
     assert len(position) <= 500
     assert np.all((position >= [0.12, 0.22]) & (position <= [0.88, 0.78]))
     assert np.abs(velocity).max() <= 1.0
-    assert all(obstacle.depth(position).max() < -0.005 for obstacle in obstacles)
+    assert all(obstacle.distance(position).min() > 0.005 for obstacle in obstacles)
     assert nearest(position).min() > 0.8 * 0.01 - 1e-12
     speeds, block = np.unique(velocity, axis=0, return_inverse=True)
     for this in range(len(speeds)):

@@ -37,7 +37,7 @@ def points(most=40):
 def near(position, walls, reach):
     """The lists, the sorted positions, and the two sets of pairs."""
     lists = PairLists(walls, reach)
-    order, starts = lists.grid.sort_by_cell(*np.ascontiguousarray(position.T))
+    order, starts = lists.sort_by_cell(*np.ascontiguousarray(position.T))
     assert sorted(order) == list(range(len(position)))
     x, y = np.ascontiguousarray(position[order].T)
     return lists, x, y, *lists.near(x, y, starts)

@@ -218,7 +218,7 @@ def test_no_particle_is_ever_outside_or_in_an_obstacle_and_gravity_turns():
         water = made.position[:, made.particle_type == 5].reshape(-1, 2).astype(np.float64)
         low, high = np.array(preset.box).T
         assert np.all((water >= low) & (water <= high))
-        assert all(obstacle.depth(water).max() <= 0 for obstacle in start.obstacles)
+        assert all(obstacle.distance(water).min() >= 0 for obstacle in start.obstacles)
         assert 0 < made.attributes["density_deviation"] < 0.5
         directions.append(made.attributes["gravity"])
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 9.81)

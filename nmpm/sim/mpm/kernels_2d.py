@@ -1,38 +1,24 @@
-"""The kernels of MLS-MPM in two dimensions."""
+"""The kernels of MLS-MPM in two dimensions.
+
+Of all X x Y nodes with mass and momentum (X, Y, 3), only those of a window (2, D) around the particles are cleared and
+updated. `low` is the box's lower corner and `size` a cell's side; particles have position and velocity (N, D), velocity
+gradient (N, D, D), stress (N, D (D + 1) / 2) and mass (N,).
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
 from nmpm.sim.mpm.obstacle_field import slide
-from nmpm.sim.mpm.stepper import MpmParticles, MpmStepper
 from nmpm.sim.state import Array
 
 
-class Stepper2d(MpmStepper):
-    """Advances particles in two dimensions."""
-
-    def _scatter(self, particles: MpmParticles) -> None:
-        _scatter(
-            self._nodes, self.grid.low, self.grid.size, self.dt * particles.volume,
-            particles.position, particles.velocity, particles.gradient, particles.stress, particles.mass,
-        )  # fmt: skip
-
-    def _update_nodes(self) -> None:
-        _update_nodes(self._nodes, self.dt * self.grid.gravity, self.grid.friction, *self._walls)
-
-    def _gather(self, particles: MpmParticles) -> int:
-        held_back: int = _gather(
-            self._nodes, self.grid.low, self.grid.size, self.dt, self._lower, self._upper,
-            particles.position, particles.velocity, particles.gradient,
-        )  # fmt: skip
-        return held_back
-
-
 @jit
-def _scatter(
+def scatter(
     nodes: Array,
+    window: NDArray[np.int64],
     low: Array,
     size: float,
     impulse: float,
@@ -43,7 +29,7 @@ def _scatter(
     mass: Array,
 ) -> None:
     """Mass and momentum of the particles, summed at the nodes; impulse is substep length × particle area."""
-    nodes[:] = 0.0
+    nodes[window[0, 0] : window[1, 0], window[0, 1] : window[1, 1]] = 0.0
     scale = -4.0 * impulse / (size * size)
     for p in range(position.shape[0]):
         m = mass[p]
@@ -68,11 +54,19 @@ def _scatter(
 
 
 @jit
-def _update_nodes(nodes: Array, fall: Array, friction: float, holds: bool, inset: int, open_corners: bool) -> None:
+def update_nodes(
+    nodes: Array,
+    window: NDArray[np.int64],
+    fall: Array,
+    friction: float,
+    holds: bool,
+    inset: int,
+    open_corners: bool,
+) -> None:
     """Momenta to velocities, with gravity's change `fall` and the walls, which reach `inset` nodes further in."""
     nx, ny = nodes.shape[0], nodes.shape[1]
-    for i in range(nx):
-        for j in range(ny):
+    for i in range(window[0, 0], window[1, 0]):
+        for j in range(window[0, 1], window[1, 1]):
             if nodes[i, j, 0] <= 0:
                 continue
             u = nodes[i, j, 1] / nodes[i, j, 0] + fall[0]
@@ -94,7 +88,7 @@ def _update_nodes(nodes: Array, fall: Array, friction: float, holds: bool, inset
 
 
 @jit
-def _gather(
+def gather(
     nodes: Array,
     low: Array,
     size: float,

@@ -1,7 +1,6 @@
-"""The kernels of MLS-MPM in three dimensions: nodes, weights and walls as in two, along one more axis.
+"""The kernels of MLS-MPM in three dimensions: as in two, along one more axis.
 
-Material fills a small part of the box for most of its fall, so that only nodes around the particles are cleared and
-updated. Where two or three walls meet, each acts in turn; friction brakes the velocity along a wall as a vector.
+Where two or three walls meet, each acts in turn; friction brakes the velocity along a wall as a vector.
 """
 
 from __future__ import annotations
@@ -12,49 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
-from nmpm.errors import ConfigError
-from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
 from nmpm.sim.state import Array
-
-
-class Stepper3d(MpmStepper):
-    """Advances particles in three dimensions.
-
-    Args:
-        grid: On which they move; without obstacles.
-        dt: Length of a substep, in seconds.
-
-    Raises:
-        ConfigError: if the grid has obstacles or open corners, which are implemented in two dimensions only.
-    """
-
-    def __init__(self, grid: MpmGrid, dt: float) -> None:
-        if grid.obstacles is not None or grid.walls is Walls.OPEN_CORNERS:
-            raise ConfigError("Obstacles and open corners are implemented in two dimensions, not in three.")
-        super().__init__(grid, dt)
-        self._first: NDArray[np.int64] = np.zeros(3, np.int64)
-        self._last: NDArray[np.int64] = np.zeros(3, np.int64)
-
-    def _scatter(self, particles: MpmParticles) -> None:
-        grid = self.grid
-        self._first = ((particles.position.min(axis=0) - grid.low) / grid.size).astype(np.int64)
-        self._last = ((particles.position.max(axis=0) - grid.low) / grid.size).astype(np.int64) + 3
-        _scatter(
-            self._nodes, grid.low, grid.size, self.dt * particles.volume, self._first, self._last,
-            particles.position, particles.velocity, particles.gradient, particles.stress, particles.mass,
-        )  # fmt: skip
-
-    def _update_nodes(self) -> None:
-        grid = self.grid
-        holds, inset, _ = self._walls
-        _update_nodes(self._nodes, self.dt * grid.gravity, grid.friction, holds, inset, self._first, self._last)
-
-    def _gather(self, particles: MpmParticles) -> int:
-        held_back: int = _gather(
-            self._nodes, self.grid.low, self.grid.size, self.dt, self._lower, self._upper,
-            particles.position, particles.velocity, particles.gradient,
-        )  # fmt: skip
-        return held_back
 
 
 @jit
@@ -64,13 +21,12 @@ def _weights(offset: float) -> tuple[float, float, float]:
 
 
 @jit
-def _scatter(
+def scatter(
     nodes: Array,
+    window: NDArray[np.int64],
     low: Array,
     size: float,
     impulse: float,
-    first: NDArray[np.int64],
-    last: NDArray[np.int64],
     position: Array,
     velocity: Array,
     gradient: Array,
@@ -78,6 +34,7 @@ def _scatter(
     mass: Array,
 ) -> None:
     """Mass and momentum of the particles, summed at the nodes; impulse is substep length × particle volume."""
+    first, last = window[0], window[1]
     for i in range(first[0], last[0]):
         for j in range(first[1], last[1]):
             nodes[i, j, first[2] : last[2]] = 0.0
@@ -124,16 +81,17 @@ def _slide(normal: float, one: float, other: float, friction: float) -> tuple[fl
 
 
 @jit
-def _update_nodes(
+def update_nodes(
     nodes: Array,
+    window: NDArray[np.int64],
     fall: Array,
     friction: float,
     holds: bool,
     inset: int,
-    first: NDArray[np.int64],
-    last: NDArray[np.int64],
+    open_corners: bool,  # noqa: ARG001  # (in two dimensions only)
 ) -> None:
     """Momenta to velocities, with gravity's change `fall` and the walls, which reach `inset` nodes further in."""
+    first, last = window[0], window[1]
     nx, ny, nz = nodes.shape[0], nodes.shape[1], nodes.shape[2]
     for i in range(first[0], last[0]):
         at_x = min(i, nx - 1 - i) <= inset + 1
@@ -161,7 +119,7 @@ def _update_nodes(
 
 
 @jit
-def _gather(
+def gather(
     nodes: Array,
     low: Array,
     size: float,
