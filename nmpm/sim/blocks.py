@@ -36,9 +36,6 @@ class BlockRanges(Layout):
         gap: Least distance between blocks, and from the box's sides.
         speed: Largest initial velocity along each axis, in length per second.
         jitter: Largest displacement of a particle off the lattice along each axis, in spacings.
-
-    Raises:
-        ConfigError: if a range is empty or a value is out of range.
     """
 
     number: tuple[int, int]
@@ -69,13 +66,6 @@ class BlockRanges(Layout):
 
 
 def lattice(low: Array, shape: tuple[int, ...], spacing: float, shift: Array | float = 0.0) -> Array:
-    """(N, D) centres of the cells of a lattice, the last axis varying fastest.
-
-    Args:
-        low: (D,) its lower corner, in length.
-        shape: Cells along each axis.
-        spacing: Side of a cell, in length.
-        shift: (N, D) displacement of each point, in spacings.
-    """
+    """(N, D) centres of the cells of a lattice, moved by `shift` (N, D) spacings; the last axis varies fastest."""
     nodes = np.stack(np.meshgrid(*(np.arange(number) for number in shape), indexing="ij"), axis=-1)
     return np.asarray(low + spacing * (nodes.reshape(-1, len(shape)) + 0.5 + shift))

@@ -136,14 +136,9 @@ class SimulatedTrajectory:
 def record_frames(
     first: Array, static: Array, frames: int, advance: Callable[[int], Array], progress: Progress | None
 ) -> NDArray[np.float32]:
-    """Positions of `frames` + 1 frames, static particles after the N moving ones: (frames + 1, N + M, D).
+    """(frames + 1, N + M, D) positions, those of static particles (M, D) after those of moving ones.
 
-    Args:
-        first: (N, D) positions of the first frame.
-        static: (M, D) positions of particles that never move.
-        frames: Frames to simulate.
-        advance: Simulates the frame of the given index, from 1, and returns its positions (N, D).
-        progress: Called after each frame.
+    `advance` simulates the frame of an index, from 1, and returns its positions (N, D).
     """
     moving, dim = first.shape
     recorded = np.empty((frames + 1, moving + len(static), dim), np.float32)

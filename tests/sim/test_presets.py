@@ -88,20 +88,6 @@ def test_variation_scales_initial_velocities_and_gravity_alone(name):
     assert preset.varied() == preset
 
 
-def test_without_gravity_and_speed_nothing_moves():
-    for name in ("goop", "wbcsph"):
-        made = small(name).varied(speed=0.0, gravity=0.0).with_frames(4).simulate(1)
-        assert np.abs(made.position[-1] - made.position[0]).max() < 1e-6
-
-
-def test_a_column_of_fluid_rises_under_reversed_gravity():
-    preset = load_preset("dambreak2d").coarsened(4).varied(gravity=-1.0).with_frames(20)
-    made = preset.simulate(0)
-    height = made.position[:, made.particle_type != BOUNDARY, 1].astype(float).mean(axis=1)
-    assert made.attributes["gravity"].tolist() == [0.0, 1.0]
-    assert height[-1] - height[0] > 0.1 * (20 * preset.frame_dt) ** 2 / 2
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_wider_domain_keeps_the_wall_and_holds_more(name):
     """Rounding must not part box and domain: a model of scenes without walls could not run there."""
@@ -129,12 +115,10 @@ def test_coarsening_keeps_the_particles_and_needs_whole_cells():
         GOOP.coarsened(3)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_no_particle_gets_into_a_ramp_or_out_of_the_box(seed):
+def test_no_particle_gets_into_a_ramp_or_out_of_the_box():
     preset = load_preset("waterramps").with_frames(80)
-    start = preset.draw(seed)
+    start, made = preset.draw(0), preset.simulate(0)
     ramps = start.obstacles
-    made = preset.simulate(seed)
     moving = made.particle_type != BOUNDARY
     assert distance_to_ramps(ramps, start.position).min() >= preset.ramps.gap
     np.testing.assert_allclose(
@@ -158,10 +142,6 @@ def test_no_seed_is_left_without_a_scene(name):
         assert len(np.unique(gravity.round(6), axis=0)) == len(drawn)
 
 
-def test_every_material_is_in_every_scene_of_several():
-    assert all(min(load_preset("multimaterial").draw(seed).counts) > 0 for seed in range(2))
-
-
 BLOCKS, FLUID = GOOP.to_dict()["blocks"], DAM.to_dict()["fluid"]
 
 
@@ -171,19 +151,13 @@ BLOCKS, FLUID = GOOP.to_dict()["blocks"], DAM.to_dict()["fluid"]
         (GOOP, {"colour": 1}, "unknown colour"),
         (GOOP, {"substeps": 1}, "too few.*at least 6"),
         (GOOP, {"substeps": 12.5}, "substeps"),
-        (GOOP, {"frames": "many"}, "frames"),
         (GOOP, {"box": [[0.1, 0.9], [0.1, 0.85001]]}, "whole number"),
-        (GOOP, {"box": [[0.1, 0.9]]}, "1 axes; 2 or 3"),
         (GOOP, {"gravity": [0.0, 0.0, -9.81]}, "gravity = .* needs 2 entries"),
-        (GOOP, {"gravity_turn": 200.0}, "gravity_turn"),
-        (GOOP, {"walls": "sticky"}, "walls = sticky"),
         (GOOP, {"materials": {"treacle": {}}}, "treacle.*goop"),
         (GOOP, {"materials": {"goop": {"density": 1.0}}}, "materials.goop.*missing"),
         (GOOP, {"blocks": {**BLOCKS, "number": [3, 1]}}, "blocks.number"),
-        (GOOP, {"blocks": 3}, "blocks"),
         (load_preset("waterdrop3d"), {"walls": "slip, open corners"}, "implemented in two dimensions"),
         (DAM, {"substeps": 40}, "sound: take at least 54"),
-        (DAM, {"fluid": {**FLUID, "viscosity": 5.0}}, "viscosity"),
         (DAM, {"fluid": {**FLUID, "density": -1.0}}, "density"),
         (DAM, {"column": {**DAM.to_dict()["column"], "width": 6.0}}, "does not fit"),
         (DAM, {"blocks": WBC.to_dict()["blocks"]}, "either column or blocks"),
@@ -198,15 +172,7 @@ def test_an_invalid_file_is_refused_naming_the_key(tmp_path, preset, changes, me
     assert str(path) in str(caught.value)
 
 
-def test_missing_and_broken_files_are_named(tmp_path):
-    with pytest.raises(ConfigError, match="goop"):
-        load_preset("treacle")
-    (tmp_path / "broken.yaml").write_text("frames: [1,")
-    with pytest.raises(DataError, match=r"broken\.yaml"):
-        load_preset(tmp_path / "broken.yaml")
-
-
-@pytest.mark.parametrize("name", ["../../../x", "a/b", ".x", "", "a\n", "${oc.env:HOME}", 3, ["goop"]])
+@pytest.mark.parametrize("name", ["../../../x", "", "a\n", 3])
 def test_a_name_leads_to_no_other_folder(name):
     with pytest.raises(ConfigError, match="name = ") as caught:
         preset_from_dict(GOOP.to_dict() | {"name": name})

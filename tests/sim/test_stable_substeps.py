@@ -129,21 +129,3 @@ def test_speeds_and_ways_that_bound_a_substep():
     assert longest_travel_substep(0.04, 5.0, thickness=1.0) == pytest.approx(0.02 / 5.0)
     thin = longest_travel_substep(0.04, 5.0, thickness=0.001)
     assert 0.0005 / 5.0 < thin < 0.01 / 5.0
-
-
-@pytest.mark.parametrize("thickness", [0.005, pytest.param(0.03, marks=pytest.mark.slow)])
-def test_no_particle_passes_a_ramp_thinner_than_coarse_cells(thickness):
-    plain = load_preset("waterramps")
-    preset = dataclasses.replace(plain, ramps=dataclasses.replace(plain.ramps, thickness=thickness)).coarsened(4)
-    start = preset.draw(1)
-    position = simulate(preset, 1, 150).astype(float)
-    for ramp in start.obstacles:
-        distances = np.array([ramp.distance(frame) for frame in position])
-        assert distances.min() > 0
-        # Which side of the bar's middle each particle is on, where it is next to it: it changes only around the ends.
-        arm = position - np.array(ramp.centre)
-        along, across = np.moveaxis(arm @ np.array([[np.cos(ramp.angle), -np.sin(ramp.angle)],
-                                                    [np.sin(ramp.angle), np.cos(ramp.angle)]]), -1, 0)  # fmt: skip
-        beside = np.abs(along) < 0.4 * ramp.length
-        both = beside[1:] & beside[:-1]
-        assert not np.any(both & (np.sign(across[1:]) != np.sign(across[:-1])))

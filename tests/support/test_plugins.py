@@ -1,4 +1,3 @@
-import subprocess
 import sys
 from pathlib import Path
 
@@ -41,16 +40,6 @@ def test_an_installed_processor_can_be_named_by_its_class(installed):
     made = from_spec({"class_path": "someones_processor.Mine", "init_args": {"hidden": [3]}}, Processor)
     assert type(made).__name__ == "Mine"
     assert made.hidden == (3,)
-
-
-@pytest.mark.slow
-def test_it_is_on_the_command_line_too(installed):
-    folder = installed("anothers_processor", MODULE)
-    words = ["fit", "--config", "goop.yaml", "--model.processor", "anothers_processor.Mine", "--print_config"]
-    script = f"import sys; sys.path.insert(0, {str(folder)!r}); from nmpm.cli import main; sys.exit(main({words!r}))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-500:]
-    assert "class_path: anothers_processor.Mine" in done.stdout
 
 
 def test_a_broken_plugin_is_named(installed):

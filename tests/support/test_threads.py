@@ -27,9 +27,9 @@ class Machine:
             choice.stop()
 
 
-def choice_on(machine, monkeypatch, stated=None):
+def choice_on(machine, monkeypatch):
     monkeypatch.setattr("nmpm._support.threads.usable_cores", lambda: 2)
-    return ThreadChoice(stated, machine.used.append, lambda: machine.now)
+    return ThreadChoice(None, machine.used.append, lambda: machine.now)
 
 
 @pytest.mark.parametrize(("seconds", "best"), [({1: 0.3, 2: 0.2}, 2), ({1: 0.3, 2: 14.0}, 1)])
@@ -54,12 +54,6 @@ def test_the_choice_follows_the_load_and_costs_a_small_share(monkeypatch):
     assert sum(machine.seconds[threads] for threads in again) <= 0.05 * machine.now
 
 
-def test_stated_threads_are_used_without_measuring(monkeypatch):
-    machine = Machine({5: 1.0})
-    machine.call(choice_on(machine, monkeypatch, 5), 20)
-    assert set(machine.used) == {5}
-
-
 def test_an_option_goes_before_the_environment_and_both_before_measuring():
     assert stated_threads(3, {"OMP_NUM_THREADS": "2"}) == 3
     assert stated_threads(None, {"OMP_NUM_THREADS": "2,1"}) == 2
@@ -76,6 +70,7 @@ def test_a_waiting_policy_of_the_users_is_kept():
     assert int(environment["GOMP_SPINCOUNT"]) < 300_000
 
 
+@pytest.mark.slow
 def test_importing_the_package_changes_neither_environment_nor_threads():
     script = (
         "import os, torch\nbefore = dict(os.environ), torch.get_num_threads()\nimport nmpm.training\n"

@@ -1,11 +1,11 @@
 """The kernels of MLS-MPM in two dimensions.
 
-Of all X x Y nodes with mass and momentum (X, Y, 3), only those of a window (2, D) around the particles are cleared and
-updated. `low` is the box's lower corner and `size` a cell's side; particles have position and velocity (N, D), velocity
-gradient (N, D, D), stress (N, D (D + 1) / 2) and mass (N,).
+Nodes have mass and momentum, (X, Y, D + 1). Only those in a window (2, D) around the particles are cleared and updated.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +14,25 @@ from nmpm._support.jit import jit
 from nmpm.sim.mpm.obstacle_field import slide
 from nmpm.sim.state import Array
 
+Motion = tuple[Array, Array, Array]
+"""Position (N, D), velocity (N, D) and velocity gradient (N, D, D) of the particles."""
+
+
+class Cells(NamedTuple):
+    """The box's lower corner, the side of its cells, and the least and largest position of a particle."""
+
+    low: Array
+    size: float
+    lower: Array
+    upper: Array
+
 
 @jit
 def scatter(
-    nodes: Array,
-    window: NDArray[np.int64],
-    low: Array,
-    size: float,
-    impulse: float,
-    position: Array,
-    velocity: Array,
-    gradient: Array,
-    stress: Array,
-    mass: Array,
+    nodes: Array, window: NDArray[np.int64], cells: Cells, impulse: float, motion: Motion, stress: Array, mass: Array
 ) -> None:
     """Mass and momentum of the particles, summed at the nodes; impulse is substep length × particle area."""
+    (position, velocity, gradient), low, size = motion, cells.low, cells.size
     nodes[window[0, 0] : window[1, 0], window[0, 1] : window[1, 1]] = 0.0
     scale = -4.0 * impulse / (size * size)
     for p in range(position.shape[0]):
@@ -88,18 +92,9 @@ def update_nodes(
 
 
 @jit
-def gather(
-    nodes: Array,
-    low: Array,
-    size: float,
-    dt: float,
-    lower: Array,
-    upper: Array,
-    position: Array,
-    velocity: Array,
-    gradient: Array,
-) -> int:
+def gather(nodes: Array, cells: Cells, dt: float, motion: Motion) -> int:
     """Velocities, their gradients and the move; returns how many were clamped, or -1 if a position is not finite."""
+    (position, velocity, gradient), (low, size, lower, upper) = motion, cells
     held_back = 0
     for p in range(position.shape[0]):
         x, y = (position[p, 0] - low[0]) / size, (position[p, 1] - low[1]) / size

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
+from nmpm.sim.mpm.kernels_2d import Cells, Motion
 from nmpm.sim.state import Array
 
 
@@ -22,18 +23,10 @@ def _weights(offset: float) -> tuple[float, float, float]:
 
 @jit
 def scatter(
-    nodes: Array,
-    window: NDArray[np.int64],
-    low: Array,
-    size: float,
-    impulse: float,
-    position: Array,
-    velocity: Array,
-    gradient: Array,
-    stress: Array,
-    mass: Array,
+    nodes: Array, window: NDArray[np.int64], cells: Cells, impulse: float, motion: Motion, stress: Array, mass: Array
 ) -> None:
     """Mass and momentum of the particles, summed at the nodes; impulse is substep length × particle volume."""
+    (position, velocity, gradient), low, size = motion, cells.low, cells.size
     first, last = window[0], window[1]
     for i in range(first[0], last[0]):
         for j in range(first[1], last[1]):
@@ -119,18 +112,9 @@ def update_nodes(
 
 
 @jit
-def gather(
-    nodes: Array,
-    low: Array,
-    size: float,
-    dt: float,
-    lower: Array,
-    upper: Array,
-    position: Array,
-    velocity: Array,
-    gradient: Array,
-) -> int:
+def gather(nodes: Array, cells: Cells, dt: float, motion: Motion) -> int:
     """Velocities, their gradients and the move; returns how many were clamped, or -1 if a position is not finite."""
+    (position, velocity, gradient), (low, size, lower, upper) = motion, cells
     held_back = 0
     for p in range(position.shape[0]):
         x, y, z = (position[p, 0] - low[0]) / size, (position[p, 1] - low[1]) / size, (position[p, 2] - low[2]) / size

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval
 from nmpm.sim.blocks import BlockRanges, lattice
-from nmpm.sim.state import Array, Obstacle, check, check_numbers
+from nmpm.sim.state import Array, InitialState, Obstacle, check, check_numbers
 
 _BLOCK_ATTEMPTS = 10_000
 _RESTARTS = 20
@@ -25,21 +25,8 @@ _RAMP_ATTEMPTS = 500
 _OUTLINE = 96  # points on a bar's outline by which its distance from others is judged
 
 
-@dataclass(frozen=True)
-class DrawnBlocks:
-    """N particles in blocks, sorted by material.
-
-    Args:
-        position: (N, D) in length.
-        velocity: (N, D) in length per second.
-        counts: Particles of each of the preset's materials.
-        extents: Lower and upper corner of each block, (D,) each.
-    """
-
-    position: Array
-    velocity: Array
-    counts: tuple[int, ...]
-    extents: tuple[tuple[Array, Array], ...]
+Extent = tuple[Array, Array]
+"""Lower and upper corner of a block, (D,) each."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +35,6 @@ class MpmBlockRanges(BlockRanges):
 
     Args:
         height: Least and largest height of a block above the box's bottom, as far as the gap allows; anywhere if None.
-
-    Raises:
-        ConfigError: if a range is empty or a value is out of range.
     """
 
     height: tuple[float, float] | None = None
@@ -60,14 +44,10 @@ class MpmBlockRanges(BlockRanges):
         if self.height is not None:
             check_numbers(self, "blocks.", at_least_0=("height",))
 
-    def draw(self, box: tuple[Interval, ...], spacing: float, materials: int, rng: np.random.Generator) -> DrawnBlocks:
-        """Random blocks within a box.
-
-        Args:
-            box: (lower, upper) along each axis, in length.
-            spacing: Between the particles of a block, in length.
-            materials: How many there are; blocks take them in turn.
-            rng: To draw with.
+    def draw(
+        self, box: tuple[Interval, ...], spacing: float, materials: int, rng: np.random.Generator
+    ) -> tuple[InitialState, list[Extent]]:
+        """Random blocks within a box, sorted by material, which they take in turn; and their extents.
 
         Raises:
             ConfigError: if no arrangement of blocks fits into the box.
@@ -94,7 +74,7 @@ class MpmBlockRanges(BlockRanges):
             velocities.append(np.broadcast_to(speeds[block], shift.shape))
             extents.append((low, low + spacing * np.array(shape)))
             counts[kinds[block]] += len(shift)
-        return DrawnBlocks(np.concatenate(positions), np.concatenate(velocities), tuple(counts), tuple(extents))
+        return InitialState(np.concatenate(positions), np.concatenate(velocities), counts=tuple(counts)), extents
 
     def _draw_lattices(self, number: int, dim: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
         """Particles of each block along each axis, drawn until their sum is within `particles`."""
@@ -117,7 +97,7 @@ class MpmBlockRanges(BlockRanges):
         """Lower corners of the blocks, or None if one does not fit or two come too close."""
         gap = self.gap
         box_low, box_high = np.array(box).T
-        placed: list[tuple[Array, Array]] = []
+        placed: list[Extent] = []
         for shape in lattices:
             side = spacing * np.array(shape)
             first, last = box_low + gap, box_high - gap - side
@@ -127,9 +107,7 @@ class MpmBlockRanges(BlockRanges):
             if np.any(last < first):
                 return None
             low = rng.uniform(first, last)
-            if any(
-                np.all((low < other_high + gap) & (other_low < low + side + gap)) for other_low, other_high in placed
-            ):
+            if any(np.all((low < high + gap) & (other < low + side + gap)) for other, high in placed):
                 return None
             placed.append((low, low + side))
         return [low for low, _ in placed]
@@ -154,14 +132,7 @@ def _block_sides(sizes: Array, aspect: tuple[float, float], dim: int, rng: np.ra
 
 @dataclass(frozen=True)
 class SimulatedRamp(Obstacle):
-    """A bar: a turned rectangle.
-
-    Args:
-        centre: (x, y) in length.
-        length: Of its longer side.
-        thickness: Of its shorter side.
-        angle: Of the longer side from the x axis, in radians.
-    """
+    """A bar: a rectangle about a centre (x, y), its longer side turned by an angle from the x axis, in radians."""
 
     centre: tuple[float, float]
     length: float
@@ -214,9 +185,6 @@ class RampRanges:
         thickness: Of all.
         angle: Least and largest slope, in degrees; to the left or to the right with equal chances.
         gap: Least distance between them, from the box's sides, and from blocks.
-
-    Raises:
-        ConfigError: if a range is empty or a value is out of range.
     """
 
     number: tuple[int, int]
@@ -235,18 +203,9 @@ class RampRanges:
         return self.number[1] * max(1, round(self.length[1] / spacing)) * max(1, round(self.thickness / spacing))
 
     def draw(
-        self, box: tuple[Interval, ...], occupied: Sequence[tuple[Array, Array]], rng: np.random.Generator
+        self, box: tuple[Interval, ...], occupied: Sequence[Extent], rng: np.random.Generator
     ) -> tuple[SimulatedRamp, ...]:
-        """Random ramps within a box.
-
-        Args:
-            box: (lower, upper) along x and y.
-            occupied: Lower and upper corners, (2,) each, of rectangles to keep clear of.
-            rng: To draw with.
-
-        Raises:
-            ConfigError: if no arrangement fits into the box.
-        """
+        """Random ramps within a box, clear of blocks; ConfigError if no arrangement fits into it."""
         number = int(rng.integers(self.number[0], self.number[1] + 1))
         for _ in range(_RESTARTS):
             placed = self._place(number, box, occupied, rng)
@@ -258,7 +217,7 @@ class RampRanges:
         self,
         number: int,
         box: tuple[Interval, ...],
-        occupied: Sequence[tuple[Array, Array]],
+        occupied: Sequence[Extent],
         rng: np.random.Generator,
     ) -> tuple[SimulatedRamp, ...] | None:
         """Bars placed one after the other, or None if the first ones leave no room for the others."""
@@ -278,7 +237,7 @@ class RampRanges:
         return None
 
 
-def _too_close(ramp: SimulatedRamp, corners: tuple[Array, Array], gap: float) -> bool:
+def _too_close(ramp: SimulatedRamp, corners: Extent, gap: float) -> bool:
     """Whether a ramp comes closer to a rectangle than the gap."""
     low, high = corners
     beyond = np.maximum(np.maximum(low - ramp.outline(), ramp.outline() - high), 0.0)

@@ -31,10 +31,7 @@ class Material(abc.ABC):
     def bulk_stiffness(self, energy: float) -> float:
         """Largest stiffness against compression, −d(J p) / d ln J in Pa, up to where an energy can compress it.
 
-        J is a particle's volume over its volume at rest, and p its pressure.
-
-        Args:
-            energy: Per volume at rest, in J / m² (J / m³ in three dimensions).
+        J is a particle's volume over its volume at rest, and p its pressure; the energy is per volume at rest.
         """
 
     @abc.abstractmethod

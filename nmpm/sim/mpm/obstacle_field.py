@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,15 @@ _LATTICE_PER_CELL = 4
 _PUSHES = 4
 
 
+class Lattice(NamedTuple):
+    """Signed distances at the points of a lattice, from the point `low` on; particles are kept at the margin."""
+
+    low: Array
+    spacing: float
+    distance: Array
+    margin: float
+
+
 @dataclass(frozen=True)
 class ObstacleField:
     """Obstacles, sampled on a grid's nodes and on a finer lattice.
@@ -40,19 +49,13 @@ class ObstacleField:
     Args:
         nodes: (K, 2) indices of the nodes within a cell of an obstacle.
         normals: (K, 2) unit vectors out of the obstacle at these nodes.
-        low: (2,) first point of the lattice.
-        spacing: Of the lattice, in length.
-        lattice: Signed distance at its points, in length.
-        margin: Distance at which particles are kept, in length.
+        lattice: Of the particles' distances.
         friction: Coulomb friction of the obstacles.
     """
 
     nodes: NDArray[np.int64]
     normals: Array
-    low: Array
-    spacing: float
-    lattice: Array
-    margin: float
+    lattice: Lattice
     friction: float
 
     @classmethod
@@ -61,40 +64,33 @@ class ObstacleField:
     ) -> ObstacleField:
         """Sample obstacles, given by their signed distance, on cells of a size and number from the box's corner on."""
         spacing = size / _LATTICE_PER_CELL
-        lattice = _sample(distance, low, spacing, [np.arange(_LATTICE_PER_CELL * cells + 1) for cells in shape])
+        at_lattice = _sample(distance, low, spacing, [np.arange(_LATTICE_PER_CELL * cells + 1) for cells in shape])
         at_nodes = _sample(distance, low, size, [np.arange(cells + 2) - 0.5 for cells in shape])
         near = np.argwhere(at_nodes < size)
         normals = _normals(distance, low + size * (near - 0.5), spacing / 8)
-        return cls(near, normals, np.asarray(low, np.float64), spacing, lattice, lattice_margin(size), friction)
+        lattice = Lattice(np.asarray(low, np.float64), spacing, at_lattice, lattice_margin(size))
+        return cls(near, normals, lattice, friction)
 
     def depth(self, position: Array) -> Array:
         """(N,) how much nearer to an obstacle than the margin particles (N, 2) are, in length; 0 where they are not."""
         depth = np.zeros(len(position))
-        _depths(position, self.low, self.spacing, self.lattice, self.margin, depth)
+        _depths(position, self.lattice, depth)
         return depth
 
     def brake(self, nodes: Array, fall: Array) -> None:
-        """Remove the momentum into the obstacles from the nodes, in place.
+        """Remove momentum into the obstacles from the nodes (X, Y, 3), in place.
 
-        Args:
-            nodes: (X, Y, 3) mass and momentum.
-            fall: (2,) change of velocity by gravity that follows; its part into the obstacles is removed as well.
+        `fall` (2,) is the change of velocity by gravity that follows: its part into the obstacles is removed as well.
         """
         _brake(nodes, fall, self.nodes, self.normals, self.friction)
 
     def push_out(self, before: Array, position: Array, velocity: Array, lower: Array, upper: Array) -> int:
         """Push particles that are too near out to the margin, and remove their velocity inwards; returns how many.
 
-        Args:
-            before: (N, 2) valid earlier positions; a particle that finds no room nearby goes back there, and stops.
-            position: (N, 2), changed in place.
-            velocity: (N, 2), changed in place.
-            lower: (2,) least position.
-            upper: (2,) largest position.
+        Positions and velocities change in place. A particle that finds no room nearby, between `lower` and `upper`
+        (2,), goes back to its valid position `before`, and stops.
         """
-        pushed: int = _push_out(
-            before, position, velocity, lower, upper, self.low, self.spacing, self.lattice, self.margin
-        )
+        pushed: int = _push_out(before, position, velocity, lower, upper, self.lattice)
         return pushed
 
 
@@ -139,43 +135,35 @@ def _brake(nodes: Array, fall: Array, near: NDArray[np.int64], normals: Array, f
 
 
 @jit
-def _look_up(x: float, y: float, low: Array, spacing: float, lattice: Array) -> tuple[float, float, float]:
+def _look_up(x: float, y: float, lattice: Lattice) -> tuple[float, float, float]:
     """Distance and the direction in which it grows, by bilinear interpolation within the lattice."""
-    px = min(max((x - low[0]) / spacing, 0.0), lattice.shape[0] - 1.000001)
-    py = min(max((y - low[1]) / spacing, 0.0), lattice.shape[1] - 1.000001)
+    low, spacing, distance, _ = lattice
+    px = min(max((x - low[0]) / spacing, 0.0), distance.shape[0] - 1.000001)
+    py = min(max((y - low[1]) / spacing, 0.0), distance.shape[1] - 1.000001)
     i, j = int(px), int(py)
     fx, fy = px - i, py - j
-    a, b, c, d = lattice[i, j], lattice[i + 1, j], lattice[i, j + 1], lattice[i + 1, j + 1]
+    a, b, c, d = distance[i, j], distance[i + 1, j], distance[i, j + 1], distance[i + 1, j + 1]
     sx, sy = (1 - fy) * (b - a) + fy * (d - c), (1 - fx) * (c - a) + fx * (d - b)
     return (1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * d), sx, sy
 
 
 @jit
-def _depths(position: Array, low: Array, spacing: float, lattice: Array, margin: float, depth: Array) -> None:
+def _depths(position: Array, lattice: Lattice, depth: Array) -> None:
     for p in range(position.shape[0]):
-        depth[p] = max(0.0, margin - _look_up(position[p, 0], position[p, 1], low, spacing, lattice)[0])
+        depth[p] = max(0.0, lattice.margin - _look_up(position[p, 0], position[p, 1], lattice)[0])
 
 
 @jit
-def _push_out(
-    before: Array,
-    position: Array,
-    velocity: Array,
-    lower: Array,
-    upper: Array,
-    low: Array,
-    spacing: float,
-    lattice: Array,
-    margin: float,
-) -> int:
+def _push_out(before: Array, position: Array, velocity: Array, lower: Array, upper: Array, lattice: Lattice) -> int:
+    low, spacing, distances, margin = lattice
     pushed = 0
     for p in range(position.shape[0]):
         x, y = position[p, 0], position[p, 1]
         # The nearest lattice point is within the margin of the particle: an early exit for most.
-        near = lattice[int((x - low[0]) / spacing + 0.5), int((y - low[1]) / spacing + 0.5)]
+        near = distances[int((x - low[0]) / spacing + 0.5), int((y - low[1]) / spacing + 0.5)]
         if near > 2 * margin:
             continue
-        distance, sx, sy = _look_up(x, y, low, spacing, lattice)
+        distance, sx, sy = _look_up(x, y, lattice)
         if distance >= margin:
             continue
         pushed += 1
@@ -191,7 +179,7 @@ def _push_out(
             step = 1.001 * (margin - distance)
             x = min(max(x + step * sx, lower[0]), upper[0])
             y = min(max(y + step * sy, lower[1]), upper[1])
-            distance, sx, sy = _look_up(x, y, low, spacing, lattice)
+            distance, sx, sy = _look_up(x, y, lattice)
             if distance >= margin:
                 break
         if distance < margin:

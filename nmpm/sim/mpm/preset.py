@@ -159,13 +159,13 @@ class MpmPreset(Preset):
         rng = np.random.default_rng(seed)
         gravity = self._draw_gravity(rng)
         for _ in range(_ARRANGEMENTS):
-            drawn = self.blocks.draw(self.box, self.spacing, len(self.materials), rng)
+            start, extents = self.blocks.draw(self.box, self.spacing, len(self.materials), rng)
             try:
-                ramps = () if self.ramps is None else self.ramps.draw(self.box, drawn.extents, rng)
+                ramps = () if self.ramps is None else self.ramps.draw(self.box, extents, rng)
             except ConfigError as error:  # These blocks leave no room; others may.
                 reason = error
                 continue
-            return InitialState(drawn.position, drawn.velocity, gravity, drawn.counts, ramps)
+            return dataclasses.replace(start, gravity=gravity, obstacles=ramps)
         raise reason
 
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:

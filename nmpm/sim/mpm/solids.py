@@ -47,9 +47,6 @@ class PlaneStrainSolid(Material):
         density: Mass per area, in kg / m².
         young: Young's modulus, in Pa.
         poisson: Poisson's ratio, between 0 and 0.5.
-
-    Raises:
-        ConfigError: if a parameter is out of its range.
     """
 
     density: float
@@ -71,6 +68,11 @@ class PlaneStrainSolid(Material):
         return self.shear_modulus / (1 - 2 * self.poisson)
 
     @property
+    def moduli(self) -> tuple[float, float]:
+        """`shear_modulus` and `bulk_modulus`."""
+        return self.shear_modulus, self.bulk_modulus
+
+    @property
     def wave_speed(self) -> float:
         return math.sqrt((self.bulk_modulus + self.shear_modulus) / self.density)
 
@@ -87,14 +89,10 @@ class PlaneStrainSolid(Material):
 class Sand(PlaneStrainSolid):
     """Dry sand in two dimensions.
 
-    Args:
-        density: Mass per area, in kg / m².
-        young: Young's modulus, in Pa.
-        poisson: Poisson's ratio, between 0 and 0.5.
-        friction_angle: φ, between 0 and 90 degrees.
+    Arguments beside those of `PlaneStrainSolid`:
 
-    Raises:
-        ConfigError: if a parameter is out of its range.
+    Args:
+        friction_angle: φ, between 0 and 90 degrees.
     """
 
     name: ClassVar[str] = "sand"
@@ -109,22 +107,18 @@ class Sand(PlaneStrainSolid):
 
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         friction = math.sin(math.radians(self.friction_angle))
-        _slide(strain, gradient, stress, dt, self.shear_modulus, self.bulk_modulus, friction)
+        _flow(strain, gradient, stress, dt, self.moduli, friction, 0.0, 0.0, True)
 
 
 @dataclass(frozen=True)
 class Goop(PlaneStrainSolid):
     """Elasto-viscoplastic goop.
 
+    Arguments beside those of `PlaneStrainSolid`:
+
     Args:
-        density: Mass per area, in kg / m².
-        young: Young's modulus, in Pa.
-        poisson: Poisson's ratio, between 0 and 0.5.
         yield_stress: Shear stress below which it does not flow, in Pa.
         viscosity: Shear stress above the yield stress per shear rate, in Pa s.
-
-    Raises:
-        ConfigError: if a parameter is out of its range.
     """
 
     name: ClassVar[str] = "goop"
@@ -139,7 +133,7 @@ class Goop(PlaneStrainSolid):
 
     def respond(self, strain: Array, gradient: Array, stress: Array, dt: float) -> None:
         remaining = math.exp(-self.shear_modulus * dt / self.viscosity)
-        _relax(strain, gradient, stress, dt, self.shear_modulus, self.bulk_modulus, self.yield_stress, remaining)
+        _flow(strain, gradient, stress, dt, self.moduli, 0.0, self.yield_stress, remaining, False)
 
 
 @jit
@@ -174,56 +168,37 @@ def _compose(area: float, deviator: float, along: float, across: float) -> tuple
 
 
 @jit
-def _slide(
+def _flow(
     strain: Array,
     gradient: Array,
     stress: Array,
     dt: float,
-    shear_modulus: float,
-    bulk_modulus: float,
+    moduli: tuple[float, float],
     friction: float,
+    yield_stress: float,
+    remaining: float,
+    parts: bool,
 ) -> None:
+    """A substep in which shear stress beyond `yield_stress` + `friction` × pressure falls to a share of `remaining`.
+
+    A solid that `parts` bears no stress once its area is at least that at rest.
+    """
+    shear_modulus, bulk_modulus = moduli
     for p in range(strain.shape[0]):
         xx, xy, yy = _stretch(strain, gradient, p, dt)
         area = math.sqrt(xx * yy - xy * xy)
-        if area >= 1:
+        if parts and area >= 1:
             strain[p, 0], strain[p, 1], strain[p, 2] = area, 0.0, area
             stress[p, 0] = stress[p, 1] = stress[p, 2] = 0.0
             continue
         pressure = -bulk_modulus * math.log(area)
         deviator, along, across = _principal(xx, xy, yy, area)
-        bound = friction * pressure / (2 * shear_modulus)
+        bound = (yield_stress + friction * pressure) / (2 * shear_modulus)
         if deviator > bound:
-            deviator = bound
+            deviator = bound + remaining * (deviator - bound)
             xx, xy, yy = _compose(area, deviator, along, across)
         strain[p, 0], strain[p, 1], strain[p, 2] = xx, xy, yy
         shear = 2 * shear_modulus * deviator
         stress[p, 0] = shear * along - pressure
         stress[p, 1] = shear * across
         stress[p, 2] = -shear * along - pressure
-
-
-@jit
-def _relax(
-    strain: Array,
-    gradient: Array,
-    stress: Array,
-    dt: float,
-    shear_modulus: float,
-    bulk_modulus: float,
-    yield_stress: float,
-    remaining: float,
-) -> None:
-    yield_strain = yield_stress / (2 * shear_modulus)
-    for p in range(strain.shape[0]):
-        xx, xy, yy = _stretch(strain, gradient, p, dt)
-        area = math.sqrt(xx * yy - xy * xy)
-        deviator, along, across = _principal(xx, xy, yy, area)
-        if deviator > yield_strain:
-            deviator = yield_strain + remaining * (deviator - yield_strain)
-            xx, xy, yy = _compose(area, deviator, along, across)
-        strain[p, 0], strain[p, 1], strain[p, 2] = xx, xy, yy
-        pressure, shear = bulk_modulus * math.log(area), 2 * shear_modulus * deviator
-        stress[p, 0] = pressure + shear * along
-        stress[p, 1] = shear * across
-        stress[p, 2] = pressure - shear * along

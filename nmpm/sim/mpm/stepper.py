@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from nmpm._support.jit import jit
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim.mpm import kernels_2d, kernels_3d
+from nmpm.sim.mpm.kernels_2d import Cells
 from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.state import Array
@@ -123,8 +124,9 @@ class MpmStepper:
         self._kernels: Any = kernels_2d if dim == 2 else kernels_3d
         self._nodes: Array = np.zeros((*(cells + 2 for cells in grid.shape), dim + 1))
         self._window: NDArray[np.int64] = np.zeros((2, dim), np.int64)
-        self._lower = grid.low + _MARGIN * grid.size
-        self._upper = grid.low + (np.array(grid.shape) - _MARGIN) * grid.size
+        lower = grid.low + _MARGIN * grid.size
+        upper = grid.low + (np.array(grid.shape) - _MARGIN) * grid.size
+        self._cells = Cells(grid.low, grid.size, lower, upper)
         holds = grid.walls is not Walls.SEPARATE
         self._walls = (holds, int(holds), in_corners)
 
@@ -134,12 +136,11 @@ class MpmStepper:
         Raises:
             DataError: if a particle cannot be pushed out of an obstacle.
         """
-        np.clip(particles.position, self._lower, self._upper, out=particles.position)
+        lower, upper = self._cells.lower, self._cells.upper
+        np.clip(particles.position, lower, upper, out=particles.position)
         obstacles = self.grid.obstacles
         if obstacles is not None:
-            obstacles.push_out(
-                particles.position.copy(), particles.position, particles.velocity, self._lower, self._upper
-            )
+            obstacles.push_out(particles.position.copy(), particles.position, particles.velocity, lower, upper)
             depth = obstacles.depth(particles.position)
             if depth.any():
                 worst = int(np.argmax(depth))
@@ -154,25 +155,23 @@ class MpmStepper:
         grid, dt, nodes, window = self.grid, self.dt, self._nodes, self._window
         for material, part in particles.parts:
             material.respond(particles.strain[part], particles.gradient[part], particles.stress[part], dt)
-        position, velocity, gradient = particles.position, particles.velocity, particles.gradient
+        position, velocity = particles.position, particles.velocity
+        motion = position, velocity, particles.gradient
         _find_window(position, grid.low, grid.size, window)
         self._kernels.scatter(
-            nodes, window, grid.low, grid.size, dt * particles.volume,
-            position, velocity, gradient, particles.stress, particles.mass,
-        )  # fmt: skip
+            nodes, window, self._cells, dt * particles.volume, motion, particles.stress, particles.mass
+        )
         before = None
         if grid.obstacles is not None:
             before = position.copy()
             grid.obstacles.brake(nodes, dt * grid.gravity)
         self._kernels.update_nodes(nodes, window, dt * grid.gravity, grid.friction, *self._walls)
-        held_back = self._kernels.gather(
-            nodes, grid.low, grid.size, dt, self._lower, self._upper, position, velocity, gradient
-        )
+        held_back = self._kernels.gather(nodes, self._cells, dt, motion)
         if held_back < 0:
             raise FloatingPointError("The state is not finite")
         self.held_back += held_back
         if grid.obstacles is not None and before is not None:
-            self.pushed_out += grid.obstacles.push_out(before, position, velocity, self._lower, self._upper)
+            self.pushed_out += grid.obstacles.push_out(before, position, velocity, self._cells.lower, self._cells.upper)
 
     def advance_frame(self, particles: MpmParticles, substeps: int, frame: int) -> None:
         """The substeps of a frame, in place.

@@ -39,9 +39,6 @@ class Water(Material):
         exponent: γ; 7 is water's, −1 makes pressure linear in J.
         viscosity: η, shear stress per shear rate, in Pa s.
         tension: Share of the pressure below zero that is kept, from 0 to 1.
-
-    Raises:
-        ConfigError: if a parameter is out of its range.
     """
 
     name: ClassVar[str] = "water"

@@ -66,9 +66,6 @@ class ObstacleRanges:
         number: Least and most of them.
         size: Least and largest width and height before turning, in length.
         gap: Least distance between their circumcircles, and from these to the box's sides, in length.
-
-    Raises:
-        ConfigError: if a range is empty or a value is out of range.
     """
 
     number: tuple[int, int]
@@ -83,11 +80,7 @@ class ObstacleRanges:
         return self.number[1] * LAYERS * math.ceil(4 * self.size[1] / spacing)
 
     def draw(self, box: tuple[Interval, Interval], rng: np.random.Generator) -> tuple[PolygonObstacle, ...]:
-        """Random obstacles within a box.
-
-        Raises:
-            ConfigError: if no arrangement fits into the box.
-        """
+        """Random obstacles within a box; ConfigError if no arrangement fits into it."""
         number = int(rng.integers(self.number[0], self.number[1] + 1))
         for _ in range(_RESTARTS):
             placed = self._place(number, box, rng)
@@ -124,11 +117,7 @@ def _draw_corners(size: Array, rng: np.random.Generator) -> Array:
 
 
 def box_particles(box: tuple[Interval, Interval], spacing: float) -> tuple[Array, NDArray[np.int64]]:
-    """Dummy particles around a box.
-
-    Returns:
-        Positions (M, 2), and the layer of each, 0 being next to the fluid.
-    """
+    """Positions (M, 2) of the dummy particles around a box, and the layer of each, 0 being next to the fluid."""
     axes, layers = [], []
     for low, high in box:
         count = round((high - low) / spacing)
@@ -189,11 +178,7 @@ class SolidBoundary:
         self._low, self._high = low + self.margin, high - self.margin
 
     def clamp(self, x: Array, y: Array, vx: Array, vy: Array) -> int:
-        """Move particles that have crossed a surface back to it, and remove their velocity into the solid.
-
-        Returns:
-            How many particles were moved.
-        """
+        """Move particles that have crossed a surface back to it, without velocity into the solid; returns how many."""
         held: int = _clamp(x, y, vx, vy, self._low, self._high, self._planes, self._ends, self.margin)
         return held
 

@@ -56,9 +56,6 @@ class Column(FluidLayout):
         height: In length.
         noise: Standard deviation of a particle's displacement off the lattice, in spacings.
         relaxation: Sweeps that spread the particles evenly again.
-
-    Raises:
-        ConfigError: if a number is out of range.
     """
 
     width: float
@@ -168,12 +165,7 @@ def relax(position: Array, box: Rectangle, spacing: float, sweeps: int) -> Array
 
     A sweep shifts each by −D ∇C, where C is the concentration Σ V W (Lind, Xu, Stansby & Rogers 2012, equation 24),
     which is what a constant background pressure does in Adami, Hu & Adams (2013).
-
-    Args:
-        position: (N, 2); those outside of the box are moved to its sides first.
-        box: (lower, upper) along x and y, in length, with dummy particles around it.
-        spacing: Of the particles, in length.
-        sweeps: How many.
+    Particles outside of the box are moved to its sides first.
     """
     boundary = SolidBoundary(box, (), spacing)
     lists = PairLists(boundary.position, SUPPORT * spacing)

@@ -54,9 +54,6 @@ class Fluid:
         alpha: Artificial viscosity; it amounts to a kinematic viscosity of α h c / 8.
         viscosity: Dynamic, in Pa s, which also brakes the fluid at walls; 0 lets it slip.
         diffusion: Of density, δ, which smooths what is uneven from particle to particle; 0.1 is usual.
-
-    Raises:
-        ConfigError: if a number is out of range.
     """
 
     density: float

@@ -69,16 +69,6 @@ def test_distances_are_those_to_the_densely_sampled_outline(ramp, seed):
     np.testing.assert_array_equal(both, np.minimum(distance, ramp.moved(shift).distance(points)))
 
 
-@given(ramp=ramps, spacing=st.floats(0.004, 0.02))
-@settings(max_examples=15, deadline=None)
-def test_particles_fill_the_bar_evenly(ramp, spacing):
-    particles = ramp.particles(spacing)
-    assert np.all(ramp.distance(particles) < 0)
-    numbers = max(1, round(ramp.length / spacing)) * max(1, round(ramp.thickness / spacing))
-    assert len(particles) == numbers
-    np.testing.assert_allclose(particles.mean(axis=0), ramp.centre, atol=1e-12)
-
-
 @given(seed=st.integers(0, 2**32), low=st.tuples(st.floats(0.15, 0.5), st.floats(0.4, 0.6)))
 @settings(max_examples=15, deadline=None)
 def test_drawn_bars_keep_their_distance_from_everything(seed, low):
@@ -103,18 +93,3 @@ def test_a_box_too_crowded_is_an_error():
         crowded.draw(0)
     with pytest.raises(ConfigError, match="No room for 20 ramps"):
         dataclasses.replace(RAMPS, number=(20, 20), gap=0.2).draw(BOX, [], np.random.default_rng(0))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"number": (3, 2)}, "ramps.number"),
-        ({"length": (0.0, 0.1)}, "ramps.length"),
-        ({"thickness": 0.2}, "ramps.thickness"),
-        ({"angle": (0.0, 120.0)}, "ramps.angle"),
-        ({"gap": -0.1}, "ramps.gap"),
-    ],
-)
-def test_invalid_values_are_refused(changes, message):
-    with pytest.raises(ConfigError, match=message):
-        dataclasses.replace(RAMPS, **changes)

@@ -81,15 +81,6 @@ def test_walls_that_hold_let_particles_a_cell_and_a_half_beyond_the_box():
     assert WATERDROP.simulate_from(InitialState(deepest, np.zeros((2, 2))), 5).position.min() > 0.085
 
 
-def test_a_heap_at_rest_keeps_its_area():
-    position = lattice((0.1072, 0.1036), (0.8872, 0.2172), GOOP.spacing)
-    made = GOOP.simulate_from(InitialState(position, np.zeros_like(position)), frames=150).position
-    speed = np.linalg.norm(np.diff(made[-2:].astype(float), axis=0), axis=-1) / GOOP.frame_dt
-    assert np.sqrt(np.mean(speed**2)) < 0.02
-    (low, high), (sunk, risen) = (np.percentile(frame[:, 1], [2, 98]) for frame in (made[0], made[-1]))
-    assert abs((risen - high) - (sunk - low)) < 0.04 * (high - low)
-
-
 def test_coarser_grids_converge_to_the_fine_one():
     position = lattice((0.4, 0.3), (0.784, 0.684), GOOP.spacing)
     start = InitialState(position, np.tile([1.0, 0.0], (len(position), 1)))

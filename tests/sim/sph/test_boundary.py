@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from nmpm.errors import ConfigError
 from nmpm.sim.sph.boundary import (
     LAYERS,
     ObstacleRanges,
@@ -15,7 +14,7 @@ from nmpm.sim.sph.boundary import (
     box_particles,
     obstacle_particles,
 )
-from nmpm.sim.sph.layouts import Column, FluidBlocks, relax
+from nmpm.sim.sph.layouts import Column, FluidBlocks
 
 SQUARE = PolygonObstacle(np.array([[0.4, 0.4], [0.6, 0.4], [0.6, 0.6], [0.4, 0.6]]))
 TRIANGLE = PolygonObstacle(np.array([[0.3, 0.2], [0.8, 0.3], [0.7, 0.7]]))
@@ -57,19 +56,6 @@ def test_obstacle_particles_lie_in_rings_of_even_spacing(obstacle):
     assert gaps.max() < 1.1 * spacing
 
 
-def test_thin_obstacles_have_fewer_rings_and_overlapping_ones_are_not_doubled():
-    plank = PolygonObstacle(np.array([[0.2, 0.5], [0.8, 0.5], [0.8, 0.518], [0.2, 0.518]]))
-    np.testing.assert_allclose(plank.distance(obstacle_particles(plank, 0.01)), -0.005, atol=1e-9)
-    boundary = SolidBoundary(UNIT, (SQUARE, TRIANGLE), 0.01)
-    inside = boundary.position[SQUARE.distance(boundary.position) < 0]
-    assert len(inside) == len(obstacle_particles(SQUARE, 0.01))
-    # A trajectory shows the first layer and the obstacles.
-    shown = boundary.position[boundary.visible]
-    outside = np.any((shown < 0) | (shown > 1), axis=1)
-    assert outside.sum() == 4 * 100 + 4
-    assert np.abs(shown[outside] - 0.5).max() == pytest.approx(0.505)
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_clamped_particles_are_outside_of_solids_and_do_not_move_into_them(seed):
@@ -109,15 +95,6 @@ def test_a_column_fills_its_corner_evenly():
     assert all(half.sum() == pytest.approx(300, abs=10) for half in halves)
 
 
-def test_relaxation_spreads_particles_until_they_are_a_lattice():
-    scattered = np.random.default_rng(0).uniform(0, 1, (400, 2))
-    evenness = [np.percentile(nearest(relax(scattered, UNIT, 0.05, sweeps)), 5) for sweeps in (0, 30, 300)]
-    assert evenness[0] < evenness[1] < evenness[2]
-    assert evenness[2] > 0.6 * 0.05
-    lattice = 0.05 * (np.stack(np.meshgrid(np.arange(20), np.arange(10), indexing="ij"), -1).reshape(-1, 2) + 0.5)
-    np.testing.assert_allclose(relax(lattice, ((0.0, 1.0), (0.0, 0.5)), 0.05, 20), lattice, atol=1e-6)
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**63 - 1))
 def test_blocks_and_obstacles_keep_to_the_preset(seed):
@@ -138,8 +115,3 @@ def test_blocks_and_obstacles_keep_to_the_preset(seed):
     for this in range(len(speeds)):
         mine, others = position[block.ravel() == this], position[block.ravel() != this]
         assert not len(others) or cKDTree(others).query(mine)[0].min() >= 0.02
-
-
-def test_a_box_too_crowded_is_an_error():
-    with pytest.raises(ConfigError, match="No room for 9 obstacles"):
-        ObstacleRanges((9, 9), (0.3, 0.3), 0.1).draw(BOX, np.random.default_rng(0))

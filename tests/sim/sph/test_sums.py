@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import quad
-from scipy.spatial import cKDTree
 
 from nmpm.sim.sph.neighbours import PairLists
 from nmpm.sim.sph.sums import NORM, SUPPORT, slope, weight
@@ -57,10 +56,3 @@ def test_pairs_are_those_of_brute_force_each_once(position, others, reach):
     assert len(pairs.first) == len(as_set(pairs))
     close = (x[:, None] - lists.wall_x) ** 2 + (y[:, None] - lists.wall_y) ** 2 < reach * reach
     assert as_set(wall_pairs) == as_set(np.nonzero(close))
-
-
-def test_memory_grows_with_the_pairs():
-    position = np.random.default_rng(0).uniform(LOW, HIGH, (2000, 2))
-    _, x, y, pairs, _ = near(position, np.array([LOW, HIGH]), 0.1)
-    expected = cKDTree(np.stack([x, y], -1)).query_pairs(0.1, output_type="ndarray").T
-    assert as_set(pairs) == as_set(expected)
