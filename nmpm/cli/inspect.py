@@ -75,38 +75,28 @@ def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namesp
 
 
 def _open(path: Path, format_name: str | None, options: Options, native: Path) -> tuple[FolderSource, list[str]]:
-    """The dataset, converted where it is foreign, and what could not be converted.
-
-    Args:
-        path: Of the dataset.
-        format_name: Its format; detected when left out.
-        options: Facts that the user states.
-        native: A folder for conversions that are not kept.
-    """
-    from nmpm.data.convert import convert
+    """The dataset, and problems of its conversion, which is in the cache; in the folder `native` if it is damaged."""
+    from nmpm.data.convert import convert, native_folder
     from nmpm.data.format import split_paths
     from nmpm.data.loading.sources import FolderSource
 
-    path = _dataset_of(path)
-    if split_paths(path) and format_name is None:
-        return FolderSource(path, options), []
-    problems: list[str] = []
+    path, problems = _dataset_of(path), list[str]()
     if format_name is None:
+        if split_paths(path):
+            return FolderSource(path, options), []
         try:
-            return _converted(path, options)
+            return FolderSource(native_folder(path, options)), []
+        except ConfigError as error:  # the gravity contradicts the files
+            return FolderSource(native_folder(path, replace(options, gravity=None))), [str(error)]
         except DataError as error:
-            convert(path, native, options=options, problems=problems)
-            return FolderSource(native), problems or [str(error)]
-    convert(path, native, format_name, options, problems=problems)
-    return FolderSource(native), problems
+            problems = [str(error)]
+    damage: list[str] = []
+    convert(path, native, format_name, options, problems=damage)
+    return FolderSource(native), damage or problems
 
 
 def _dataset_of(path: Path) -> Path:
-    """The folder of the dataset that an HDF5 file is a part of; other paths as they are.
-
-    Raises:
-        DataError: if the file cannot be read, or is not a part of a dataset, as a rollout.
-    """
+    """The folder of the dataset that an HDF5 file is a split of; a DataError for other HDF5 files, such as rollouts."""
     if path.suffix != ".h5" or not path.is_file():
         return path
     from nmpm.data.convert import FORMATS
@@ -120,17 +110,6 @@ def _dataset_of(path: Path) -> Path:
         f"{path}: it is not a split of a dataset, which are train.h5, valid.h5 and test.h5 beside a metadata.json. To"
         f" look at its trajectories: nmpm view {path}, or nmpm render {path}."
     )
-
-
-def _converted(path: Path, options: Options) -> tuple[FolderSource, list[str]]:
-    """A foreign dataset in the cache; a gravity that contradicts its files is left out and becomes a finding."""
-    from nmpm.data.convert import native_folder
-    from nmpm.data.loading.sources import FolderSource
-
-    try:
-        return FolderSource(native_folder(path, options)), []
-    except ConfigError as error:
-        return FolderSource(native_folder(path, replace(options, gravity=None))), [str(error)]
 
 
 def _lines(inspection: Inspection) -> Iterator[str]:
@@ -154,10 +133,18 @@ def _lines(inspection: Inspection) -> Iterator[str]:
     yield _label("bounds", _box(inspection.stated_bounds) + " stated")
     yield _label("", _box(inspection.observed) + " observed")
     yield _label("domain", f"{_box(inspection.domain)} for a grid; {', '.join(inspection.boundary)}")
-    yield _label("gravity", _gravity(inspection))
+    measured = ", ".join(f"{value:.3g}" for value in inspection.first_acceleration)
+    gravity = "not stated" if inspection.gravity is None else ", ".join(f"{value:g}" for value in inspection.gravity)
+    gravity = "differs between trajectories" if "gravity" in inspection.varies else gravity
+    yield _label("gravity", f"{gravity}; median acceleration in the first frames: {measured}")
     share, each = 100 * inspection.occupied, 100 * inspection.occupied_each
     yield _label("occupied", f"{share:.2g}% of the domain, one trajectory {each:.2g}%")
-    yield _label("at rest", _rest(inspection))
+    rest = "no trajectory comes to rest"
+    if inspection.rest is not None:
+        middle, first, last = inspection.rest
+        moving = f"; {inspection.restless} still move at their end" if inspection.restless else ""
+        rest = f"from frame {middle} on ({first}-{last}), {middle * inspection.dt:.3g} s{moving}"
+    yield _label("at rest", rest)
     yield ""
     yield "  grid          particles per    cells per frame"
     yield "                occupied cell    median    99.9%      max"
@@ -187,39 +174,13 @@ def _box(box: Iterable[tuple[float, float]]) -> str:
     return " x ".join(f"{low:.4g}…{high:.4g}" for low, high in box)
 
 
-def _gravity(inspection: Inspection) -> str:
-    measured = ", ".join(f"{value:.3g}" for value in inspection.first_acceleration)
-    stated = "not stated" if inspection.gravity is None else ", ".join(f"{value:g}" for value in inspection.gravity)
-    stated = "differs between trajectories" if "gravity" in inspection.varies else stated
-    return f"{stated}; median acceleration in the first frames: {measured}"
-
-
-def _rest(inspection: Inspection) -> str:
-    if inspection.rest is None:
-        return "no trajectory comes to rest"
-    middle, first, last = inspection.rest
-    moving = f"; {inspection.restless} still move at their end" if inspection.restless else ""
-    return f"from frame {middle} on ({first}-{last}), {middle * inspection.dt:.3g} s{moving}"
-
-
 def _draw(source: FolderSource, inspection: Inspection, path: Path) -> None:
-    from nmpm.data.gravity import trajectory_gravity
     from nmpm.data.inspection.reading import open_dataset
-    from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
+    from nmpm.viz import write_snapshots
+    from nmpm.viz.files import label_trajectory
 
     data = open_dataset(source)
     metadata, scene, trajectory = data.source.metadata, data.source.scene, next(iter(data.splits.values())).read(0)
-    moving, static = metadata.is_moving(trajectory.particle_type), metadata.is_static(trajectory.particle_type)
-    pictured = LabelledTrajectories(
-        positions={"recorded": trajectory.position[:, moving]},
-        material=material_names(trajectory.particle_type[moving], metadata.particle_types),
-        bounds=scene.bounds,
-        dt=metadata.dt,
-        domain=scene.domain,
-        obstacle=trajectory.position[0, static],
-        periodic=scene.periodic,
-        gravity=trajectory_gravity(trajectory.attributes, scene, inspection.path),
-        title=f"{Path(inspection.path).name}, first trajectory",
-    )
-    write_snapshots(pictured, path)
+    title = f"{Path(inspection.path).name}, first trajectory"
+    write_snapshots(label_trajectory(trajectory, "recorded", metadata, scene, title), path)
     sys.stdout.write(f"\nwrote {path}\n")

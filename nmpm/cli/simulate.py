@@ -124,23 +124,14 @@ def _list() -> None:
 
 def _preview(preset: Preset, seed: int, path: Path) -> None:
     from nmpm._support.progress import progress_bar
-    from nmpm.data.gravity import trajectory_gravity
-    from nmpm.sim.preset import BOUNDARY
-    from nmpm.viz import LabelledTrajectories, material_names, write_snapshots
+    from nmpm.data.format import Trajectory
+    from nmpm.data.generate import preset_metadata
+    from nmpm.viz import write_snapshots
+    from nmpm.viz.files import label_trajectory
 
     with progress_bar(f"Simulating {preset.name}", preset.frames) as step:
-        trajectory = preset.simulate(seed, lambda _: step())
-    moving, scene = trajectory.particle_type != BOUNDARY, preset.scene
-    pictured = LabelledTrajectories(
-        positions={"simulated": trajectory.position[:, moving]},
-        material=material_names(trajectory.particle_type[moving], preset.type_names),
-        bounds=scene.bounds,
-        dt=scene.dt,
-        domain=scene.domain,
-        obstacle=trajectory.position[0, ~moving],
-        periodic=scene.periodic,
-        gravity=trajectory_gravity(trajectory.attributes, scene, preset.name),
-        title=f"{preset.name}, simulated by nmpm ({preset.generator})",
-    )
-    write_snapshots(pictured, path)
+        run = preset.simulate(seed, lambda _: step())
+    trajectory = Trajectory(run.position, run.particle_type, run.attributes)
+    title = f"{preset.name}, simulated by nmpm ({preset.generator})"
+    write_snapshots(label_trajectory(trajectory, "simulated", preset_metadata(preset), preset.scene, title), path)
     sys.stdout.write(f"wrote {path}\n")

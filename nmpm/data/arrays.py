@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.statistics import first_outside
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
@@ -57,29 +58,26 @@ def _check_trajectories(
     trajectories: Iterable[Trajectory | np.ndarray], scene: Scene, path: Path, lengths: list[int]
 ) -> Iterator[Trajectory]:
     kinds = len(scene.materials) + scene.obstacles
-    low, high = np.asarray(scene.domain).T
     for index, item in enumerate(trajectories):
         where = f"{path}: trajectory {index}"
         trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
-        _check_axes(trajectory.position, isinstance(item, Trajectory), where)
-        if trajectory.position.shape[2] != scene.dim:
-            raise DataError(f"{where} has {trajectory.position.shape[2]} axes, the scene has {scene.dim}.")
-        types = np.unique(trajectory.particle_type)
+        position, types = trajectory.position, np.unique(trajectory.particle_type)
+        _check_axes(position, isinstance(item, Trajectory), where)
+        if position.shape[2] != scene.dim:
+            raise DataError(f"{where} has {position.shape[2]} axes, the scene has {scene.dim}.")
         if types.min() < 0 or types.max() >= kinds:
             known = ", ".join(f"{i} {name}" for i, name in _types(scene).items())
             raise DataError(f"{where} has particle types {types.tolist()}; the scene has {known}.")
-        outside = ((trajectory.position < low) | (trajectory.position > high)) & ~np.asarray(scene.periodic)
-        if outside.any():
-            frame, particle, axis = map(int, np.argwhere(outside)[0])
+        if outside := first_outside(position, scene.domain, scene.periodic):
+            frame, particle, _ = outside
             raise DataError(
-                f"{where}, frame {frame}: particle {particle} is at {trajectory.position[frame, particle].tolist()},"
-                f" outside the domain {scene.domain[axis]} of axis {axis}."
-                " Give the scene a domain that contains all positions."
+                f"{where}, frame {frame}: particle {particle} is at {position[frame, particle].tolist()}, outside the"
+                f" domain {list(map(list, scene.domain))}. Give the scene a domain that contains all positions."
             )
         missing = [name for name in scene.fields if name not in {*trajectory.fields, *trajectory.attributes}]
         if missing:
             raise DataError(f"{where} has no field {', '.join(missing)}, which the scene has: give Trajectory.fields.")
-        lengths.append(len(trajectory.position))
+        lengths.append(len(position))
         yield trajectory
 
 
@@ -97,9 +95,6 @@ def _check_axes(position: np.ndarray, typed: bool, where: str) -> None:
 
     Between frames a particle moves less than the distance to another particle, which may be anywhere; the limit is
     `_SWAPPED` times that distance.
-
-    Raises:
-        DataError: if particles and frames look swapped.
     """
     if typed and position.shape[0] != position.shape[1]:
         return  # `Trajectory` compared the types with the second axis

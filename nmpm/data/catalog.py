@@ -49,11 +49,6 @@ def catalog() -> tuple[str, ...]:
     return preset_names()
 
 
-def dataset_home() -> Path:
-    """The cache folder of datasets."""
-    return user_home()
-
-
 def describe(name: str) -> CatalogEntry:
     """The catalog's entry for an embedded dataset; raises a DataError if there is none of that name."""
     if name not in catalog():
@@ -82,7 +77,7 @@ def simulation_request(
 def dataset_folder(name: str, request: SimulationRequest) -> Path:
     """The folder of a request in the cache: the name and a hash of all that determines the data."""
     fingerprint = hashlib.sha256(json.dumps(request.to_dict(), sort_keys=True).encode()).hexdigest()[:10]
-    return dataset_home() / "datasets" / f"{name}-{fingerprint}"
+    return user_home() / "datasets" / f"{name}-{fingerprint}"
 
 
 def find_simulated(name: str, test: int) -> Path | None:
@@ -94,7 +89,7 @@ def find_simulated(name: str, test: int) -> Path | None:
 def _complete_folders(name: str, request: SimulationRequest) -> Iterator[tuple[Path, Mapping[str, int]]]:
     """Complete folders that differ from the request in their counts at most, with these counts."""
     wanted = request.to_dict()
-    for folder in sorted((dataset_home() / "datasets").glob(f"{name}-*")):
+    for folder in sorted((user_home() / "datasets").glob(f"{name}-*")):
         if not (folder / METADATA_FILE).is_file():
             continue
         stored = read_metadata(folder).extra.get("simulation", {})
@@ -109,7 +104,7 @@ def ensure(
     seed: int | None = None,
     workers: int | None = None,
 ) -> Path:
-    """The folder of an embedded dataset, which is simulated now if it is missing.
+    """The folder of an embedded dataset, which is simulated now if it is missing; raises as `generate`.
 
     Trajectories do not depend on how many there are: those that another folder of it has are copied.
 
@@ -119,10 +114,6 @@ def ensure(
         frames: Simulated frames of a trajectory; the preset's own when left out.
         seed: The seeds of all trajectories are derived from it; 0 when left out.
         workers: Trajectories simulated at a time; one per processor core when left out.
-
-    Raises:
-        DataError: if there is no dataset of that name, or its folder cannot be written.
-        ConfigError: if counts or frames are invalid.
     """
     request = simulation_request(name, counts, frames, seed)
     folder, largest = dataset_folder(name, request), None

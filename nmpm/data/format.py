@@ -110,10 +110,7 @@ class _Entry:
 
 
 class Split:
-    """The trajectories of one file, read on access. Keeps no file open, so that it can be pickled and shared.
-
-    Args:
-        path: The HDF5 file.
+    """The trajectories of an HDF5 file, read on access. Keeps no file open, so that it can be pickled and shared.
 
     Raises:
         DataError: if the file is missing, damaged, not of the layout above, or takes content from other files.

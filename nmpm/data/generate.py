@@ -63,8 +63,8 @@ def generate(
     Args:
         preset: The family of scenes.
         folder: The dataset's folder; created if missing.
-        counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
-        seed: The seeds of all trajectories are derived from it.
+        counts: As for `SimulationRequest`.
+        seed: Likewise.
         workers: Trajectories simulated at a time; one per processor core when left out. Where there is much to
             simulate, each is a process, of about 200 MB.
         copy_from: A complete dataset of the same preset and seed, whose trajectories are copied.
@@ -102,10 +102,9 @@ def generate_shard(
     seed: int = 0,
     workers: int | None = None,
 ) -> int:
-    """Simulates a shard of a dataset; the shard that finishes last completes the dataset.
+    """Simulates a shard of a dataset; the one that finishes last completes it, with the bytes that `generate` writes.
 
-    Shards may run at the same time in the same folder. The folder then has the bytes that `generate` writes. Arguments
-    and errors are those of `generate`.
+    Shards may run at the same time in the same folder. Other arguments and errors are as for `generate`.
 
     Returns:
         Number of trajectories that other shards have yet to simulate; 0 if the dataset is complete.

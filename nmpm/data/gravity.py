@@ -23,13 +23,8 @@ Gravity = tuple[float, ...]
 def trajectory_gravity(attributes: Mapping[str, Any], facts: Scene | Metadata, where: str) -> Gravity | None:
     """The gravity (D,) that a trajectory's attributes state, else its scene or dataset; None if neither does.
 
-    Args:
-        attributes: Of the trajectory.
-        facts: Of its scene or dataset.
-        where: The trajectory, for messages.
-
     Raises:
-        DataError: if the attribute is not a finite number for each axis.
+        DataError: naming `where`, if the attribute is not a finite number for each axis.
     """
     stated = attributes.get("gravity")
     if stated is None:
@@ -68,11 +63,6 @@ def check_gravity(given: Sequence[float], stated: Gravity | None, path: Path) ->
 
 def common_gravity(gravities: tuple[Gravity, ...], metadata: Metadata, split: Split) -> Gravity | None:
     """The metadata's gravity, or else that of all trajectories; None if neither is known.
-
-    Args:
-        gravities: The distinct ones of the trajectories.
-        metadata: Of the dataset.
-        split: The trajectories' file.
 
     Raises:
         DataError: if all trajectories state one that is not the metadata's: models would learn theirs, and fall by the

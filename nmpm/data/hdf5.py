@@ -14,7 +14,6 @@ import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from io import FileIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -105,15 +104,7 @@ def check_stored_size(dataset: Any, where: str) -> None:
 
 
 def write_compressed(group: Any, name: str, values: np.ndarray, rows: int, threads: int | None = None) -> None:
-    """Adds a compressed dataset to an HDF5 group.
-
-    Args:
-        group: Open for writing.
-        name: Of the dataset.
-        values: At least one row.
-        rows: Of a chunk, along the first axis.
-        threads: That compress; one per processor core when left out.
-    """
+    """Adds a compressed dataset to an HDF5 group, in chunks of so many rows; by default a thread per core."""
     chunk = (rows, *values.shape[1:])
     dataset = group.create_dataset(name, shape=values.shape, dtype=values.dtype, chunks=chunk, **FILTERS)
     threads = threads or usable_cores()
@@ -135,11 +126,7 @@ def _compress(values: np.ndarray, rows: int) -> bytes:
 
 @contextmanager
 def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[], None]]]:
-    """Opens a new HDF5 file, which replaces `path` once it is complete.
-
-    Args:
-        path: The file.
-        options: Of `h5py.File`.
+    """Opens a new HDF5 file, with options of `h5py.File`, which replaces `path` once it is complete.
 
     Yields:
         The open HDF5 file, and a function that raises the error of an earlier write; call it after each large write.
@@ -147,8 +134,14 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
     Raises:
         DataError: if a write fails, e.g. because the disk is full; `path` is then as it was.
     """
-    with _open_atomically(path) as raw:
-        target = _NeverFailingFile(raw.fileno())
+    with ExitStack() as stack:
+        try:
+            part = stack.enter_context(atomic_write(path))
+            target = _NeverFailingFile(stack.enter_context(part.open("w+b", buffering=0)).fileno())
+        except OSError as error:
+            raise DataError(
+                f"{path}: cannot be written ({error.strerror}). Correct the permissions, or choose another folder."
+            ) from error
 
         def check() -> None:
             if target.error is not None:
@@ -164,28 +157,11 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
         check()
 
 
-@contextmanager
-def _open_atomically(path: Path) -> Iterator[FileIO]:
-    """Opens a temporary file that replaces `path` on success."""
-    with ExitStack() as stack:
-        try:
-            part = stack.enter_context(atomic_write(path))
-            raw = stack.enter_context(part.open("w+b", buffering=0))
-        except OSError as error:
-            raise DataError(
-                f"{path}: cannot be written ({error.strerror}). Correct the permissions, or choose another folder."
-            ) from error
-        yield raw
-
-
 class _NeverFailingFile:
     """The file object that h5py writes to; content that cannot be written is kept in memory, and the error noted.
 
     Reads return that content too, so that HDF5 can close the file in order. The caller stops after the first error, so
     that no more than one trajectory and HDF5's caches are kept.
-
-    Args:
-        descriptor: Of a file that is open for reading and writing.
     """
 
     def __init__(self, descriptor: int) -> None:

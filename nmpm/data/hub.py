@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from nmpm._support.atomic import lock_folder, new_folder
 from nmpm._support.bounded_files import EXPANSION, FILE_NAME, ZIP_ERRORS, expansion_limit
+from nmpm._support.messages import one_line
 from nmpm._support.shipped import user_home
 from nmpm.data.format import SPLITS
 from nmpm.errors import ConfigError, DataError
@@ -28,7 +29,7 @@ def hub_folder(name: str) -> Path:
 
     Raises:
         ConfigError: if the name is malformed.
-        DataError: if it cannot be downloaded: no connection, or no dataset of that name.
+        DataError: if it cannot be downloaded.
     """
     repository, folder = _parse_name(name)
     downloaded = _fetch(repository, folder)
@@ -65,7 +66,7 @@ def _fetch(repository: str, folder: str) -> Path:
         raise DataError(f"{wanted}: the hub has no dataset {repository}.") from error
     except (LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
         raise DataError(
-            f"{wanted}: not in the cache, and cannot be downloaded from the Hugging Face hub ({_first_line(error)})."
+            f"{wanted}: not in the cache, and cannot be downloaded from the Hugging Face hub ({one_line(error, 160)})."
             f" On a machine with a connection, run `hf download --repo-type dataset {repository}"
             f"{f' --include {folder}/*' if folder else ''} --local-dir data`, unpack archives, copy"
             " the folder here, and give it as the path."
@@ -74,10 +75,6 @@ def _fetch(repository: str, folder: str) -> Path:
     if not downloaded.is_dir():
         raise DataError(f"{wanted}: the dataset {repository} has no folder {folder}.")
     return downloaded
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
 
 
 def _unpack(downloaded: Path, archives: list[Path], target: Path) -> None:
@@ -94,7 +91,7 @@ def _unpack(downloaded: Path, archives: list[Path], target: Path) -> None:
             if not any(new.iterdir()):
                 raise DataError(f"{target}: cannot be unpacked (no data files in {downloaded}).")
     except ZIP_ERRORS as error:
-        raise DataError(f"{target}: cannot be unpacked ({_first_line(error)}).") from error
+        raise DataError(f"{target}: cannot be unpacked ({one_line(error, 160)}).") from error
 
 
 def _unpack_one(archive: Path, target: Path) -> None:

@@ -30,16 +30,11 @@ _LENGTH_KEYS = ("sequence_length", "sequence_length_train", "sequence_length_tes
 def read_metadata(folder: Path, family: str | None = None) -> Metadata:
     """Reads and checks a dataset's `metadata.json`.
 
-    Args:
-        folder: The dataset's folder.
-        family: Meaning of the type ids ("deepmind", "lagrangebench", "jax-sph") where the file does not state it.
+    A family gives the type ids their meaning where the file does not; a file that contradicts it wins, with a warning.
 
     Raises:
         DataError: if the file is missing or not JSON, or a key is missing or has a wrong value.
         ConfigError: if there is no such family.
-
-    Warns:
-        UserWarning: if the file names types otherwise than the family, which is then not used.
     """
     path = Path(folder) / METADATA_FILE
     return parse_metadata(load_json(path), path, family)
@@ -52,7 +47,7 @@ def parse_metadata(
     problems: list[str] | None = None,
     substitutes: Mapping[str, Any] | None = None,
 ) -> Metadata:
-    """Validates the metadata in a JSON object.
+    """As `read_metadata`, of a JSON object.
 
     Args:
         plain: The object.
@@ -60,10 +55,6 @@ def parse_metadata(
         family: Meaning of the type ids where it does not state it.
         problems: Collects what is wrong with it; when left out, the first problem is raised.
         substitutes: Where problems are collected, values of the keys that are missing or wrong.
-
-    Raises:
-        DataError: if a key is missing or has a wrong value.
-        ConfigError: if there is no such family.
     """
     check_plain(plain, where)
     keys = JsonKeys(where, plain, problems, substitutes)

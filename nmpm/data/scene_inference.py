@@ -19,27 +19,22 @@ _SAMPLE_BYTES = 2**27
 
 
 def infer_scene(folder: Path, options: Options | None = None) -> Scene:
-    """Infers the scene of a dataset.
+    """Infers the scene of a dataset in the native layout.
 
     Bounds are the metadata's, widened to contain all sampled positions of moving particles. The domain is the
     metadata's, or else the metadata's bounds with a wall layer of 2.5% of their extent (further out where particles
     are), and the bounds themselves on a periodic axis. Materials are the types that move and occur, in order of id.
     The particle volume is the metadata's, or else (median distance to the nearest neighbour in first frames) ** dim.
-
     Fields are those that the metadata or the user names and that differ anywhere in the sample.
 
     Sampled are the positions and fields of `train.h5` (or else `valid.h5`, `test.h5`): all of them up to 128 MiB,
     evenly spaced trajectories beyond that. Types and gravities are read from all its trajectories.
 
-    Args:
-        folder: The dataset's folder.
-        options: What the user states beside the metadata.
-
     Raises:
         DataError: if files are missing or wrong, a trajectory lacks a field, a position lies outside the domain that
             the metadata states, that domain is not the period of a periodic axis, or all trajectories contradict the
             metadata's gravity.
-        ConfigError: if an argument does not match the number of axes, is invalid, or contradicts the files' gravity.
+        ConfigError: if an option does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
     folder, options = Path(folder), options or Options()
     stated = read_metadata(folder, options.family)

@@ -192,14 +192,9 @@ def simulate_all(
 ) -> Generator[tuple[int, SimulatedTrajectory], None, None]:
     """Yields the index and the trajectory of each of `entropies` as they are finished, of the first stable seed each.
 
-    Closing the iterator ends the processes at once. They write nothing, ignore Ctrl-C, and end with this process
-    however it ends. Little work is done in this process instead, one trajectory after the other.
-
-    Args:
-        preset: The family of scenes.
-        entropies: As for `seed_of_draw`, of each trajectory.
-        workers: Processes at most.
-        check: Called several times a second; what it raises ends the simulation.
+    Closing the iterator ends the processes, at most `workers`, at once. They write nothing, ignore Ctrl-C, and end with
+    this process however it ends. Little work is done in this process instead, one trajectory after the other.
+    `check` is called several times a second; what it raises ends the simulation.
 
     Raises:
         UnstableError: if no seed of a trajectory stays stable.

@@ -63,12 +63,9 @@ def notes_on_lengths(frames: set[int], metadata: Metadata, others: Iterable[int]
 
 
 def neighbour_distance(split: Split, indices: Sequence[int], metadata: Metadata) -> float:
-    """Median distance of moving particles to the nearest other one, in first frames; 0 where it is unknown.
+    """Median distance of moving particles to the nearest other one, in the first frames of some trajectories.
 
-    Args:
-        split: The trajectories.
-        indices: Of some of them; at most 8, evenly spaced, are read, and those that cannot be read are left out.
-        metadata: States bounds and periodic axes.
+    At most 8 of them are read, evenly spaced; those that cannot be read are left out. It is 0 where it is unknown.
     """
     distances = [np.empty(0)]
     lower, upper = np.asarray(metadata.bounds).T
@@ -101,9 +98,6 @@ class MotionStatistics:
 
     Velocities are differences of successive frames, in length per frame; accelerations are differences of velocities,
     in length per frame squared.
-
-    Args:
-        metadata: States which types move and which axes are periodic.
     """
 
     def __init__(self, metadata: Metadata) -> None:
@@ -149,14 +143,23 @@ def _short(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in np.atleast_1d(values)) + ")"
 
 
-def first_moving_particle(position: np.ndarray, particles: np.ndarray, extent: Sequence[Interval]) -> int | None:
-    """Index of the first of some particles that is displaced by more than a thousandth of the extent, or None.
+def first_outside(
+    position: np.ndarray, domain: Sequence[Interval], periodic: Sequence[bool], present: np.ndarray | bool = True
+) -> tuple[int, int, int] | None:
+    """Frame and particle of the first (T, N, D) position outside, and how many particles are ever; None if none is.
 
-    Args:
-        position: (T, N, D).
-        particles: (N,) bool, the particles to look at.
-        extent: (lower, upper) per axis.
+    On a periodic axis no position is outside. Only particles that are `present`, (N,), count.
     """
+    lower, upper = np.asarray(domain, dtype=np.float32).T
+    outside = (((position < lower) | (position > upper)) & ~np.asarray(periodic)).any(axis=-1) & present
+    if not outside.any():
+        return None
+    frame, particle = map(int, np.argwhere(outside)[0])
+    return frame, particle, int(outside.any(axis=0).sum())
+
+
+def first_moving_particle(position: np.ndarray, particles: np.ndarray, extent: Sequence[Interval]) -> int | None:
+    """Index of the first of some (N,) particles that moves by over a thousandth of the extent (D,), or None."""
     if not particles.any():
         return None
     lower, upper = np.asarray(extent).T

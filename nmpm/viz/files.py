@@ -11,7 +11,7 @@ import numpy as np
 
 from nmpm.data.convert import Options
 from nmpm.data.fields import read_fields
-from nmpm.data.format import TRUTH, Split, Trajectory, read_metadata
+from nmpm.data.format import TRUTH, Metadata, Split, Trajectory, read_metadata
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
 from nmpm.data.scene_inference import infer_scene
@@ -56,6 +56,25 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         gravity=trajectory_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
         title=f"{split.path.name}, trajectory {index}",
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
+    )
+
+
+def label_trajectory(
+    trajectory: Trajectory, label: str, metadata: Metadata, scene: Scene, title: str
+) -> LabelledTrajectories:
+    """One trajectory of a dataset, to be drawn; raises a DataError if a position or its gravity is wrong."""
+    types = trajectory.particle_type
+    moving, static = metadata.is_moving(types), metadata.is_static(types)
+    return LabelledTrajectories(
+        positions={label: trajectory.position[:, moving]},
+        material=material_names(types[moving], metadata.particle_types),
+        bounds=scene.bounds,
+        dt=scene.dt,
+        domain=scene.domain,
+        obstacle=trajectory.position[0, static],
+        periodic=scene.periodic,
+        gravity=trajectory_gravity(trajectory.attributes, scene, title),
+        title=title,
     )
 
 

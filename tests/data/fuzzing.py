@@ -110,8 +110,8 @@ def random_changes(rng: random.Random) -> list[Change]:
 
 def _read_foreign(folder: Path) -> None:
     dataset = open_dataset(folder, None, Options(types={5: "water"}, dt=0.0025))
-    for split in dataset.splits.values():
-        for trajectory in split:
+    for start in dataset.splits.values():
+        for trajectory in start():
             assert np.isfinite(trajectory.position).all()
 
 

@@ -17,12 +17,6 @@ def home(tmp_path, monkeypatch) -> Path:
     return tmp_path / "home"
 
 
-def test_cache_folder_from_the_environment_or_the_home(home, monkeypatch):
-    assert catalog.dataset_home() == home
-    monkeypatch.delenv("NMPM_HOME")
-    assert catalog.dataset_home() == Path.home() / ".cache" / "nmpm"
-
-
 def test_ensure_simulates_once(home):
     folder = catalog.ensure("goop", counts=COUNTS, frames=2)
     assert folder.parent == home / "datasets"

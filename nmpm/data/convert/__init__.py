@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from nmpm._support.shipped import user_home
 from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
-from nmpm.data.convert.base import Rereadable as Rereadable
 from nmpm.data.convert.conversion import renumber_types, write_native
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
@@ -34,12 +33,7 @@ FORMATS: tuple[DatasetFormat, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(
 
 
 def open_dataset(path: Path, format_name: str | None = None, options: Options | None = None) -> ForeignDataset:
-    """Opens a dataset of any format.
-
-    Args:
-        path: A file or folder.
-        format_name: Name of the format; detected when left out.
-        options: Facts that the files do not state.
+    """Opens a dataset of any format, of the one that is named or else detected.
 
     Raises:
         DataError: if the path is missing, of no known format, or damaged.
@@ -84,8 +78,7 @@ def convert(
         format_name: Name of the source's format; detected when left out.
         options: Facts that the files do not state.
         ids: New particle type ids by old ones; other ids stay.
-        problems: Collects what is wrong with trajectories, and the others are converted; when left out, the first
-            problem is raised.
+        problems: As for `write_native`.
 
     Returns:
         Notes on assumptions and inconsistencies, as sentences.
@@ -99,13 +92,9 @@ def convert(
 
 
 def native_folder(path: Path, options: Options | None = None) -> Path:
-    """A folder in the native layout with the same data, converted now or by an earlier call.
+    """A folder in the native layout with the same data, converted in the cache now or by an earlier call.
 
     The dataset is converted again when the size or time of a source file, or an option, has changed.
-
-    Args:
-        path: A file or folder of any format that `nmpm convert` reads.
-        options: Facts that its files do not state.
 
     Raises:
         DataError: if the source cannot be read or the cache cannot be written.
@@ -127,6 +116,9 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
 
 
 def _fingerprint(path: Path, options: Options) -> str:
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    states = [(str(file.relative_to(path)), file.stat()) for file in files if file.is_file()]
+    stamps = [(name, state.st_size, state.st_mtime_ns) for name, state in states]
     # Mappings and sets of equal content may have another order.
     ordered = [
         sorted(value.items() if isinstance(value, Mapping) else value)
@@ -134,12 +126,5 @@ def _fingerprint(path: Path, options: Options) -> str:
         else value
         for value in vars(options).values()
     ]
-    identity = repr((str(path), ordered, list(_stamps(path))))
+    identity = repr((str(path), ordered, stamps))
     return hashlib.sha256(identity.encode()).hexdigest()[:10]
-
-
-def _stamps(path: Path) -> Iterator[tuple[str, int, int]]:
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file():
-            status = file.stat()
-            yield str(file.relative_to(path)), status.st_size, status.st_mtime_ns

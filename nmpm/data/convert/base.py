@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -81,42 +81,34 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Rereadable(Iterable[Trajectory]):
-    """Trajectories that are read again in each iteration.
+class ForeignDataset:
+    """An opened dataset of another format.
 
     Args:
-        start: Starts a new iteration.
+        metadata: Facts that all trajectories share.
+        splits: For each of "train", "valid" and "test" that exists, a function that starts reading its trajectories.
+        notes: Sentences for the user, on assumptions and inconsistencies.
+        counts: Trajectories per split; None where only reading them all would tell.
+        assumed: Fields of the metadata that the files do not state.
     """
 
-    start: Callable[[], Iterator[Trajectory]]
-
-    def __iter__(self) -> Iterator[Trajectory]:
-        return self.start()
-
-
-@dataclass(frozen=True)
-class ForeignDataset:
-    """An opened dataset of another format."""
-
-    metadata: Metadata  # facts that all trajectories share
-    splits: Mapping[
-        str, Iterable[Trajectory]
-    ]  # trajectories of the splits "train", "valid" and "test" that exist; read one by one, in each iteration
-    notes: tuple[str, ...] = ()  # sentences for the user, on assumptions and inconsistencies
-    counts: Mapping[str, int | None] = field(
-        default_factory=dict
-    )  # trajectories per split; None where only reading them all would tell
-    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
+    metadata: Metadata
+    splits: Mapping[str, Callable[[], Iterator[Trajectory]]]
+    notes: tuple[str, ...] = ()
+    counts: Mapping[str, int | None] = field(default_factory=dict)
+    assumed: frozenset[str] = frozenset()
 
 
 class DatasetFormat(abc.ABC):
-    """Abstract reader of a format, one subclass per format."""
+    """Abstract reader of a format, one subclass per format.
+
+    Attributes:
+        name: The format's name.
+        summary: One line for the command line's help.
+    """
 
     name: ClassVar[str]
-    """The format's name."""
-
     summary: ClassVar[str]
-    """One line for the command line's help."""
 
     @abc.abstractmethod
     def recognises(self, path: Path) -> bool:
@@ -124,11 +116,7 @@ class DatasetFormat(abc.ABC):
 
     @abc.abstractmethod
     def open(self, path: Path, options: Options) -> ForeignDataset:
-        """Opens a dataset of this format.
-
-        Raises:
-            DataError: if a file is missing, damaged or not of this format; names the file.
-        """
+        """Opens a dataset; raises a DataError that names the file if it is missing, damaged or of another format."""
 
 
 class FileFormat(DatasetFormat):
@@ -136,30 +124,24 @@ class FileFormat(DatasetFormat):
 
     The files of the splits are in folders called train, valid and test, or have names that begin so; other files, and a
     file alone, are the test split.
+
+    Attributes:
+        pattern: Of the files' names.
+        family: Meaning of the type ids where the user names no family.
+        assumed: Fields of the metadata that the files do not state.
     """
 
     pattern: ClassVar[str]
-    """Of the files' names."""
     family: ClassVar[str] = "deepmind"
-    """Meaning of the type ids where the user names no family."""
     assumed: ClassVar[frozenset[str]] = frozenset()
-    """Fields of the metadata that the files do not state."""
 
     @abc.abstractmethod
     def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
-        """Facts about the dataset, before the user's corrections, and notes, from its first file.
-
-        Raises:
-            DataError: as `open`.
-        """
+        """Facts about the dataset from its first file, before the user's corrections, and notes for the user."""
 
     @abc.abstractmethod
     def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:
-        """Yields the trajectories of a file.
-
-        Raises:
-            DataError: naming the file, if it is damaged.
-        """
+        """Yields the trajectories of a file; raises a DataError that names it if it is damaged."""
 
     def count(self, file: Path) -> int | None:  # noqa: ARG002 (for subclasses)
         """Number of trajectories in a file; None where only reading them all would tell."""
@@ -175,22 +157,17 @@ class FileFormat(DatasetFormat):
         stated, notes = self.metadata(next(iter(files.values()))[0], options)
         metadata = options.apply_to(stated)
         counts = {split: [self.count(file) for file in paths] for split, paths in files.items()}
-        alone = {split: paths[0] for split, paths in files.items() if len(paths) == 1}
-        named = (
-            f"{file.name} becomes the {split} split."
-            for split, file in alone.items()
-            if split not in (file.stem, file.parent.name)
+        renamed = (
+            f"{paths[0].name} becomes the {split} split."
+            for split, paths in files.items()
+            if len(paths) == 1 and split not in (paths[0].stem, paths[0].parent.name)
         )
         return ForeignDataset(
-            metadata=metadata,
-            splits={
-                split: Rereadable(partial(self._read_all, paths, metadata, options)) for split, paths in files.items()
-            },
-            notes=(f"Particle types have the meaning of the {options.family or self.family} family.", *notes, *named),
-            counts={
-                split: None if None in numbers else sum(n or 0 for n in numbers) for split, numbers in counts.items()
-            },
-            assumed=self.assumed,
+            metadata,
+            {split: partial(self._read_all, paths, metadata, options) for split, paths in files.items()},
+            (f"Particle types have the meaning of the {options.family or self.family} family.", *notes, *renamed),
+            {split: None if None in each else sum(number or 0 for number in each) for split, each in counts.items()},
+            self.assumed,
         )
 
     def _read_all(self, files: tuple[Path, ...], metadata: Metadata, options: Options) -> Iterator[Trajectory]:
@@ -200,21 +177,19 @@ class FileFormat(DatasetFormat):
 
 def split_files(path: Path, pattern: str) -> dict[str, tuple[Path, ...]]:
     """The files of each split, ordered by the numbers in their names; see `FileFormat`."""
+
+    def split_of(name: str) -> str | None:
+        return next((split for split in SPLITS if name.lower().startswith(split)), None)
+
+    def order(file: Path) -> tuple[list[int], str]:
+        return [int(digits) for digits in re.findall(r"\d{1,18}", file.name)], file.name
+
     if path.is_file():
-        return {split_name(path.name) or "test": (path,)} if path.match(pattern) else {}
+        return {split_of(path.name) or "test": (path,)} if path.match(pattern) else {}
     files = {split: list((path / split).glob(pattern)) for split in SPLITS}
     if not any(files.values()):
         beside = list(path.glob(pattern))
-        files = {split: [file for file in beside if split_name(file.name) == split] for split in SPLITS}
+        files = {split: [file for file in beside if split_of(file.name) == split] for split in SPLITS}
         if not any(files.values()):
-            files = {split_name(path.name) or "test": beside}
-    return {split: tuple(sorted(paths, key=_numbers)) for split, paths in files.items() if paths}
-
-
-def split_name(name: str) -> str | None:
-    """The split that a file's name begins with, or None: "test_sub.npz" means test."""
-    return next((split for split in SPLITS if name.lower().startswith(split)), None)
-
-
-def _numbers(path: Path) -> tuple[list[int], str]:
-    return [int(digits) for digits in re.findall(r"\d{1,18}", path.name)], path.name
+            files = {split_of(path.name) or "test": beside}
+    return {split: tuple(sorted(paths, key=order)) for split, paths in files.items() if paths}

@@ -11,7 +11,7 @@ import numpy as np
 
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
-from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Rereadable
+from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset
 from nmpm.data.format import SPLITS, Metadata, Trajectory, write_metadata, write_split
 from nmpm.data.statistics import (
     STATISTICS_KEYS,
@@ -29,16 +29,13 @@ MOVING_BOUNDARIES = "moving_boundaries"
 
 
 def write_native(source: ForeignDataset, destination: Path, problems: list[str] | None = None) -> tuple[str, ...]:
-    """Writes an opened dataset in the native layout.
+    """Writes an opened dataset into a folder that is new or empty, and returns notes for the user.
 
     Args:
         source: The dataset.
-        destination: A folder that does not exist yet, or is empty.
+        destination: The folder.
         problems: Collects what is wrong with trajectories; of each split those before the first that cannot be read
             are written. When left out, the first problem is raised.
-
-    Returns:
-        The source's notes, and those of the conversion.
 
     Raises:
         DataError: if the destination exists or cannot be written, or the source is damaged; nothing is left then.
@@ -62,7 +59,7 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
         for name in names:
             before = log.number
             try:
-                write_split(folder / f"{name}.h5", log.watch(source.splits[name], name, advance))
+                write_split(folder / f"{name}.h5", log.watch(source.splits[name](), name, advance))
             except DataError:
                 if not problems or log.number > before:
                     raise
@@ -161,12 +158,14 @@ def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDat
     return replace(
         source,
         metadata=replace(metadata, particle_types=types, static_types=static),
-        splits={name: Rereadable(partial(_renumber, split, ids, kept)) for name, split in source.splits.items()},
+        splits={name: partial(_renumber, start, ids, kept) for name, start in source.splits.items()},
     )
 
 
-def _renumber(split: Iterable[Trajectory], ids: Mapping[int, int], kept: Mapping[int, str]) -> Iterator[Trajectory]:
-    for trajectory in split:
+def _renumber(
+    start: Callable[[], Iterator[Trajectory]], ids: Mapping[int, int], kept: Mapping[int, str]
+) -> Iterator[Trajectory]:
+    for trajectory in start():
         old = trajectory.particle_type
         dropped = sorted(set(np.unique(old).tolist()) - set(kept))
         if dropped:

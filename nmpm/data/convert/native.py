@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, Rereadable
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options
 from nmpm.data.format import METADATA_FILE, Split, Trajectory, read_metadata, split_paths
 
 
@@ -28,11 +28,11 @@ class Native(DatasetFormat):
         )
         return ForeignDataset(
             metadata=metadata,
-            splits={name: Rereadable(partial(_trajectories, split)) for name, split in splits.items()},
+            splits={name: partial(_read, split) for name, split in splits.items()},
             notes=(note,) if options.family else (),
             counts={name: len(split) for name, split in splits.items()},
         )
 
 
-def _trajectories(split: Split) -> Iterator[Trajectory]:
+def _read(split: Split) -> Iterator[Trajectory]:
     return map(split.read_with_fields, range(len(split)))

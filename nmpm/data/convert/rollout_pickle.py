@@ -27,7 +27,11 @@ class RolloutPickle(FileFormat):
     pattern: ClassVar[str] = "*.pkl"
 
     def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
-        plain = _to_plain(_content(file)["metadata"], file)
+        stated = _content(file)["metadata"]
+        if not isinstance(stated, dict):
+            raise DataError(f"{file}: metadata must map keys to values; it is {type(stated).__name__}.")
+        numpy = np.ndarray | np.generic
+        plain = {key: value.tolist() if isinstance(value, numpy) else value for key, value in stated.items()}
         note = (
             "The true trajectories become the positions; the predictions are kept as the field predicted_rollout, with"
             " the initial positions in front."
@@ -54,10 +58,3 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not all(key in content for key in _NEEDED):
         raise DataError(f"{path}: a rollout is a dict of {', '.join(_NEEDED)}; this is something else.")
     return content
-
-
-def _to_plain(metadata: Any, path: Path) -> dict[str, Any]:
-    """The metadata with NumPy's arrays and numbers as Python's lists and numbers."""
-    if not isinstance(metadata, dict):
-        raise DataError(f"{path}: metadata must map keys to values; it is {type(metadata).__name__}.")
-    return {key: item.tolist() if isinstance(item, np.ndarray | np.generic) else item for key, item in metadata.items()}

@@ -51,16 +51,7 @@ def record_offsets(path: Path) -> list[int]:
 
 
 def read_record(path: Path, offset: int, index: int) -> SequenceExample:
-    """Reads the record at an offset.
-
-    Args:
-        path: The file.
-        offset: From `record_offsets`.
-        index: Index of the record, for error messages.
-
-    Raises:
-        DataError: if the record is damaged or not a SequenceExample.
-    """
+    """Reads the record at one of `record_offsets`; a DataError names its index if it is damaged."""
     with path.open("rb") as file:
         file.seek(offset)
         payload = file.read(_length(file, path, index, offset))

@@ -127,6 +127,8 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         findings += find_disagreements(statistics.result(), metadata.extra)
     stated = [metadata.extra.get(f"sequence_length_{name}") for name in splits]
     findings += notes_on_lengths(counts.frames, metadata, [length for length in stated if isinstance(length, int)])
+    if len(findings) > _MOST_FINDINGS:
+        findings = [*findings[:_MOST_FINDINGS], f"… and {len(findings) - _MOST_FINDINGS} more."]
     occupied, occupied_each = measured.occupied()
     fall = np.median(measured.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
     rests = [rest for rest in measured.rests if rest is not None]
@@ -153,7 +155,7 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
         restless=len(measured.rests) - len(rests),
         notes=tuple(_notes(source, data.source, measured, metadata)),
-        findings=tuple(_shorten(findings)),
+        findings=tuple(findings),
         channels={name: _describe_channels(name, field, metadata, materials) for name, field in facts.items()},
     )
 
@@ -225,8 +227,3 @@ def _notes(stated: FolderSource, source: FolderSource, measured: Measurements, m
     yield from measured.observed.notes(metadata)
     notes = metadata.extra.get("conversion")
     yield from [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
-
-
-def _shorten(findings: list[str]) -> list[str]:
-    more = len(findings) - _MOST_FINDINGS
-    return findings if more <= 0 else [*findings[:_MOST_FINDINGS], f"… and {more} more."]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import Extent, displacements, first_moving_particle
+from nmpm.data.statistics import Extent, displacements, first_moving_particle, first_outside
 from nmpm.scene import Interval
 
 CANDIDATES = (16, 32, 64, 128, 256, 512)
@@ -128,25 +128,18 @@ class Measurements:
 
 
 def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
-    """Yields the anomalies of one trajectory, as sentences that name trajectory, frame and particle.
+    """Yields the anomalies of one trajectory, as sentences that name `where`, frame and particle.
 
-    Args:
-        trajectory: Read from the dataset.
-        metadata: Of the dataset.
-        spacing: Typical distance between neighbours, in domain length.
-        where: Split and trajectory, to name in the sentences.
+    `spacing` is the typical distance between neighbours, in domain length.
     """
     types, position = trajectory.particle_type, trajectory.position
     moving = np.flatnonzero(metadata.is_moving(types))
-    if metadata.domain is not None:
-        lower, upper = np.asarray(metadata.domain).T
-        outside = (((position < lower) | (position > upper)) & ~np.asarray(metadata.periodic)).any(axis=-1)
-        if outside.any():
-            frame, particle = map(int, np.argwhere(outside)[0])
-            yield (
-                f"{where}, frame {frame}: particle {particle} is outside of the stated domain, at"
-                f" {position[frame, particle].round(5).tolist()}; {int(outside.any(axis=0).sum())} particles leave it."
-            )
+    if metadata.domain is not None and (outside := first_outside(position, metadata.domain, metadata.periodic)):
+        frame, particle, number = outside
+        yield (
+            f"{where}, frame {frame}: particle {particle} is outside of the stated domain, at"
+            f" {position[frame, particle].round(5).tolist()}; {number} particles leave it."
+        )
     change = np.linalg.norm(np.diff(displacements(position[:, moving], metadata), axis=0), axis=-1)
     far = change > _JUMP * spacing
     if far.any():

@@ -43,13 +43,7 @@ class RecordingProvider(Protocol):
 
 
 class MotionSampler:
-    """Draws windows with a probability proportional to the mean distance that their particles travel.
-
-    Args:
-        recordings: By index of the trajectory.
-        scene: Their scene.
-        length: Frames of a window.
-    """
+    """Draws windows of `length` frames in proportion to the mean distance that their particles travel."""
 
     def __init__(self, recordings: Mapping[int, Recording], scene: Scene, length: int) -> None:
         distances = {index: _window_distances(recording, scene, length) for index, recording in recordings.items()}
@@ -93,15 +87,10 @@ class _BufferContents:
 
 
 class TrajectoryBuffer:
-    """Endless batches of training windows, from trajectories in memory.
+    """Endless batches of training windows, from trajectories in memory on a device.
 
     While one buffer is in use, a thread reads the next: up to three times `plan.buffer_size` trajectories are in
     memory, however large the dataset is.
-
-    Args:
-        provider: The trajectories.
-        plan: Which windows make up which batch.
-        device: Where the buffer is stored and the windows are gathered.
 
     Raises:
         DataError: if a trajectory is shorter than a window.
@@ -112,12 +101,9 @@ class TrajectoryBuffer:
         self.provider, self.plan, self.device = provider, plan, device or torch.device("cpu")
 
     def batches(self, start: int = 0, rank: int = 0, world: int = 1) -> Iterator[Window]:
-        """Yields the batches of one of `world` ranks, from index `start` on.
+        """Yields the batches of one of `world` ranks, from index `start` on; a DataError if a trajectory does not fit.
 
         Closing the iterator stops its reading thread and waits for it.
-
-        Raises:
-            DataError: if a trajectory cannot be read or does not fit the scene.
         """
         plan = self.plan
         contents = self._load(plan.members(plan.locate(start, world)[0], rank, world), None)

@@ -22,8 +22,7 @@ class EvaluationLoader:
         recordings: The trajectories.
         batch_size: Trajectories per batch, at most.
         limit: Only the first `limit` trajectories; all when None.
-        rank: Index of this process.
-        world: Number of processes.
+        rank, world: Index of this process, and the number of processes.
         device: Where the batches are used; those for a GPU are in pinned memory.
 
     Raises:

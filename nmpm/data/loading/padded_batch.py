@@ -66,15 +66,10 @@ class PaddedRecordings:
         return replace(self, **tensors, fields={name: values.to(device) for name, values in self.fields.items()})
 
     def gather(self, rows: Sequence[int], starts: Sequence[int], length: int, particles: int | None = None) -> Window:
-        """Gathers consecutive frames of B recordings.
+        """Gathers `length` consecutive frames of B recordings, by their rows and first frames.
 
-        Args:
-            rows: Rows of the recordings.
-            starts: First frame of each. On the scene's periodic axes positions are unwrapped from there on, so that
-                differences between frames are displacements.
-            length: Frames of the window; each recording must have as many from its start on.
-            particles: Number to which the windows are padded, at least that of each; the largest recording's if left
-                out.
+        On the scene's periodic axes positions are unwrapped from the first frame on, so that differences between frames
+        are displacements. Windows are padded to a number of particles, the largest recording's if left out.
         """
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)

@@ -17,7 +17,7 @@ from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.statistics import first_moving_particle
+from nmpm.data.statistics import first_moving_particle, first_outside
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -76,7 +76,14 @@ class RecordingReader:
         self.metadata.check_types(types, where)
         moving = self.metadata.is_moving(types)
         static = self.metadata.is_static(types)
-        self._check_inside(trajectory, moving | static, where, first_frame)
+        if outside := first_outside(trajectory.position, self.scene.domain, self.scene.periodic, moving | static):
+            frame, particle, number = outside
+            raise DataError(
+                f"{where}: particle {particle} in frame {first_frame + frame} is at"
+                f" {trajectory.position[frame, particle].tolist()}, outside"
+                f" the domain {list(map(list, self.scene.domain))} ({number} particles leave"
+                " it). Set a `domain` in the metadata that contains all positions, or remove the trajectory."
+            )
         if not moving.any():
             raise DataError(f"{where}: no particle has a moving type; check static_types in the metadata.")
         self._materials(types[moving], where)
@@ -109,20 +116,6 @@ class RecordingReader:
             index[types == type_id] = self.scene.material_index(name)
         return index
 
-    def _check_inside(self, trajectory: Trajectory, present: np.ndarray, where: str, first_frame: int) -> None:
-        lower, upper = np.asarray(self.scene.domain, dtype=np.float32).T
-        walls = ~np.asarray(self.scene.periodic)  # on a periodic axis no position is outside
-        position = trajectory.position
-        outside = (((position < lower) | (position > upper)) & walls).any(axis=-1) & present
-        if outside.any():
-            frame, particle = map(int, np.argwhere(outside)[0])
-            raise DataError(
-                f"{where}: particle {particle} in frame {first_frame + frame} is at"
-                f" {position[frame, particle].tolist()}, outside"
-                f" the domain {list(map(list, self.scene.domain))} ({int(outside.any(axis=0).sum())} particles leave"
-                " it). Set a `domain` in the metadata that contains all positions, or remove the trajectory."
-            )
-
     def _check_static(self, trajectory: Trajectory, static: np.ndarray, where: str) -> None:
         particle = first_moving_particle(trajectory.position, static, self.scene.domain)
         if particle is not None:
@@ -142,11 +135,6 @@ class RecordingReader:
 
 class SplitRecordings(Sequence[Recording]):
     """The trajectories of a split as recordings, read and validated on access.
-
-    Args:
-        split: The file.
-        metadata: Names its type ids.
-        scene: The trajectories' scene.
 
     Raises:
         DataError: if file and scene differ in the number of axes.

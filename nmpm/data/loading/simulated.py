@@ -33,12 +33,7 @@ _GENERATE = frozenset(inspect.signature(catalog.ensure).parameters) - {"name"}
 
 @dataclass(frozen=True)
 class EmbeddedSource(DataSource):
-    """An embedded dataset, simulated on first use.
-
-    Args:
-        name: One of `nmpm.data.catalog.catalog()`.
-        generate: Keyword arguments of `nmpm.data.catalog.ensure`.
-    """
+    """A dataset of `nmpm.data.catalog`, simulated on first use; `generate` are keyword arguments of `ensure`."""
 
     name: str
     generate: dict[str, Any] = field(default_factory=dict)
@@ -99,12 +94,8 @@ class SimulatedSource(EmbeddedSource):
 class SimulatedRecordings:
     """Endless trajectories that a preset gives for a seed, simulated on request; nothing is written to disk.
 
-    Index i is always the same trajectory, so that a resumed training uses the same ones as an uninterrupted one.
-
-    Args:
-        preset: The family of scenes.
-        seed: The seeds of all trajectories are derived from it.
-        workers: Trajectories simulated at a time; one for each processor core when left out.
+    Index i is always the same trajectory, so that a resumed training uses the same ones as an uninterrupted one. So
+    many are simulated at a time as there are workers, by default processor cores.
     """
 
     def __init__(self, preset: Preset, seed: int = 0, workers: int | None = None) -> None:

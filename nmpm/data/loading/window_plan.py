@@ -45,19 +45,13 @@ class PlanStart:
 
 @dataclass(frozen=True)
 class WindowPlan:
-    """Assigns windows to batches.
+    """Assigns windows to batches. Arguments that are not listed are as for `TrajectoryDataModule`.
 
     Args:
         frames: Frames of each trajectory of the dataset.
         length: Frames of a window.
-        batch_size: Windows in a batch of one rank.
-        buffer_size: Trajectories in memory at a time; all of them where the dataset has no more.
-        passes: How often a buffer's windows are drawn, on average, before the next buffer.
-        seed: Seed of the order.
-        emphasis: Fraction of the windows that is drawn in proportion to the motion in them, in [0, 1].
         start: Where the batches of this size start, if there were batches of another size before.
-        bucket: Batches in a row whose windows are sorted by size; 1 for none.
-        openings: Fraction of the windows that is moved to one of the first `OPENING` frames of its trajectory.
+        bucket: `bucket_batches`.
 
     Raises:
         ConfigError: if a number is out of its range.
@@ -171,13 +165,7 @@ class WindowPlan:
         return range(low, min(low + self.bucket, first + count))
 
     def deal(self, bucket: range, windows: Sequence[T], sizes: Sequence[int]) -> list[list[T]]:
-        """The windows of a bucket's batches, of all ranks together, dealt to these batches by size.
-
-        Args:
-            bucket: From `bucket_of`.
-            windows: Of its batches, in order.
-            sizes: Number of particles of each.
-        """
+        """The windows of a bucket's batches, in order and of all ranks together, dealt to these batches by size."""
         share = len(windows) // len(bucket)
         if len(bucket) == 1:
             return [list(windows)]

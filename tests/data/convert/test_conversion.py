@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.data.convert import ForeignDataset, Options, Rereadable, convert
+from nmpm.data.convert import ForeignDataset, Options, convert
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.data.scene_inference import infer_scene
@@ -15,7 +15,7 @@ from tests.made_up import made_up_metadata, made_up_trajectory
 
 
 def source_of(*trajectories: Trajectory, **changes) -> ForeignDataset:
-    return ForeignDataset(made_up_metadata(**changes), {"train": Rereadable(lambda: iter(trajectories))})
+    return ForeignDataset(made_up_metadata(**changes), {"train": lambda: iter(trajectories)})
 
 
 def test_an_existing_destination_is_not_overwritten(tmp_path):
@@ -31,7 +31,7 @@ def test_an_error_leaves_no_files_or_is_collected(tmp_path):
         yield made_up_trajectory(5, 3)
         raise DataError("the second is damaged.")
 
-    source = ForeignDataset(made_up_metadata(), {"train": Rereadable(broken)})
+    source = ForeignDataset(made_up_metadata(), {"train": broken})
     with pytest.raises(DataError, match="second is damaged"):
         write_native(source, tmp_path / "out")
     assert not list(tmp_path.iterdir())
@@ -44,13 +44,13 @@ def test_an_error_leaves_no_files_or_is_collected(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from nmpm.data.convert import ForeignDataset, Rereadable
+from nmpm.data.convert import ForeignDataset
 from nmpm.data.convert.conversion import write_native
 from tests.made_up import made_up_metadata, made_up_trajectory
 def killed():
     yield made_up_trajectory(5, 3)
     os.kill(os.getpid(), signal.SIGKILL)
-write_native(ForeignDataset(made_up_metadata(), {"train": Rereadable(killed)}), Path(sys.argv[1]))
+write_native(ForeignDataset(made_up_metadata(), {"train": killed}), Path(sys.argv[1]))
 """
 
 
