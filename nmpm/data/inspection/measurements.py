@@ -135,10 +135,10 @@ def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, w
     types, position = trajectory.particle_type, trajectory.position
     moving = np.flatnonzero(metadata.is_moving(types))
     if metadata.domain is not None and (outside := first_outside(position, metadata.domain, metadata.periodic)):
-        frame, particle, number = outside
+        frame, particle, leaving = outside
         yield (
             f"{where}, frame {frame}: particle {particle} is outside of the stated domain, at"
-            f" {position[frame, particle].round(5).tolist()}; {number} particles leave it."
+            f" {position[frame, particle].round(5).tolist()}; {leaving} particles leave it."
         )
     change = np.linalg.norm(np.diff(displacements(position[:, moving], metadata), axis=0), axis=-1)
     far = change > _JUMP * spacing
