@@ -45,8 +45,8 @@ def run(words: list[str]) -> None:
         raise ConfigError(
             f"--trajectory {arguments.trajectory}: {arguments.file} contains trajectories 0 … {len(split) - 1}."
         )
-    for path in (picture, video):
-        check_output(path)
+    check_output(picture, (".png",))
+    check_output(video, (".gif", ".mp4"))
     trajectories = read_labelled(split, arguments.trajectory, arguments.family)
     for path in (write_snapshots(trajectories, picture), write_animation(trajectories, video)):
         sys.stdout.write(f"wrote {path}\n")

@@ -38,11 +38,10 @@ def run(words: list[str]) -> None:
     for name, path in (("FILE", arguments.file), ("TRUTH", arguments.truth)):
         if path is not None:
             check_input(name, path)
-    from nmpm.viz.output import check_output, check_suffix
+    from nmpm.viz.output import check_output
 
     out = arguments.out or arguments.file.with_suffix(".html")
-    check_suffix(out, (".html",), "a page")
-    check_output(out)
+    check_output(out, (".html",))
     from nmpm.viz.viewer import page_of_files
 
     truth_index = arguments.trajectory if arguments.truth_trajectory is None else arguments.truth_trajectory

@@ -15,9 +15,8 @@ Position errors barely notice a liquid that slowly loses its volume; height and 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,9 +31,8 @@ from nmpm.transfer import Linear, Nearest
 
 REVISION = 4
 """Increased whenever the same prediction gets other errors."""
-MOST_CROWDED = 0.05
-"""Share of the occupied cells that `Shape.peak_crowding` averages: the most crowded ones."""
 
+_MOST_CROWDED = 0.05  # of the occupied cells: those whose crowding is averaged
 _MOST_GAIN = 0.05  # of the initial energy: a prediction that gains more is unstable
 _CELL = 3.0  # particle spacings: side of the cells in which particles are counted
 _FIELD_FRAMES = 50  # at which fields are compared
@@ -46,10 +44,8 @@ class Measures:
 
     Args:
         horizons: Frames up to which the MSE is reported, beside the full rollout.
-        emd_frames: Evenly spaced frames at which the earth mover's distance is computed, the last among them; 0 for
-            none, as each takes half a second for 2,000 particles.
-        emd_particles: Particles of a material, drawn at random, that it matches; all when left out. Its cost grows with
-            their cube.
+        emd_frames: Evenly spaced frames at which the earth mover's distance is computed; 0 for none.
+        emd_particles: Particles of a material, drawn at random, that it matches; all when left out.
     """
 
     horizons: tuple[int, ...] = (8, 32, 100)
@@ -73,13 +69,13 @@ def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Me
     if measures.emd_frames:
         frames = _evenly_spaced(len(ours), measures.emd_frames)
         errors["emd"] = earth_mover_of_materials(ours[frames], theirs[frames], material, measures.emd_particles)
-    errors["kinetic"] = _kinetic_error(scene, window, ours, theirs)
+    kinetic, truth = (_energy(scene, *_path(window, positions))[0] for positions in (ours, theirs))
+    errors["kinetic"] = float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))
     if bool((window.gravity != 0).any()):
         grid, state = _counting_grid(scene), window.initial
         last = (predicted[:, -1], window.target[:, -1])
-        shape, other = (measure_shape(scene, grid, state, into_domain(scene, position)) for position in last)
-        relative = shape.relative_to(other)
-        errors |= {name: abs(relative[name] - 1) for name in ("height", "crowding")}
+        shape, right = (measure_shape(scene, grid, state, into_domain(scene, position)) for position in last)
+        errors |= {name: abs(float(shape[name] / right[name]) - 1) for name in ("height", "crowding")}
     return errors
 
 
@@ -130,11 +126,6 @@ def _counting_grid(scene: Scene) -> Grid:
     return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
 
 
-def _kinetic_error(scene: Scene, window: Window, ours: Tensor, theirs: Tensor) -> float:
-    kinetic, truth = (_energy(scene, *_path(window, positions))[0] for positions in (ours, theirs))
-    return float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))
-
-
 def _path(window: Window, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Positions (T + 2, N, D) from the window's first two frames on, materials and gravity of its moving particles."""
     moving = window.mask[0]
@@ -178,42 +169,19 @@ def _energy(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> tu
     return kinetic, kinetic - (((middle - floor) @ gravity) * share).sum(-1)
 
 
-@dataclass(frozen=True)
-class Shape:
-    """How high settled material stands, how many cells it occupies and how crowded these are, of B scenes at one frame.
-
-    Args:
-        height: (B,) mean height of the particles above the lowest bound, against gravity, in domain length.
-        occupied: (B,) cells that hold a particle.
-        crowding: (B,) particles per occupied cell.
-        peak_crowding: (B,) particles per cell in the most crowded twentieth of the occupied cells.
-    """
-
-    height: Tensor
-    occupied: Tensor
-    crowding: Tensor
-    peak_crowding: Tensor
-
-    @classmethod
-    def concatenate(cls, shapes: Sequence[Shape]) -> Self:
-        """The scenes of several ones."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: torch.cat([getattr(shape, name) for shape in shapes]) for name in names})
-
-    def relative_to(self, other: Shape) -> dict[str, float]:
-        """Each measure, summed over scenes, over that of another shape, by name."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return {name: float(getattr(self, name).sum() / getattr(other, name).sum()) for name in names}
-
-
-def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) -> Shape:
-    """The shape of each scene.
+def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) -> dict[str, Tensor]:
+    """How high the material of B scenes stands, how many cells it occupies and how crowded these are.
 
     Args:
         scene: Gives the bounds.
         grid: Whose cells are counted.
         state: Gives gravity, which must not be zero, and which particles are real.
         position: (B, N, D) in domain length, all finite.
+
+    Returns:
+        (B,) each: `height`, the mean above the lowest bound against gravity, in domain length; `occupied`, the cells
+        that hold a particle; `crowding`, the particles per occupied cell; `peak_crowding`, those per cell in the most
+        crowded twentieth of the occupied cells.
     """
     mask = state.mask.unsqueeze(-1)
     up = -torch.nn.functional.normalize(state.gravity, dim=-1)
@@ -224,11 +192,11 @@ def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) 
     counts = Nearest().p2g(mask.to(position.dtype), grid.to_cells(position), grid).flatten(1)
     occupied = (counts > 0).sum(1)
     ranked = counts.sort(dim=1, descending=True).values
-    kept = (MOST_CROWDED * occupied).ceil().clamp(min=1)
+    kept = (_MOST_CROWDED * occupied).ceil().clamp(min=1)
     first = torch.arange(ranked.shape[1], device=ranked.device) < kept.unsqueeze(1)
-    return Shape(
-        height=(heights * state.mask).sum(1) / real,
-        occupied=occupied.to(position.dtype),
-        crowding=real / occupied,
-        peak_crowding=(ranked * first).sum(1) / kept,
-    )
+    return {
+        "height": (heights * state.mask).sum(1) / real,
+        "occupied": occupied.to(position.dtype),
+        "crowding": real / occupied,
+        "peak_crowding": (ranked * first).sum(1) / kept,
+    }

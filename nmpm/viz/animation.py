@@ -7,9 +7,8 @@ for all frames, to avoid flicker.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import imageio.v2 as imageio
@@ -22,8 +21,8 @@ from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours
-from nmpm.viz.output import check_output, check_suffix, replace_picture
-from nmpm.viz.panel import PanelRenderer, format_distance, format_out_of_view, format_time
+from nmpm.viz.output import check_output, replace_picture
+from nmpm.viz.panel import PanelRenderer, format_time
 from nmpm.viz.trajectories import LabelledTrajectories
 
 PALETTE_SAMPLES = 5
@@ -68,22 +67,21 @@ class FrameRenderer:
         columns, rows = (1, count) if self._stacked else (count, 1)
         self._errors = trajectories.rms_errors()
         self._legend = material_colours(trajectories.materials) if len(trajectories.materials) > 1 else {}
-        self._font, self._bold_font = _load_font("DejaVuSans.ttf"), _load_font("DejaVuSans-Bold.ttf")
+        fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"  # those of the snapshots
+        self._font = ImageFont.truetype(fonts / "DejaVuSans.ttf", FONT_SIZE)
+        self._bold_font = ImageFont.truetype(fonts / "DejaVuSans-Bold.ttf", FONT_SIZE)
         self._title_height = LINE_HEIGHT if trajectories.title else 0
         panels_bottom = self._title_height + rows * (PANEL_HEADER + self._panel.height)
         self._footer_baseline = panels_bottom + 18
-        self.width = _round_up_to_even(MARGIN + columns * (self._panel.width + MARGIN))
+        width = MARGIN + columns * (self._panel.width + MARGIN)
+        self.width = width + width % 2
         # The legend takes a second footer line if it does not fit beside the time.
         time = self._text_width(self._time_text(trajectories.frame_count - 1)) + 2 * MARGIN + 20
         legend = sum(self._text_width(name) + LEGEND_DOT + 19 for name in self._legend)
         self._legend_height = LINE_HEIGHT if self._legend and time + legend > self.width else 0
-        self.height = _round_up_to_even(panels_bottom + FOOTER + self._legend_height)
+        height = panels_bottom + FOOTER + self._legend_height
+        self.height = height + height % 2
         self._template = self._draw_template()
-
-    @property
-    def colours(self) -> list[Rgb]:
-        """Colours of the materials and the obstacles."""
-        return [*material_colours(self.trajectories.materials).values(), OBSTACLE]
 
     def draw(self, frame: int) -> NDArray[np.uint8]:
         """Draws one frame of the trajectories, (height, width, 3)."""
@@ -92,11 +90,11 @@ class FrameRenderer:
         for index, (label, position) in enumerate(self.trajectories.positions.items()):
             left, top = self._corner(index)
             image.paste(Image.fromarray(self._panel.draw(position[frame])), (left, top))
-            notes = [format_out_of_view(self._panel.count_outside(position[frame]))]
+            outside = self._panel.count_outside(position[frame])
+            notes = [f"{outside} out of view"] if outside else []
             if label in self._errors:
                 notes.append(f"RMS error {format_distance(self.trajectories, self._errors[label][frame])}")
-            text = ", ".join(filter(None, notes))
-            draw.text((left + self._panel.width, top - 6), text, FAINT_TEXT, self._font, anchor="rs")
+            draw.text((left + self._panel.width, top - 6), ", ".join(notes), FAINT_TEXT, self._font, anchor="rs")
         draw.text((MARGIN, self._footer_baseline), self._time_text(frame), TEXT, self._font, anchor="ls")
         return np.asarray(image)
 
@@ -129,13 +127,13 @@ class FrameRenderer:
         return int(np.ceil(self._font.getlength(text)))
 
 
-def _load_font(name: str) -> ImageFont.FreeTypeFont:
-    # The font of the snapshots, which matplotlib ships.
-    return ImageFont.truetype(Path(mpl.get_data_path()) / "fonts" / "ttf" / name, FONT_SIZE)
-
-
-def _round_up_to_even(length: int) -> int:
-    return length + length % 2
+def format_distance(trajectories: LabelledTrajectories, length: float) -> str:
+    """A distance in domain length, rounded to about a thousandth of the box, with the same number of decimals for every
+    frame; in scientific notation from 100 box lengths on.
+    """
+    longest = max(high - low for low, high in trajectories.bounds)
+    decimals = max(0, 3 - math.floor(math.log10(longest)))
+    return f"{length:.{decimals}f}" if length < 100 * longest else f"{length:.1e}"
 
 
 class GifPalette:
@@ -197,12 +195,11 @@ def write_animation(
         DataError: if the file cannot be written; a missing or read-only folder is found before drawing.
     """
     path = Path(path)
-    write = _WRITERS[check_suffix(path, _WRITERS, "an animation")]
     if not 0 < fps <= 50:
         raise ConfigError(f"fps = {fps} must be above 0 and at most 50, the highest rate that viewers play.")
     if max_frames < 1 or not 64 <= side <= 4096:
         raise ConfigError(f"max_frames = {max_frames} must be at least 1, and side = {side} within 64 and 4096 pixels.")
-    check_output(path)
+    write = _write_mp4 if check_output(path, (".gif", ".mp4")) == ".mp4" else _write_gif
     frames = trajectories.evenly_spaced_frames(max_frames)
     renderer = FrameRenderer(trajectories, side)
     with replace_picture(path) as temporary:
@@ -221,7 +218,7 @@ def _draw_frames(renderer: FrameRenderer, frames: list[int]) -> Iterator[NDArray
 def _write_gif(renderer: FrameRenderer, frames: list[int], fps: float, path: Path) -> None:
     indices = np.linspace(0, len(frames) - 1, PALETTE_SAMPLES).astype(int)
     samples = [renderer.draw(frames[index]) for index in dict.fromkeys(indices.tolist())]
-    palette = GifPalette(samples, renderer.colours)
+    palette = GifPalette(samples, [*material_colours(renderer.trajectories.materials).values(), OBSTACLE])
     first, *rest = (palette.quantize(frame) for frame in _draw_frames(renderer, frames))
     frame_time = round(100 / fps) * 10
     durations = [frame_time] * len(rest) + [max(frame_time, round(LAST_FRAME_SECONDS * 1000))]
@@ -255,8 +252,3 @@ def _write_mp4(renderer: FrameRenderer, frames: list[int], fps: float, path: Pat
         raise OSError("the video encoder failed") from error
     if written < len(frames):
         raise OSError(f"the video encoder wrote {written} of {len(frames)} frames")
-
-
-_WRITERS: Mapping[str, Callable[[FrameRenderer, list[int], float, Path], None]] = MappingProxyType(
-    {".gif": _write_gif, ".mp4": _write_mp4}
-)

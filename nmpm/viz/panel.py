@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
-from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours, vary_brightness
+from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours, vary_brightness
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3
@@ -53,10 +53,14 @@ class PanelRenderer:
         self.width = width
         self.height = max(1, round(width * self.camera.height / self.camera.width))
         self._scale = SUPERSAMPLING * width / self.camera.width
-        self._disc = _disc_offsets(SUPERSAMPLING * self._diameter / 2)
+        spacing = particle_spacing(next(iter(trajectories.positions.values()))[0])
+        diameter = float(np.clip(DISC_DIAMETER * spacing * width / self.camera.width, *DIAMETER_LIMITS))
+        self._disc = _disc_offsets(SUPERSAMPLING * diameter / 2)
+        colours = material_colours(trajectories.materials)
+        materials = np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8)
         # Obstacles come first, so that material is drawn over them in 2-D.
         obstacles = np.tile(np.array(OBSTACLE, dtype=np.uint8), (len(trajectories.obstacles), 1))
-        self._colours = np.concatenate([obstacles, vary_brightness(self._colours_of_materials())])
+        self._colours = np.concatenate([obstacles, vary_brightness(materials)])
 
     def draw(self, position: Floats) -> NDArray[np.uint8]:
         """Draws one frame.
@@ -84,16 +88,6 @@ class PanelRenderer:
     def count_outside(self, position: Floats) -> int:
         """Counts the particles (N, D) outside of the window."""
         return int((~self._inside(self.camera.project(self.trajectories.wrap(position)))).sum())
-
-    @property
-    def _diameter(self) -> float:
-        spacing = particle_spacing(next(iter(self.trajectories.positions.values()))[0])
-        return float(np.clip(DISC_DIAMETER * spacing * self._scale / SUPERSAMPLING, *DIAMETER_LIMITS))
-
-    def _colours_of_materials(self) -> NDArray[np.uint8]:
-        colours = material_colours(self.trajectories.materials)
-        names, inverse = np.unique(self.trajectories.material, return_inverse=True)
-        return np.array([colours[name] for name in names.tolist()], dtype=np.uint8)[inverse]
 
     def _inside(self, projected: NDArray[np.float64]) -> NDArray[np.bool_]:
         right, up = projected[:, 0], projected[:, 1]
@@ -135,26 +129,20 @@ class PanelRenderer:
     def _background(self) -> NDArray[np.uint32]:
         image = Image.new("RGBA", (self.width * SUPERSAMPLING, self.height * SUPERSAMPLING), (*BACKGROUND, 255))
         draw = ImageDraw.Draw(image)
+        bounds = self.trajectories.bounds
         if self.trajectories.dim == 2:
-            self._paint_rectangle(draw, self.trajectories.outer_bounds, WALL)
-            self._paint_rectangle(draw, self.trajectories.bounds, INTERIOR)
+            for box, fill in ((self.trajectories.outer_bounds, WALL), (bounds, INTERIOR)):
+                (left, bottom), (right, top) = self._canvas_points(np.array(box).T)
+                draw.rectangle((left, top, right, bottom), (*fill, 255), (*EDGE, 255), SUPERSAMPLING)
         else:
-            self._paint_box(draw)
+            corners, vertical = box_corners(bounds), vertical_axis(self.trajectories)
+            points = self._canvas_points(corners)
+            floor = np.flatnonzero(corners[:, vertical] == bounds[vertical][0])[[0, 1, 3, 2]]
+            draw.polygon([points[corner] for corner in floor], fill=(*INTERIOR, 255))
+            for one in range(8):
+                for other in (one ^ 1, one ^ 2, one ^ 4):
+                    draw.line((points[one], points[other]), (*EDGE, 255), SUPERSAMPLING)
         return np.array(image).view(np.uint32)[..., 0]
-
-    def _paint_rectangle(self, draw: ImageDraw.ImageDraw, box: tuple[tuple[float, float], ...], fill: Rgb) -> None:
-        (left, bottom), (right, top) = self._canvas_points(np.array(box).T)
-        draw.rectangle((left, top, right, bottom), fill=(*fill, 255), outline=(*EDGE, 255), width=SUPERSAMPLING)
-
-    def _paint_box(self, draw: ImageDraw.ImageDraw) -> None:
-        corners = box_corners(self.trajectories.bounds)
-        points = self._canvas_points(corners)
-        vertical = vertical_axis(self.trajectories)
-        floor = np.flatnonzero(corners[:, vertical] == self.trajectories.bounds[vertical][0])[[0, 1, 3, 2]]
-        draw.polygon([points[corner] for corner in floor], fill=(*INTERIOR, 255))
-        for one in range(8):
-            for other in (one ^ 1, one ^ 2, one ^ 4):
-                draw.line((points[one], points[other]), fill=(*EDGE, 255), width=SUPERSAMPLING)
 
     def _canvas_points(self, points: NDArray[Any]) -> list[tuple[float, float]]:
         projected = self.camera.project(points) * self._scale
@@ -204,17 +192,3 @@ def format_time(trajectories: LabelledTrajectories, frame: int) -> str:
     longest = max(trajectories.frame_count - 1, 1) * trajectories.dt
     decimals = max(0, 2 - math.floor(math.log10(longest)))
     return f"{frame * trajectories.dt:.{decimals}f} s"
-
-
-def format_distance(trajectories: LabelledTrajectories, length: float) -> str:
-    """A distance in domain length, rounded to about a thousandth of the box, with the same number of decimals for every
-    frame; in scientific notation from 100 box lengths on.
-    """
-    longest = max(high - low for low, high in trajectories.bounds)
-    decimals = max(0, 3 - math.floor(math.log10(longest)))
-    return f"{length:.{decimals}f}" if length < 100 * longest else f"{length:.1e}"
-
-
-def format_out_of_view(count: int) -> str:
-    """States how many particles lie outside of the picture; empty for none."""
-    return f"{count} out of view" if count else ""

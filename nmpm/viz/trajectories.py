@@ -80,7 +80,7 @@ class LabelledTrajectories:
             obstacle: Static particles.
             title: Of the picture.
             fields: Further numbers of the particles.
-            gravity: Where scenes differ in it; the scene's when left out.
+            gravity: Where scenes differ in it.
         """
         return cls(
             positions,
@@ -146,7 +146,15 @@ class LabelledTrajectories:
     def rms_errors(self) -> dict[str, NDArray[np.float64]]:
         """Root mean square position error of each later trajectory against the first, (T,) in domain length."""
         reference, *others = self.positions
-        return {label: self._rms_distance(self.positions[reference], self.positions[label]) for label in others}
+        errors = {label: np.zeros(self.frame_count) for label in others}
+        for label, squares in errors.items():
+            for axis, period in enumerate(self.periods):
+                first = self.positions[reference][..., axis]
+                difference = self.positions[label][..., axis].astype(np.float64) - first
+                if period:
+                    difference -= period * np.round(difference / period)
+                squares += np.square(difference).mean(axis=1)
+        return {label: np.sqrt(squares) for label, squares in errors.items()}
 
     def wrap(self, position: Floats) -> Floats:
         """Wraps positions (..., D) into the box along the periodic axes."""
@@ -155,19 +163,10 @@ class LabelledTrajectories:
         low, high = np.array(self.bounds).T
         return np.where(self.periodic, low + np.mod(position - low, high - low), position)
 
-    def _rms_distance(self, reference: Floats, other: Floats) -> NDArray[np.float64]:
-        squares = np.zeros(self.frame_count)
-        for axis, period in enumerate(self.periods):
-            difference = other[..., axis].astype(np.float64) - reference[..., axis]
-            if period:
-                difference -= period * np.round(difference / period)
-            squares += np.square(difference).mean(axis=1)
-        return np.sqrt(squares)
-
     def _check_positions(self) -> None:
         if not self.positions:
             raise DataError("There is nothing to draw: `positions` is empty.")
-        shape = next(iter(self.positions.values())).shape
+        first, shape = next((label, position.shape) for label, position in self.positions.items())
         if len(shape) != 3 or shape[0] < 1 or shape[1] < 1 or shape[2] not in (2, 3):
             raise DataError(
                 f"Positions to draw have shape {shape}; expected (frames, particles, 2 or 3), none of them 0."
@@ -175,10 +174,10 @@ class LabelledTrajectories:
         for label, position in self.positions.items():
             if position.shape != shape:
                 raise DataError(
-                    f"Trajectory {label!r} has shape {position.shape}, but {next(iter(self.positions))!r} has {shape}: "
-                    "reduce both to the same frames and particles."
+                    f"Trajectory {label!r} has shape {position.shape}, but {first!r} has {shape}: reduce both to the"
+                    " same frames and particles."
                 )
-            _check_finite(position, label)
+            _check_finite(f"trajectory {label!r}", position)
         if self.material.shape != shape[1:2]:
             raise DataError(
                 f"Materials have shape {self.material.shape}, expected one name for each of {shape[1]} particles."
@@ -195,13 +194,7 @@ class LabelledTrajectories:
                         f"The field {name} of {label!r} has shape {values.shape}, expected {shape} (frames, particles)"
                         f" or (1, {shape[1]})."
                     )
-                finite = np.isfinite(values)
-                if not finite.all():
-                    frame, particle = (int(index) for index in np.argwhere(~finite)[0])
-                    raise DataError(
-                        f"The field {name} of {label!r} is {values[frame, particle]} for particle {particle} in frame"
-                        f" {frame}: only particles that do not move may lack a value. Correct the data."
-                    )
+                _check_finite(f"the field {name} of {label!r}", values)
 
     def _check_box(self) -> None:
         for name, box in {"bounds": self.bounds, "domain": self.outer_bounds}.items():
@@ -217,7 +210,7 @@ class LabelledTrajectories:
             raise DataError(f"dt = {self.dt} must be a positive number of seconds between frames.")
         if self.obstacles.ndim != 2 or self.obstacles.shape[1] != self.dim:
             raise DataError(f"Obstacles have shape {self.obstacles.shape}, expected (particles, {self.dim}).")
-        _check_finite(self.obstacles[None], "obstacle")
+        _check_finite("the obstacle", self.obstacles[None])
 
 
 def material_names(ids: ArrayLike, names: Mapping[int, str]) -> NDArray[np.str_]:
@@ -238,11 +231,12 @@ def material_names(ids: ArrayLike, names: Mapping[int, str]) -> NDArray[np.str_]
     return np.array([names[index] for index in unique.tolist()], dtype=np.str_)[inverse]
 
 
-def _check_finite(position: Floats, label: str) -> None:
-    finite = np.isfinite(position).all(axis=2)
+def _check_finite(what: str, values: Floats) -> None:
+    """Raise DataError for positions (T, N, D), or numbers (T, N), that are not finite."""
+    finite = np.isfinite(values if values.ndim == 3 else values[..., None]).all(axis=2)
     if not finite.all():
         frame, particle = (int(index) for index in np.argwhere(~finite)[0])
         raise DataError(
-            f"Trajectory {label!r}: particle {particle} is at {position[frame, particle].tolist()} in frame {frame}; "
-            f"{int((~finite).sum())} of its positions are not finite. Draw fewer frames, or correct the data."
+            f"In {what}, particle {particle} is at {values[frame, particle].tolist()} in frame {frame};"
+            f" {int((~finite).sum())} of the values are not finite. Draw fewer frames, or correct the data."
         )

@@ -30,14 +30,11 @@ def test_all_figures_of_a_table_are_in_one_unit(scale, unit, figures):
     ("value", "text"),
     [
         (5.78, "5780 ×10⁻³"),
-        (57.8, "57.8"),
         (1.64e-4, "0.164 ×10⁻³"),
-        (5780.0, "5.78 ×10³"),
         (0.9996, "1000 ×10⁻³"),
         (1e-9, "1 ×10⁻⁹"),
         (0.0, "0 ×10⁻³"),
         (float("nan"), "nan ×10⁻³"),
-        (float("inf"), "inf ×10⁻³"),
     ],
 )
 def test_a_line_names_its_unit(value, text):

@@ -1,13 +1,10 @@
 """Snapshots and animations as files, and `nmpm render`, which writes both."""
 
 import dataclasses
-import errno
 import importlib.util
 import json
-import os
 import resource
 import sys
-import tempfile
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -24,7 +21,7 @@ from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.viz import write_animation, write_snapshots
-from nmpm.viz.animation import PALETTE_SIZE, FrameRenderer, GifPalette
+from nmpm.viz.animation import FrameRenderer, GifPalette
 from nmpm.viz.colours import BACKGROUND, INTERIOR, WALL, material_colours
 from nmpm.viz.panel import PanelRenderer
 
@@ -58,15 +55,15 @@ def water_in(image, top, bottom=0):
 
 def test_the_size_of_snapshots_follows_from_columns_and_rows(falling, tmp_path):
     settings = dict(mpl.rcParams)
+    one = pixels(write_snapshots(falling, tmp_path / "1.png", columns=1))
     three = pixels(write_snapshots(falling, tmp_path / "3.png", columns=3))
-    six = pixels(write_snapshots(falling, tmp_path / "6.png", columns=6))
     alone = dataclasses.replace(falling, positions={"simulation": falling.positions["simulation"]})
-    one_row = pixels(write_snapshots(alone, tmp_path / "1.png", columns=3))
-    assert six.shape[0] == three.shape[0] > one_row.shape[0] + 330
-    assert six.shape[1] - three.shape[1] == 3 * (330 + 12)
+    one_row = pixels(write_snapshots(alone, tmp_path / "row.png", columns=3))
+    assert three.shape[0] == one.shape[0] > one_row.shape[0] + 330
+    assert three.shape[1] - one.shape[1] == 2 * (330 + 12)
     assert one_row.shape[1] == three.shape[1]
     assert dict(mpl.rcParams) == settings
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["1.png", "3.png", "6.png"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["1.png", "3.png", "row.png"]
 
 
 def test_snapshots_run_from_left_to_right_with_the_prediction_below(falling, tmp_path):
@@ -78,16 +75,13 @@ def test_snapshots_run_from_left_to_right_with_the_prediction_below(falling, tmp
     assert rows[gap + 1] - rows[0] == 330 + 12
 
 
-def test_one_frame_or_three_dimensions_are_drawn(still, tmp_path):
-    image = pixels(write_snapshots(still([[0.5, 0.5, 0.5]], ["water"]), tmp_path / "three.png", columns=4))
-    assert (image[..., 2].astype(int) - image[..., 0] > 60).any()
-    assert len(frames_of(write_animation(still([[0.5, 0.5]], ["water"]), tmp_path / "one.gif", side=100))) == 1
-
-
 def test_the_gif_shows_the_drawn_frames(falling, tmp_path):
     """No pixels remain from earlier frames, and colours are close to those drawn."""
     renderer = FrameRenderer(falling, 160)
-    shown = frames_of(write_animation(falling, tmp_path / "a.gif", side=160))
+    path = write_animation(falling, tmp_path / "a.gif", side=160, fps=25)
+    with Image.open(path) as file:
+        assert [frame.info["duration"] for frame in ImageSequence.Iterator(file)] == [40] * 10 + [1000]
+    shown = frames_of(path)
     assert len(shown) == falling.frame_count
     for frame, image in enumerate(shown):
         drawn = renderer.draw(frame)
@@ -97,24 +91,6 @@ def test_the_gif_shows_the_drawn_frames(falling, tmp_path):
     _, columns = water_in(renderer.draw(5), top=0, bottom=30)
     assert columns.min() < renderer.width // 2 < columns.max()  # truth is left and prediction right
     assert (renderer.draw(0) != renderer.draw(1))[60 : renderer.height - 40].any()
-
-
-def test_identical_frames_are_kept(falling, tmp_path):
-    still = np.repeat(falling.positions["simulation"][:1], 6, axis=0)
-    rest = dataclasses.replace(falling, positions={"simulation": still})
-    assert len(frames_of(write_animation(rest, tmp_path / "rest.gif", side=100))) == 6
-
-
-def test_wide_boxes_are_stacked(falling):
-    wide = dataclasses.replace(falling, bounds=((0, 4), (0, 1)), domain=None)
-    one = dataclasses.replace(wide, positions={"simulation": wide.positions["simulation"]})
-    assert FrameRenderer(wide, 160).width == FrameRenderer(one, 160).width
-    assert FrameRenderer(wide, 160).height > FrameRenderer(one, 160).height
-
-
-def test_frame_durations_follow_fps_and_the_last_frame_is_held(falling, tmp_path):
-    with Image.open(write_animation(falling, tmp_path / "a.gif", side=100, fps=25, max_frames=3)) as file:
-        assert [frame.info["duration"] for frame in ImageSequence.Iterator(file)] == [40, 40, 1000]
 
 
 @needs_ffmpeg
@@ -129,8 +105,6 @@ def test_the_palette_keeps_fixed_colours_and_rare_materials_exact():
     frame[:20], frame[:3], frame[30, 30] = INTERIOR, WALL, WATER
     shown = np.asarray(GifPalette([frame], [WATER]).quantize(frame).convert("RGB"))
     np.testing.assert_array_equal(shown, frame)
-    noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), dtype=np.uint8)
-    assert np.asarray(GifPalette([noise]).quantize(noise)).max() < PALETTE_SIZE - 1  # the transparent entry
 
 
 @pytest.mark.parametrize(
@@ -138,9 +112,7 @@ def test_the_palette_keeps_fixed_colours_and_rare_materials_exact():
     [
         (write_animation, "a.avi", {}, r"\.gif or \.mp4"),
         (write_animation, "a.gif", {"fps": float("nan")}, "fps"),
-        (write_animation, "a.gif", {"max_frames": 0}, "max_frames"),
         (write_animation, "a.gif", {"side": 3}, "side"),
-        (write_snapshots, "a.bmp", {}, r"a\.bmp.*\.png"),
         (write_snapshots, "a.png", {"columns": 0}, "columns = 0"),
     ],
 )
@@ -156,15 +128,6 @@ def test_an_unusable_path_is_reported_before_drawing(falling, tmp_path, monkeypa
     (tmp_path / name).mkdir()
     with pytest.raises(DataError, match="is a folder"):
         write(falling, tmp_path / name)
-    with pytest.raises(DataError, match=r"missing does not exist"):
-        write(falling, tmp_path / "missing" / name)
-
-    def fail(**_):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", fail)  # permission bits do not stop root
-    with pytest.raises(DataError, match=r"not writable \(Read-only file system\)"):
-        write(falling, tmp_path / f"b{name}")
 
 
 @pytest.mark.parametrize(("write", "name"), FORMATS)
@@ -206,8 +169,7 @@ def test_a_failing_encoder_is_reported(falling, tmp_path, monkeypatch):
     assert not (tmp_path / "a.mp4").exists()
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_non_finite_frame_ends_the_drawing_with_a_title(falling, bad):
+def test_a_non_finite_frame_ends_the_drawing_with_a_title(falling):
     scene = Scene(falling.bounds, falling.domain, falling.dt, materials=("water", "sand"), particle_volume=1e-4)
     truth = torch.tensor(falling.positions["simulation"]).float()[None]
     none = torch.zeros(1, 0, 2)
@@ -220,7 +182,7 @@ def test_a_non_finite_frame_ends_the_drawing_with_a_title(falling, bad):
         gravity=torch.zeros(1, 2),
     )
     predicted = truth[:, 2:].clone()
-    predicted[0, 4:, 1, 0] = bad
+    predicted[0, 4:, 1, 0] = float("nan")
     trajectories = labelled_trajectories(scene, window, predicted)
     assert trajectories.frame_count == 6
     assert trajectories.title == "The prediction is not finite from frame 6 on"

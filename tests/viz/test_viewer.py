@@ -6,8 +6,6 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from nmpm import view
 from nmpm.cli import main
@@ -28,12 +26,11 @@ def description(page) -> dict:
     return json.loads(re.search(r'type="application/json">(.*?)</script>', page.html, re.DOTALL)[1])
 
 
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(1, 9), st.sampled_from([2, 3]))
-def test_positions_come_back_within_half_a_step(seed, frames, count, dim):
-    rng = np.random.default_rng(seed)
-    low, high = np.sort(rng.normal(scale=10, size=(2, dim)), axis=0) + np.array([[-1e-3], [1e-3]])
-    position = rng.uniform(low, high, size=(frames, count, dim))
+@pytest.mark.parametrize("shape", [(1, 1, 2), (6, 9, 3)])
+def test_positions_come_back_within_half_a_step(shape):
+    rng = np.random.default_rng(0)
+    low, high = np.sort(rng.normal(scale=10, size=(2, shape[-1])), axis=0) + np.array([[-1e-3], [1e-3]])
+    position = rng.uniform(low, high, size=shape)
     steps = unpack(pack_positions(quantize(position, low, high)), position.shape)
     assert np.all(np.abs(low + steps * (high - low) / STEPS - position) <= 0.5001 * (high - low) / STEPS)
 
@@ -49,19 +46,15 @@ def test_the_page_describes_frames_box_and_errors(falling):
         view(falling, every=0)
 
 
-def test_the_page_loads_nothing_from_elsewhere_and_notebooks_show_it_in_a_frame(falling):
-    page = view(falling)
-    assert not re.findall(r"""(?:src|href)=|url\(|https?://|import\(""", page.html)
-    assert page._repr_html_().startswith("<iframe srcdoc=")
-    assert 'sandbox="allow-scripts"' in page._repr_html_()
-
-
 def test_names_cannot_leave_the_data():
     hostile = "</script><script>alert(1)</script>"
     trajectories = LabelledTrajectories(
         {hostile: np.full((2, 1, 2), 0.5)}, np.array([hostile]), bounds=((0, 1), (0, 1)), dt=1.0, title=hostile
     )
     page = view(trajectories)
+    assert not re.findall(r"""(?:src|href)=|url\(|https?://|import\(""", page.html)  # nothing is loaded from elsewhere
+    assert page._repr_html_().startswith("<iframe srcdoc=")
+    assert 'sandbox="allow-scripts"' in page._repr_html_()
     assert "alert(1)</script>" not in page.html
     assert description(page)["title"] == hostile
     assert "<script>alert" not in page._repr_html_()
@@ -136,9 +129,7 @@ def test_view_compares_with_the_truth_over_common_frames(dataset, capsys):
     [
         (["view", "out.h5", "test.h5"], "do not start at the same positions"),
         (["view", "fewer.h5", "test.h5"], "5 moving ones in 2-D, and 4"),
-        (["view", "nowhere.h5"], "nowhere.h5"),
         (["view", "out.h5", "--out", "page.png"], "must end in .html"),
-        (["view", "out.h5", "--out", "missing/page.html"], "missing"),
         (["view", "out.h5", "--every", "0"], "--every 0"),
         (["view", "out.h5", "--trajectory", "3"], "trajectories 0 … 0"),
     ],

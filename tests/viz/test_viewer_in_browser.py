@@ -131,15 +131,3 @@ def test_particles_have_the_colours_of_their_fields(open_page):
         rgb = [int(expected[at : at + 2], 16) for at in (1, 3, 5)]
         assert np.any(np.abs(left - rgb).sum(axis=2) < 12)
         assert np.any(np.abs(right - WATER).sum(axis=2) < 40)  # the prediction has no temperature
-
-
-@pytest.mark.slow
-def test_a_single_trajectory_has_an_arrow_for_gravity_and_no_error(open_page):
-    alone = one_particle()
-    shown = {"recorded": alone.positions["simulated"]}
-    page = open_page(LabelledTrajectories(shown, alone.material, alone.bounds, 0.01, gravity=(9.81, 0.0)))
-    assert page.locator("#errors").is_hidden()
-    assert page.locator("#layout-choice").is_hidden()
-    assert page.locator("#colour option").count() == 2
-    (arrow,) = page.locator("#labels small i").all()
-    assert arrow.evaluate("arrow => arrow.style.transform") == "rotate(-1.5708rad)"  # from down to the right

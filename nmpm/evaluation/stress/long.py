@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.emulator.rollouts import stream
-from nmpm.evaluation.prediction_errors import Shape, measure_shape
+from nmpm.evaluation.prediction_errors import measure_shape
 from nmpm.evaluation.stress.model import ModelUnderTest, simulate_beside, simulate_window
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, filled_volume, trace_rollout
-from nmpm.particles import Particles, Window
-from nmpm.sim import Preset
+from nmpm.particles import Particles
 from nmpm.sim.predictability import twin_of
 
 MAX_DRIFT = 0.1
@@ -29,9 +28,6 @@ PROBE = 200
 
 MAX_DEVIATION = 0.05
 """Share by which height, occupied cells and crowding may differ from the simulator's."""
-
-Shapes = dict[int, list[Shape]]
-"""Shapes by frame, one for each window."""
 
 _LONG, _SETTLING = "long", "settling"
 _NEEDS = f"height, occupied cells and crowding within {MAX_DEVIATION:.0%} of the simulator's"
@@ -53,16 +49,10 @@ def energy_and_rest(model: ModelUnderTest, effort: Effort) -> Iterator[TestResul
     yield TestResult(
         _LONG, f"{effort.horizons} training horizons ({frames} frames)", long.valid, long.figures(), INVARIANTS, curves
     )  # fmt: skip
-    yield _failure(long)
+    steps = long.steps_to_failure()
+    figures = {"least": min(steps), "median": statistics.median(steps), "most": max(steps), "of": frames}
+    yield TestResult(_LONG, "steps to failure (one more than all: none)", None, figures)
     yield from _settled_results(model, long, state, effort)
-
-
-def _failure(trace: Trace) -> TestResult:
-    """The first frames at which an invariant breaks."""
-    steps = trace.steps_to_failure()
-    numbers = {"least": min(steps), "median": statistics.median(steps), "most": max(steps), "of": trace.frames}
-    figures = {name: float(value) for name, value in numbers.items()}
-    return TestResult(_LONG, "steps to failure (one more than all: none)", None, figures)
 
 
 def _settled_results(model: ModelUnderTest, trace: Trace, state: Particles, effort: Effort) -> Iterator[TestResult]:
@@ -121,64 +111,38 @@ def settling(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
     Constraints freeze particles that hardly move, so that a test of resting material alone would test them, not the
     network. Each figure is reported beside that of the simulator's twin, which shows the simulator's own scatter.
     """
-    if model.preset is None or not model.emulator.scene.gravity_known:
+    preset = model.preset
+    if preset is None or not model.emulator.scene.gravity_known:
         yield TestResult(_SETTLING, "shape beside the simulator: there is none, or gravity is unknown", None, {})
         return
     forms = {"with constraints": model.emulator, "without constraints": model.emulator.unconstrained()}
     if forms["with constraints"].constraints == forms["without constraints"].constraints:
         del forms["with constraints"]
-    frames = [round(multiple * model.preset.frames) for multiple in effort.settling_multiples]
-    twin, *others = _compare(model, model.preset, list(forms.values()), frames, effort.settling_scenes)
-    for name, ratios in zip(forms, others, strict=True):
-        yield _shape_result(name, ratios, twin)
+    frames = [round(multiple * preset.frames) for multiple in effort.settling_multiples]
+    totals: dict[str, dict[str, float]] = {name: {} for name in ("simulator", "twin", *forms)}
+    for truth, twin in simulate_beside(model, preset, effort.settling_scenes, max(frames), [twin_of(preset)]):
+        paths = {"simulator": truth.target[:, [frame - 1 for frame in frames]]}
+        paths["twin"] = twin.target[:, [frame - 1 for frame in frames]]
+        paths |= {name: _predict_frames(emulator, truth.initial, frames) for name, emulator in forms.items()}
+        for name, path in paths.items():
+            for frame, position in zip(frames, path.unbind(1), strict=True):
+                shape = measure_shape(model.emulator.scene, model.emulator.grid, truth.initial, position)
+                for what, value in shape.items():
+                    key = f"{what}_at_{frame}"
+                    totals[name][key] = totals[name].get(key, 0.0) + float(value)
+    simulated = totals.pop("simulator")
+    ratios = {name: {key: total / simulated[key] for key, total in sums.items()} for name, sums in totals.items()}
+    beside = {f"twin_{key}": value for key, value in ratios["twin"].items()}
+    for name in forms:
+        worst = max(abs(value - 1) for value in ratios[name].values())
+        title = f"shape beside the simulator, {name}"
+        yield TestResult(_SETTLING, title, worst <= MAX_DEVIATION, ratios[name] | beside, _NEEDS)
 
 
-def _compare(
-    model: ModelUnderTest, preset: Preset, emulators: Sequence[Emulator], frames: Sequence[int], scenes: int
-) -> list[dict[int, dict[str, float]]]:
-    """Measures of the twin and of each emulator over the simulator's, scene by scene, as long ones take memory."""
-    collected: list[Shapes] = [{frame: [] for frame in frames} for _ in range(len(emulators) + 2)]
-    for truth, twin in simulate_beside(model, preset, scenes, max(frames), [twin_of(preset)]):
-        shapes = [recorded_shapes(model.emulator, window, frames) for window in (truth, twin)]
-        shapes += [predicted_shapes(emulator, truth.initial, frames) for emulator in emulators]
-        for all_scenes, scene in zip(collected, shapes, strict=True):
-            for frame in frames:
-                all_scenes[frame] += scene[frame]
-    simulated, *others = collected
-    return [shape_ratios(other, simulated) for other in others]
-
-
-def recorded_shapes(emulator: Emulator, window: Window, frames: Sequence[int]) -> Shapes:
-    """The shapes of a window's trajectories at frames, which count from 1, on an emulator's grid."""
-    return {frame: [_shape(emulator, window.initial, window.target[:, frame - 1])] for frame in frames}
-
-
-def predicted_shapes(emulator: Emulator, state: Particles, frames: Sequence[int]) -> Shapes:
-    """The shapes of a rollout at frames, which count from 1; only one bundle is kept at a time."""
-    shapes, made = {}, 0
+def _predict_frames(emulator: Emulator, state: Particles, frames: Sequence[int]) -> Tensor:
+    """Positions (B, F, N, D) of a rollout at frames, which count from 1; only one bundle is kept at a time."""
+    kept, made = [], 0
     for bundle in stream(emulator, state, max(frames)):
-        for frame in frames:
-            if made < frame <= made + bundle.shape[1]:
-                shapes[frame] = [_shape(emulator, state, bundle[:, frame - made - 1])]
+        kept += [bundle[:, frame - made - 1] for frame in frames if made < frame <= made + bundle.shape[1]]
         made += bundle.shape[1]
-    return shapes
-
-
-def _shape(emulator: Emulator, state: Particles, position: Tensor) -> Shape:
-    return measure_shape(emulator.scene, emulator.grid, state, position)
-
-
-def shape_ratios(these: Shapes, those: Shapes) -> dict[int, dict[str, float]]:
-    """Measures of some shapes over those of others, by frame and name."""
-    return {
-        frame: Shape.concatenate(shapes).relative_to(Shape.concatenate(those[frame])) for frame, shapes in these.items()
-    }
-
-
-def _shape_result(
-    name: str, ratios: Mapping[int, Mapping[str, float]], twin: Mapping[int, Mapping[str, float]]
-) -> TestResult:
-    figures = {f"{what}_at_{frame}": value for frame, row in ratios.items() for what, value in row.items()}
-    worst = max(abs(value - 1) for value in figures.values())
-    figures |= {f"twin_{what}_at_{frame}": value for frame, row in twin.items() for what, value in row.items()}
-    return TestResult(_SETTLING, f"shape beside the simulator, {name}", worst <= MAX_DEVIATION, figures, _NEEDS)
+    return torch.stack(kept, dim=1)

@@ -28,7 +28,7 @@ NUDGE = 1e-6
 
 NON_FINITE = (math.nan, math.inf, -math.inf)
 
-_PRECISION, _POISON = "precision and sensitivity", "poison"
+_PRECISION = "precision and sensitivity"
 
 
 def precision(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
@@ -126,49 +126,41 @@ def _at(model: ModelUnderTest, distance: Tensor, nudged: Tensor) -> dict[str, fl
 
 def poison(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:  # noqa: ARG001 (all groups share a signature)
     """NaN and infinity in a particle, a frame, a weight, a statistic."""
-    yield _rejection("a position that is not finite", partial(_particle, model, "position"))
-    yield _rejection("a velocity that is not finite", partial(_particle, model, "velocity"))
-    yield _rejection("a trajectory with a frame that is not finite", partial(_frame, model))
-    if any(True for _ in model.emulator.processor.parameters()):
-        yield _rejection("a weight that is not finite", partial(_weight, model))
-    yield _rejection("a statistic that is not finite", partial(_statistic, model))
+    emulator, state = model.emulator, model.starts(1)
 
+    def run_particles(what: str, bad: float) -> None:
+        values = getattr(state, what).clone()
+        values[0, 0, 0] = bad
+        rollout(emulator, dataclasses.replace(state, **{what: values}), 1)
 
-def _rejection(name: str, attempt: Callable[[float], object]) -> TestResult:
-    passed = 0
-    for bad in NON_FINITE:
-        try:
-            attempt(bad)
-        except DataError:
-            passed += 1
-    return TestResult(
-        _POISON, name, passed == len(NON_FINITE), {"refused": passed, "of": len(NON_FINITE)}, "rejected by name"
-    )
+    def make_trajectory(bad: float) -> None:
+        position = np.full((4, 2, emulator.scene.dim), 0.5, np.float32)
+        position[2, 1, 0] = bad
+        Trajectory(position, np.zeros(2, np.int64))
 
+    def run_emulator(choose: Callable[[Emulator], Tensor], bad: float) -> None:
+        changed = copy.deepcopy(emulator)
+        values = choose(changed).data
+        values[(0,) * values.dim()] = bad
+        rollout(changed, state, 1)
 
-def _particle(model: ModelUnderTest, what: str, bad: float) -> object:
-    state = model.starts(1)
-    values = getattr(state, what).clone()
-    values[0, 0, 0] = bad
-    return rollout(model.emulator, dataclasses.replace(state, **{what: values}), 1)
-
-
-def _frame(model: ModelUnderTest, bad: float) -> object:
-    position = np.full((4, 2, model.emulator.scene.dim), 0.5, np.float32)
-    position[2, 1, 0] = bad
-    return Trajectory(position, np.zeros(2, np.int64))
-
-
-def _weight(model: ModelUnderTest, bad: float) -> object:
-    return _with_non_finite(model, lambda emulator: next(iter(emulator.processor.parameters())), bad)
-
-
-def _statistic(model: ModelUnderTest, bad: float) -> object:
-    return _with_non_finite(model, lambda emulator: emulator.output_scale, bad)
-
-
-def _with_non_finite(model: ModelUnderTest, choose: Callable[..., Tensor], bad: float) -> object:
-    emulator = copy.deepcopy(model.emulator)
-    values = choose(emulator).data
-    values[(0,) * values.dim()] = bad
-    return rollout(emulator, model.starts(1), 1)
+    attempts: dict[str, Callable[[float], None]] = {
+        "a position": partial(run_particles, "position"),
+        "a velocity": partial(run_particles, "velocity"),
+        "a trajectory with a frame": make_trajectory,
+        "a weight": partial(run_emulator, lambda changed: next(changed.processor.parameters())),
+        "a statistic": partial(run_emulator, lambda changed: changed.output_scale),
+    }
+    if not any(True for _ in emulator.processor.parameters()):
+        del attempts["a weight"]
+    for name, attempt in attempts.items():
+        refused = 0
+        for bad in NON_FINITE:
+            try:
+                attempt(bad)
+            except DataError:
+                refused += 1
+        yield TestResult(
+            "poison", f"{name} that is not finite", refused == len(NON_FINITE),
+            {"refused": refused, "of": len(NON_FINITE)}, "rejected by name",
+        )  # fmt: skip

@@ -55,7 +55,7 @@ def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Stor
     """The points of all choices; what the store has is not measured again.
 
     Args:
-        choices: Of `make_choices`; times are compared with the first.
+        choices: Of `make_choices`.
         scenes: What is predicted.
         sweep: Measures and timing.
         store: Keeps everything as soon as it is measured.
@@ -134,7 +134,7 @@ class _Runner:
     Args:
         choice: What is timed.
         key: Of its times in the store.
-        stored: Milliseconds by round, beside those of the reference; the memory; why it failed.
+        stored: Milliseconds by round; the memory; why it failed.
         warm: Whether it has run before.
     """
 
@@ -148,38 +148,30 @@ def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, sto
     """The times of all choices; those that lack a round take turns in it, in an order that changes.
 
     Args:
-        choices: What to time; ratios of times are over the first, which is timed in each of these rounds.
+        choices: What to time.
         scenes: What is predicted: round r predicts scene r, and the next ones where a choice takes several at once.
         timing: Rounds and frames.
-        store: Keeps each round's times as soon as the round is complete.
+        store: Keeps each time as soon as it is measured.
         step: Called after each run.
     """
     keys = [_times_key(choice, scenes, timing) for choice in choices]
     runners: dict[str, _Runner] = {}  # one for choices that are the same, such as the twin and that many substeps
     for choice, key in zip(choices, keys, strict=True):
         runners.setdefault(digest(key), _Runner(choice, key, store.read("times", key)))
-    reference = next(iter(runners.values()))
     for turn in range(timing.rounds):
         missing = [r for r in runners.values() if str(turn) not in r.stored and "failed" not in r.stored]
-        timed = list(dict.fromkeys([reference, *missing])) if missing else []
-        shift = turn % max(1, len(timed))
-        spent: dict[_Runner, float | None] = {}
-        for runner in timed[shift:] + timed[:shift]:
-            spent[runner] = _time_one(runner, scenes, turn, timing)
-            step(_TIMES)
-        for runner in missing:
-            if spent[runner] is not None:
-                runner.stored[str(turn)] = [spent[runner], spent[reference]]
+        shift = turn % max(1, len(missing))
+        for runner in missing[shift:] + missing[:shift]:
+            _time_one(runner, scenes, turn, timing)
             store.write("times", runner.key, runner.stored)
-        step(_TIMES, len(choices) - len(timed))
+            step(_TIMES)
+        step(_TIMES, len(choices) - len(missing))
     return [_times(runners[digest(key)], timing) for key in keys]
 
 
 def _times(runner: _Runner, timing: Timing) -> Times:
-    rounds = [runner.stored[str(turn)] for turn in range(timing.rounds) if str(turn) in runner.stored]
     return Times(
-        milliseconds=tuple(spent for spent, _ in rounds),
-        ratios=tuple(spent / reference for spent, reference in rounds if reference),
+        milliseconds=tuple(runner.stored[str(turn)] for turn in range(timing.rounds) if str(turn) in runner.stored),
         memory=runner.stored.get("memory"),
         clock=runner.key["clock"],
         hardware=runner.key["hardware"],
@@ -199,10 +191,10 @@ def _times_key(choice: Choice, scenes: Scenes, timing: Timing) -> dict[str, Any]
     }
 
 
-def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> float | None:
-    """Milliseconds per computed frame and scene, with one thread of torch; None where the choice fails.
+def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> None:
+    """Put down the milliseconds per computed frame and scene, with one thread of torch, or why the choice fails.
 
-    The failure is stored, but where the machine fails the error is raised, so that the round is repeated later.
+    Where the machine fails the error is raised, so that the round is repeated later.
     """
     choice = runner.choice
     indices = [(turn + offset) % len(scenes) for offset in range(choice.batch)]
@@ -220,11 +212,10 @@ def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> flo
         _, clock = clock_for(choice.device)
         start = clock()
         run(frames)
-        return 1e3 * (clock() - start) / (choice.computed_frames(frames) * choice.batch)
+        runner.stored[str(turn)] = 1e3 * (clock() - start) / (choice.computed_frames(frames) * choice.batch)
     except NmpmError as error:
         if is_machine_failure(error):
             raise
         runner.stored["failed"] = str(error)
-        return None
     finally:
         torch.set_num_threads(before)

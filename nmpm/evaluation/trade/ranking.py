@@ -28,14 +28,12 @@ class Times:
 
     Args:
         milliseconds: Per computed frame and scene, of each round, see `Choice.computed_frames`.
-        ratios: Of each round, over the reference's in the same round.
         memory: Peak in bytes, None where it is not known.
         clock: "CPU time" or "wall time".
         hardware: Processor or GPU.
     """
 
     milliseconds: Sequence[float] = ()
-    ratios: Sequence[float] = ()
     memory: float | None = None
     clock: str = ""
     hardware: str = ""
@@ -77,11 +75,6 @@ class Point:
         return self.quartiles[1]
 
     @property
-    def ratio(self) -> float:
-        """Median over rounds of the time over the reference's."""
-        return float(np.median(self.times.ratios or [math.nan]))
-
-    @property
     def stable(self) -> bool:
         """Whether no scene failed."""
         return not self.failures
@@ -115,11 +108,10 @@ def measure_names(points: Sequence[Point]) -> list[str]:
 
 @dataclass(frozen=True)
 class Rank:
-    """A point's mean error with its interval, and its membership in the Pareto set.
+    """A point's mean error over scenes with its bootstrap interval of 95%, and its membership in the Pareto set.
 
     Args:
-        mean: Over scenes.
-        low, high: Bootstrap interval of 95%.
+        mean, low, high: The error.
         member: Whether it is in the Pareto set: of one scene at a time if its batch is 1, else of all choices.
         probability: Share of resamples of the scenes in which it is a member.
     """
@@ -153,11 +145,10 @@ def rank(points: Sequence[Point], measure: str = "mse") -> dict[str, Rank]:
 
 def pareto_members(times: Floats, errors: Floats) -> NDArray[np.bool_]:
     """Whether each of P points, with times (P,) and errors (..., P), is in the Pareto set, (..., P)."""
-    faster = times[:, None] < times[None]
-    as_fast = times[:, None] <= times[None]
-    better = errors[..., :, None] < errors[..., None, :]
-    as_good = errors[..., :, None] <= errors[..., None, :]
-    dominates = as_fast & as_good & (faster | better)
+    time, other_time = times[:, None], times[None]
+    error, other_error = errors[..., :, None], errors[..., None, :]
+    better = (time < other_time) | (error < other_error)
+    dominates = (time <= other_time) & (error <= other_error) & better
     return np.asarray(~dominates.any(axis=-2))
 
 

@@ -97,8 +97,6 @@ def _describe_row(point: Point, scenes: Scenes) -> dict[str, object]:
         "ms_per_frame": middle,
         "ms_lower_quartile": low,
         "ms_upper_quartile": high,
-        "ratio_to_reference": point.ratio,
-        "ms_per_second": middle / scenes.scene.dt,
         "frames_per_second": 1e3 / middle if middle > 0 else "",
         "memory_mb": "" if memory is None else memory / 1e6,
         "stable": point.stable,
@@ -136,7 +134,6 @@ def _describe_point(point: Point) -> dict[str, Any]:
             for name, values in point.errors.items()
         },
         "ms_per_frame": {"median": middle, "quartiles": [low, high]},
-        "ratio_to_first": _figure(point.ratio),
         "failures": {str(scene): reason for scene, reason in point.failures.items()},
         "curve": [_figure(value) for value in point.curves.mean(0).tolist()],
     }

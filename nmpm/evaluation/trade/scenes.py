@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -76,15 +77,24 @@ class Scenes:
     @cached_property
     def digests(self) -> tuple[str, ...]:
         """SHA-256 of what predictions and errors of each scene depend on, in short: its facts and its recording."""
-        return tuple(_digest(self.scene, recording) for recording in self.recordings)
+        digests = []
+        for recording in self.recordings:
+            digest = hashlib.sha256(json.dumps(self.scene.to_dict(), sort_keys=True).encode())
+            tensors = {name: getattr(recording, name) for name in ("frames", "material", "obstacle", "gravity")}
+            tensors |= {f"field {name}": values for name, values in sorted(recording.fields.items())}
+            for name, values in tensors.items():
+                digest.update(f";{name} {values.dtype} {tuple(values.shape)};".encode())
+                digest.update(values.contiguous().numpy().tobytes())
+            digests.append(digest.hexdigest()[:16])
+        return tuple(digests)
 
 
 def find_scenes(dataset: str, count: int) -> Scenes:
-    """Test scenes of a dataset; of an embedded one that is missing, only these are simulated.
+    """Test scenes of a dataset, `count` at most; of an embedded one that is missing, only these are simulated.
 
     Args:
         dataset: Name of an embedded dataset, or a folder in native layout.
-        count: Scenes at most; the dataset may have fewer.
+        count: The dataset may have fewer.
 
     Raises:
         ConfigError: if there is no such dataset.
@@ -140,38 +150,17 @@ def read_scenes(name: str, folder: Path, count: int) -> Scenes:
     recordings = SplitRecordings(split, metadata, scene)
     recordings.require_frames(3, "an evaluation")
     indices = range(min(count, len(recordings)))
-    seeds = tuple(_seed(split, index) for index in indices) if preset else ()
-    scenes = Scenes(name, scene, tuple(recordings[index] for index in indices), preset, seeds)
-    if preset is not None:
-        _check_start(scenes, preset)
-    return scenes
-
-
-def _seed(split: Split, index: int) -> int:
-    seed = split.attributes(index).get("seed")
-    if seed is None:
-        raise DataError(
-            f"{split.where(index)}: the attribute seed is missing, so that the simulator cannot repeat the trajectory."
-        )
-    return int(seed)
-
-
-def _check_start(scenes: Scenes, preset: Preset) -> None:
-    """Make sure that the preset draws the initial state that the first trajectory has."""
-    drawn = torch.from_numpy(preset.draw(scenes.seeds[0]).position).float()
-    recorded = scenes.recordings[0].frames[0]
-    if drawn.shape != recorded.shape or not torch.allclose(drawn, recorded, atol=1e-5):
+    scenes = Scenes(name, scene, tuple(recordings[index] for index in indices), preset)
+    if preset is None:
+        return scenes
+    seeds: list[Any] = [split.attributes(index).get("seed") for index in indices]
+    missing = [index for index, seed in enumerate(seeds) if seed is None]
+    if missing:
+        raise DataError(f"{split.where(missing[0])}: the attribute seed is missing, by which it was simulated.")
+    drawn, first = torch.from_numpy(preset.draw(int(seeds[0])).position).float(), scenes.recordings[0].frames[0]
+    if drawn.shape != first.shape or not torch.allclose(drawn, first, atol=1e-5):
         raise ConfigError(
-            f"The simulator {preset.name} does not draw the initial states of {scenes.name}: they were made by"
-            " another version or preset. Simulate the dataset again, or measure without a simulator."
+            f"The simulator {preset.name} does not draw the initial states of {name}: they were made by another version"
+            " or preset. Simulate the dataset again, or measure without a simulator."
         )
-
-
-def _digest(scene: Scene, recording: Recording) -> str:
-    digest = hashlib.sha256(json.dumps(scene.to_dict(), sort_keys=True).encode())
-    tensors = {name: getattr(recording, name) for name in ("frames", "material", "obstacle", "gravity")}
-    tensors |= {f"field {name}": values for name, values in sorted(recording.fields.items())}
-    for name, values in tensors.items():
-        digest.update(f";{name} {values.dtype} {tuple(values.shape)};".encode())
-        digest.update(values.contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    return replace(scenes, seeds=tuple(map(int, seeds)))

@@ -149,7 +149,7 @@ def make_choices(
     device: torch.device = CPU,
     predictors: Sequence[Callable[[Scene], Predictor]] = (),
 ) -> list[Choice]:
-    """All choices of a sweep; the first is the reference that times are compared with.
+    """All choices of a sweep.
 
     Args:
         sweep: Settings.

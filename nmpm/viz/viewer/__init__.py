@@ -22,8 +22,7 @@ def view(what: LabelledTrajectories | Path | str, truth: Path | str | None = Non
         every: Shows every so many frames.
 
     Raises:
-        DataError: if a file cannot be read, or the two do not show the same particles.
-        ConfigError: if `every` is below 1.
+        DataError, ConfigError: as `page_of_files` does.
     """
     if isinstance(what, LabelledTrajectories):
         return ViewerPage(what, every)

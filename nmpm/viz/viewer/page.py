@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 import zlib
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.colours import hex_code, material_colours, vary_brightness
-from nmpm.viz.output import check_output, check_suffix, fill_page, replace_picture
+from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import particle_spacing
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
@@ -41,6 +42,9 @@ class ViewerPage:
         trajectories: What to play, side by side or overlaid; errors are against the first.
         every: Shows every so many frames.
 
+    Attributes:
+        html: The page's text.
+
     Raises:
         ConfigError: if `every` is below 1.
     """
@@ -48,12 +52,19 @@ class ViewerPage:
     def __init__(self, trajectories: LabelledTrajectories, every: int = 1) -> None:
         if every < 1:
             raise ConfigError(f"every = {every} must be at least 1.")
-        self._html = fill_page(files(__package__), SCRIPTS, _describe(trajectories, every))
+        data = json.dumps(_describe(trajectories, every), separators=(",", ":"), allow_nan=False)
 
-    @property
-    def html(self) -> str:
-        """The page's text."""
-        return self._html
+        def read(name: str) -> str:
+            return files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+        self.html = read("page.html")
+        for mark, content in {
+            "/*STYLE*/": read("style.css"),
+            "/*SCRIPT*/": "\n".join(map(read, SCRIPTS)),
+            "/*DATA*/": data.replace("<", "\\u003c"),  # `</script>` in a text would end the data
+        }.items():
+            before, after = self.html.split(mark)
+            self.html = before + content + after
 
     def write(self, path: Path | str) -> Path:
         """Writes the page to a `.html` file; an existing one is replaced only when the new one is complete.
@@ -63,59 +74,49 @@ class ViewerPage:
             DataError: if the file cannot be written.
         """
         path = Path(path)
-        check_suffix(path, (".html",), "a page")
-        check_output(path)
+        check_output(path, (".html",))
         with replace_picture(path) as temporary:
-            temporary.write_text(self._html, encoding="utf-8")
+            temporary.write_text(self.html, encoding="utf-8")
         return path
 
     def _repr_html_(self) -> str:
-        page = html.escape(self._html, quote=True)
+        page = html.escape(self.html, quote=True)
         return (
             f'<iframe srcdoc="{page}" sandbox="allow-scripts" style="width: 100%; height: 640px; border: 0"></iframe>'
         )
 
 
 def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
-    """All that the page's scripts read, as JSON."""
+    """All that the page's scripts read, as JSON; speeds and errors in domain lengths, per shown frame."""
     positions = {
         label: trajectories.wrap(position[::every].astype(np.float64))
         for label, position in trajectories.positions.items()
     }
+    first, *others = positions.values()
+    colours = material_colours(trajectories.materials)
+    rgb = vary_brightness(np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8))
+    scale = np.round(255 * matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))).astype(int).tolist()
+    sampled = np.unique(np.linspace(0, len(first) - 1, SAMPLED_FRAMES).astype(int))
+    moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
+    longest = max(high - low for low, high in trajectories.outer_bounds)
     return {
         "title": trajectories.title or "nmpm",
         "every": every,
         "dt": trajectories.dt * every,
-        **_describe_box(trajectories),
-        **_describe_looks(trajectories, list(positions.values())),
-        **_describe_motion(trajectories, positions, every),
-        "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
-    }
-
-
-def _describe_box(trajectories: LabelledTrajectories) -> dict[str, Any]:
-    return {
         "dim": trajectories.dim,
         "bounds": [list(side) for side in trajectories.bounds],
         "domain": [list(side) for side in trajectories.outer_bounds],
         "period": list(trajectories.periods),
         "up": vertical_axis(trajectories),
         "tilt": trajectories.tilt,
-    }
-
-
-def _describe_looks(trajectories: LabelledTrajectories, positions: list[Floats]) -> dict[str, Any]:
-    """Colours and sizes; speeds in domain lengths per frame."""
-    colours = material_colours(trajectories.materials)
-    rgb = vary_brightness(np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8))
-    longest = max(high - low for low, high in trajectories.outer_bounds)
-    return {
-        "spacing": min(particle_spacing(positions[0][0]), longest / 20),
+        "spacing": min(particle_spacing(first[0]), longest / 20),
         "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
         "colours": pack_bytes(rgb),
-        "scale": [hex_code(colour) for colour in _colour_scale()],
-        "fastest": _fastest(trajectories, positions),
-        "worst": _worst(trajectories, positions),
+        "scale": [hex_code((red, green, blue)) for red, green, blue, _ in scale],
+        "fastest": _nearly_largest(trajectories, moved),
+        "worst": _nearly_largest(trajectories, [other[sampled] - first[sampled] for other in others]),
+        **_describe_motion(trajectories, positions, every),
+        "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
     }
 
 
@@ -149,48 +150,23 @@ def _describe_field(trajectories: LabelledTrajectories, name: str, every: int) -
     values = np.concatenate([each.ravel() for each in by_label.values()]).astype(np.float64)
     low, high = np.percentile(values, FIELD_PERCENTILES)
     ends = np.array(low), np.array(high if high > low else low + 1.0)
-
-    def pack(label: str) -> str | None:
-        if label not in by_label:
-            return None
-        shown = np.broadcast_to(by_label[label], (trajectories.frame_count, len(trajectories.material)))[::every]
-        return pack_positions(quantize(shown.clip(*ends), *ends))
-
-    return {
-        "name": name,
-        "low": float(ends[0]),
-        "high": float(ends[1]),
-        "values": [pack(label) for label in trajectories.positions],
+    shape = trajectories.frame_count, len(trajectories.material)
+    packed = {
+        label: pack_positions(quantize(np.broadcast_to(each, shape)[::every].clip(*ends), *ends))
+        for label, each in by_label.items()
     }
+    shown = [packed.get(label) for label in trajectories.positions]
+    return {"name": name, "low": float(ends[0]), "high": float(ends[1]), "values": shown}
 
 
-def _colour_scale() -> list[tuple[int, int, int]]:
-    colours = matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))
-    return [(red, green, blue) for red, green, blue, _ in np.round(255 * colours).astype(int).tolist()]
-
-
-def _fastest(trajectories: LabelledTrajectories, positions: list[Floats]) -> float:
-    """Nearly the largest distance that particles move from one shown frame to the next."""
-    frames = np.unique(np.linspace(0, len(positions[0]) - 1, SAMPLED_FRAMES).astype(int)[1:])
-    return _top([_lengths(trajectories, part[frames] - part[frames - 1]) for part in positions])
-
-
-def _worst(trajectories: LabelledTrajectories, positions: list[Floats]) -> float:
-    """Nearly the largest distance between a particle and the same particle in the first trajectory."""
-    frames = np.unique(np.linspace(0, len(positions[0]) - 1, SAMPLED_FRAMES).astype(int))
-    return _top([_lengths(trajectories, other[frames] - positions[0][frames]) for other in positions[1:]])
-
-
-def _lengths(trajectories: LabelledTrajectories, difference: Floats) -> Floats:
-    """Lengths (..., N) of differences (..., N, D), the shortest where axes are periodic."""
-    period = np.array(trajectories.periods)
-    wrapped = difference - period * np.round(difference / np.where(period > 0, period, 1.0))
-    return np.asarray(np.sqrt(np.square(wrapped).sum(axis=-1)))
-
-
-def _top(lengths: list[Floats]) -> float:
-    top = np.percentile(np.concatenate([part.ravel() for part in lengths]), TOP_PERCENTILE) if lengths else 0.0
-    return float(top) or 1.0
+def _nearly_largest(trajectories: LabelledTrajectories, differences: list[Floats]) -> float:
+    """Nearly the largest length of differences (..., D), the shortest ones where axes are periodic; 1 for none."""
+    if not differences:
+        return 1.0
+    period, stacked = np.array(trajectories.periods), np.concatenate(differences)
+    stacked = stacked - period * np.round(stacked / np.where(period > 0, period, 1.0))
+    lengths = np.sqrt(np.square(stacked).sum(axis=-1))
+    return (float(np.percentile(lengths, TOP_PERCENTILE)) if lengths.size else 0.0) or 1.0
 
 
 def quantize(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.uint16]:

@@ -14,10 +14,7 @@ from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.input_checks import beyond_walls
 from nmpm.errors import UnstableError
 from nmpm.evaluation.stress import GROUPS, Effort, ModelUnderTest, battery, results
-from nmpm.evaluation.stress.long import predicted_shapes, recorded_shapes, shape_ratios
 from nmpm.evaluation.stress.model import simulate_beside, simulate_window
-from nmpm.evaluation.stress.numerics import growth, nudge_positions
-from nmpm.evaluation.stress.scenes import widen_scene
 from nmpm.evaluation.stress.trace import energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
 from nmpm.processors import Pointwise
 from nmpm.sim import MpmPreset, load_preset
@@ -75,9 +72,6 @@ def test_shapes_stand_beside_the_simulators_and_its_twins():
         assert set(twin) == {f"twin_{name}" for name in result.figures if not name.startswith("twin_")}
         assert {name.rsplit("_", 1)[1] for name in twin} == {"10", "20"}
         assert 0.9 < twin["twin_height_at_20"] < 1.1
-    window = simulate_window(model, model.preset, 2, 20)
-    shapes = (predicted_shapes(model.emulator, window.initial, [20]), recorded_shapes(model.emulator, window, [20]))
-    assert held.figures["height_at_20"] == pytest.approx(shape_ratios(*shapes)[20]["height"], rel=1e-4)
     bare = model.with_emulator(model.emulator.unconstrained())
     (result,) = battery(bare, TINY, {"settling": GROUPS["settling"]})
     assert result.figures == free.figures
@@ -113,28 +107,6 @@ def test_scenes_one_by_one_are_those_of_a_window_and_unstable_ones_make_room_for
         if preset.substeps == twin.substeps and start.position.shape == bad.shape and (start.position == bad).all():
             raise UnstableError("blown up")
         return simulate_from(preset, start, frames, progress)
-
-    monkeypatch.setattr(MpmPreset, "simulate_from", blows_up)
-    first, second = (truth for truth, _ in simulate_beside(model, model.preset, 2, 5, [twin]))
-    assert torch.equal(first.initial.position[0], together.initial.position[0, : first.initial.position.shape[1]])
-    assert len(model.preset.draw(seed_of_draw(entropy, 1)).position) == int(second.mask.sum())
-
-
-def test_speeds_at_which_the_simulator_is_unstable_are_tested_without_it(monkeypatch):
-    model = goop()
-    fastest = max(abs(model.preset.draw(seed).velocity).max() for seed in range(20))
-    simulate_from = MpmPreset.simulate_from
-
-    def blows_up(preset, start, frames, progress=None):
-        if abs(start.velocity).max() > 1.2 * fastest:
-            raise UnstableError("blown up")
-        return simulate_from(preset, start, frames, progress)
-
-    monkeypatch.setattr(MpmPreset, "simulate_from", blows_up)
-    tested = {result.name: result for result in battery(model, TINY, {"speeds": GROUPS["speeds"]})}
-    assert "mse" in tested["initial speed × 1"].figures
-    assert tested["initial speed × 10"].passed is not None
-    assert "mse" not in tested["initial speed × 10"].figures
 
 
 def test_a_trace_holds_gains_and_first_failures():
@@ -180,22 +152,6 @@ def test_clumped_particles_fill_less():
     assert together == pytest.approx(0.25, abs=0.1)  # its rim spreads over the cells beside
 
 
-def test_growth_is_the_exponent_of_a_nudge_by_a_millionth_of_the_domain():
-    frames = torch.arange(100, dtype=torch.float64)
-    assert growth(1e-6 * (0.03 * frames).exp()) == pytest.approx(3.0)
-    model = recorded()
-    state = model.starts(1)
-    nudged_by = (nudge_positions(model, state).position - state.position).std().item()
-    assert nudged_by == pytest.approx(0.84e-6, rel=0.1)
-
-
-def test_a_wider_scene_has_the_same_wall_layers():
-    wide = widen_scene(box(), 3)
-    assert wide.domain[0] == pytest.approx((0.08, 0.92 + 2 * 0.84))
-    assert wide.domain[0][1] - wide.bounds[0][1] == pytest.approx(0.02)
-    assert wide.bounds[1] == (0.1, 0.9)
-
-
 def test_report_files(tmp_path):
     tested = [
         results.TestResult("long", "one", True, {"drift": 0.1}, "small", {"drift": ([0.0, 0.1], 2)}),
@@ -209,13 +165,6 @@ def test_report_files(tmp_path):
     assert [path.name for path in paths] == ["stress.json", "stress.md", "stress.png"]
     assert paths[1].read_text().count("\n") == 5
     assert paths[2].read_bytes().startswith(b"\x89PNG")
-
-
-def test_one_in_the_way_of_a_model_without_walls_is_left_out():
-    scene = box(domain=((0.1, 0.9),) * 2)
-    model = ModelUnderTest("open", emulator_of(scene), 8)
-    names = [result.name for result in battery(model, TINY, {"obstacles": GROUPS["obstacles"]})]
-    assert names == ["an inlet"]
 
 
 @pytest.mark.parametrize(("group", "runs"), [("counts", "scenes.trace_rollout"), ("obstacles", "obstacles.unroll")])

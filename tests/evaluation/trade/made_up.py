@@ -70,7 +70,7 @@ def flow(start, steps):
 def point(name, kind=Kind.MODEL, time=1.0, errors=(1.0, 1.0), batch=1, failures=None, **settings):
     """A point with so many milliseconds per frame and the same errors in all measures."""
     values = np.asarray(errors, dtype=float)
-    times = Times((0.9 * time, time, 1.2 * time), (time,) * 3, 2e6, "CPU time", "a processor")
+    times = Times((0.9 * time, time, 1.2 * time), 2e6, "CPU time", "a processor")
     measured = {"mse": values, "mse@8": values / 10, "emd": values}
     curves = np.repeat(values[:, None], 5, axis=1)
     return Point(kind, name, settings, batch, "cpu", times, measured, failures or {}, curves)

@@ -11,7 +11,7 @@ import torch
 from nmpm.data.loading.recording import Recording
 from nmpm.emulator import rollout
 from nmpm.errors import ConfigError
-from nmpm.evaluation.comparison import free_fall, still
+from nmpm.evaluation.comparison import free_fall
 from nmpm.evaluation.prediction_errors import (
     field_error,
     into_domain,
@@ -20,13 +20,13 @@ from nmpm.evaluation.prediction_errors import (
 )
 from nmpm.evaluation.trade import Kind, Scenes, Store, measure
 from nmpm.evaluation.trade.choices import PredictorChoice, SimulatorChoice
-from nmpm.evaluation.trade.measurement import measure_accuracy, measure_times
+from nmpm.evaluation.trade.measurement import measure_accuracy
 from nmpm.evaluation.trade.report import csv_text
 from nmpm.evaluation.trade.sweep import Timing
 from nmpm.sim import load_preset
 from nmpm.sim.sph.preset import SphPreset
 from nmpm.sim.state import SimulatedTrajectory
-from tests.evaluation.trade.made_up import Shifted, flow, tiny_emulator, tiny_sweep
+from tests.evaluation.trade.made_up import flow, tiny_emulator, tiny_sweep
 
 
 def named(choices, name):
@@ -45,10 +45,6 @@ def made(name, scenes, make):
         return make(scenes.window([index], frames).target)
 
     return PredictorChoice(kind=Kind.OTHER, name=name, predictor=predict)
-
-
-def still_choice():
-    return PredictorChoice(kind=Kind.TRIVIAL, name="nothing moves", predictor=still)
 
 
 def ignore(*_):
@@ -77,15 +73,14 @@ def test_an_interrupted_measurement_goes_on_to_the_same_errors(scenes, choices, 
     assert measure_accuracy(choice, scenes, measures, cut, ignore) == whole
 
 
-@pytest.mark.parametrize("facts", [{"bounds": ((0.0, 1.0), (0.05, 1.0))}, {"particle_volume": 2e-3}, {"dt": 0.02}])
-def test_errors_are_measured_anew_where_a_fact_of_the_scene_is_another(facts, tmp_path):
-    scenes, measures, store = flow(0.1, [0.01] * 8), tiny_sweep().measures, Store(tmp_path)
-    other = dataclasses.replace(scenes, scene=dataclasses.replace(scenes.scene, **facts))
-    choice = still_choice()
-    for measured in (scenes, other):
-        measure_accuracy(choice, measured, measures, store, ignore)
-    (path,) = (tmp_path / "points").iterdir()
-    assert len(json.loads(path.read_text())["values"]) == 2
+def test_digests_tell_facts_of_the_scene_and_fields_apart():
+    scenes = flow(0.1, [0.01] * 8)
+    changes = ({"bounds": ((0.0, 1.0), (0.05, 1.0))}, {"particle_volume": 2e-3}, {"dt": 0.02}, {})
+    others = [dataclasses.replace(scenes, scene=dataclasses.replace(scenes.scene, **facts)) for facts in changes]
+    for fields in ({"heat": torch.zeros(9, 100)}, {"heat": torch.ones(9, 100)}, {"salt": torch.ones(9, 100)}):
+        recording = dataclasses.replace(scenes.recordings[0], fields=fields)
+        others.append(dataclasses.replace(scenes, recordings=(recording,)))
+    assert len({other.digests for other in others}) == len(others)
 
 
 def test_errors_curves_and_frames_are_those_of_the_predictions(scenes, choices, tmp_path):
@@ -181,19 +176,6 @@ def test_resting_frames_are_not_timed_and_rest_is_found_across_a_periodic_border
     assert flow(0.9, slowing).moving_frames(0) == flow(0.1, slowing).moving_frames(0) < 30
 
 
-def test_digests_tell_fields_apart():
-    scenes = flow(0.1, [0.01] * 8)
-
-    def with_fields(**fields):
-        heated = dataclasses.replace(scenes.recordings[0], fields=fields)
-        return dataclasses.replace(scenes, recordings=(heated,)).digests
-
-    cold, warm = torch.zeros(9, 100), torch.ones(9, 100)
-    digests = [with_fields(**fields) for fields in ({}, {"heat": cold}, {"heat": warm}, {"salt": warm})]
-    assert len(set(digests)) == 4
-    assert with_fields(heat=warm, salt=cold) == with_fields(salt=cold, heat=warm)
-
-
 def test_times_are_per_frame_that_is_computed(scenes, choices, monkeypatch, tmp_path):
     timed = [choices[0], named(choices, "carried"), named(choices, "carried, batch 2"), named(choices, "free fall")]
     ticks = itertools.count()  # each rollout takes a second
@@ -202,27 +184,6 @@ def test_times_are_per_frame_that_is_computed(scenes, choices, monkeypatch, tmp_
     points = measure(timed, scenes, sweep, Store(tmp_path))
     frames = [1e3 / point.milliseconds for point in points]
     assert frames == pytest.approx([4, 4, 8, 3])  # one more; a bundle of 2 more, of one and of two scenes; as asked
-
-
-def test_another_choice_is_timed_beside_the_reference_alone(scenes, choices, tmp_path, monkeypatch):
-    store, timing, prepared = Store(tmp_path), Timing(rounds=1, frames=3), []
-    reference, other = choices[0], still_choice()
-    new = PredictorChoice(kind=Kind.OTHER, name="new", predictor=Shifted(scenes.scene))
-    first = measure_times([reference, other], scenes, timing, store, ignore)
-    for kind in (SimulatorChoice, PredictorChoice):
-        monkeypatch.setattr(kind, "prepare", recorded(kind.prepare, prepared))
-    again = measure_times([reference, other, new], scenes, timing, store, ignore)
-    assert prepared == [reference.name, "new"]
-    assert again[:2] == first
-    assert len(again[2].ratios) == 1
-
-
-def recorded(prepare, names):
-    def prepare_and_record(self, scenes, indices):
-        names.append(self.name)
-        return prepare(self, scenes, indices)
-
-    return prepare_and_record
 
 
 def drops(preset, start):
