@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nmpm.cli.options import HelpFormatter, add_device_option, add_model_options, check_device, check_output
 from nmpm.errors import ConfigError, DataError
@@ -86,7 +86,8 @@ def _export(options: argparse.Namespace, out: Path) -> None:
     part = kinds[options.part](emulator).to(find_device(options.device))
     form = export.FORMATS[options.format]
     with progress_bar(f"Writing {out.name}", 2) as step:
-        form.write(part, export.description(part, options.model, _training_data(model.card)), out)
+        training_data = f"{model.card.get('dataset', 'not stated')}. {model.card.get('about', '')}".strip()
+        form.write(part, export.description(part, options.model, training_data), out)
         step(f"Comparing {out.name} with the model")
         difference = form.difference(part, out, batch=1, count=300)
     if not difference <= TOLERANCE:
@@ -110,7 +111,3 @@ def _file_stem(model: str, part: str) -> str:
     path = Path(model)
     name = path.stem if path.suffix == ".ckpt" else path.resolve().name if path.is_dir() else model.replace("/", "-")
     return name if part == "Step" else f"{name}-{'processor' if part == 'Network' else 'solid'}"
-
-
-def _training_data(card: Mapping[str, Any]) -> str:
-    return f"{card.get('dataset', 'not stated')}. {card.get('about', '')}".strip()

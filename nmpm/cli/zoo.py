@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from nmpm._support.messages import one_line
 from nmpm.cli.options import HelpFormatter, add_device_option, check_device
@@ -91,46 +90,34 @@ def _parser() -> argparse.ArgumentParser:
 def _list(options: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
     from nmpm.errors import ZooError
-    from nmpm.zoo.card import lifecycle
+    from nmpm.evaluation.figures import with_unit
+    from nmpm.zoo.card import lifecycle, stated_error
     from nmpm.zoo.registry import Zoo
 
     for name in Zoo.list(options.root):
         own = "yours" if options.root is None and Zoo.folder(name).is_relative_to(user_zoo()) else ""
         try:
             card = Zoo.card(name, options.root)
-            state, text = str(lifecycle(card)), _summary(card)
+            mse, dataset = stated_error(card), one_line(card.get("dataset", "data not stated"))
+            error_text = "not measured" if mse is None else with_unit(mse)
+            state, text = lifecycle(card), f"full-rollout MSE {error_text}   {dataset}"
         except ZooError as error:
             state, text = "", str(error)
         sys.stdout.write(f"{name:<20} {own:<6} {state:<10} {text}\n")
 
 
-def _summary(card: Mapping[str, Any]) -> str:
-    from nmpm.evaluation.figures import with_unit
-
-    test = card.get("test")
-    mse = test.get("mse") if isinstance(test, Mapping) else None
-    error = with_unit(mse) if isinstance(mse, int | float) else "not measured"
-    return f"full-rollout MSE {error}   {one_line(card.get('dataset', 'data not stated'))}"
-
-
 def _card(options: argparse.Namespace) -> None:
     from nmpm._support.bounded_files import to_yaml
-    from nmpm.errors import ZooError
     from nmpm.zoo.entries import read_card
-    from nmpm.zoo.pages import MALFORMED, entry_page
+    from nmpm.zoo.pages import complete_card, entry_page
     from nmpm.zoo.registry import find_entry
 
     card = read_card(find_entry(options.name, options.root))
     if options.yaml:
         sys.stdout.write(to_yaml(card))
         return
-    try:
+    with complete_card(options.name):
         text = entry_page(card)
-    except MALFORMED as error:
-        raise ZooError(
-            f"The card of {options.name} is not complete ({error}): `nmpm zoo card {options.name} --yaml` shows what it"
-            " has."
-        ) from error
     if not sys.stdout.isatty():
         sys.stdout.write(text)
         return

@@ -105,15 +105,10 @@ def _snapshot(identifier: HubId, force_download: bool = False) -> Path:
 
 
 def pull(identifier: HubId, target: Path, name: str) -> Path:
-    """Copy a model of the hub to a new entry, after its weights have been compared with its card.
+    """Copy a model of the hub to the folder of a new entry, after its weights have been compared with its card.
 
-    Args:
-        identifier: Of the model.
-        target: Folder of the new entry.
-        name: Of the new entry; its card and README have it, and the card the commit as `source`.
-
-    Raises:
-        ZooError: as `download`; if the model cannot be loaded.
+    Card and README have the new name, and the card the commit as `source`. Raises ZooError if the model cannot be
+    downloaded or loaded.
     """
     folder = download(identifier)
     card = dict(load_entry(folder).card) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
@@ -184,12 +179,11 @@ def _upload(folder: str, repository: str, private: bool, message: str) -> str:
 
 def _page(card: Mapping[str, Any], entry: Path, load: str) -> str:
     """The README of an entry, by which `Zoo.load(load)` loads it; empty for a card without what it shows."""
-    from nmpm.zoo.pages import MALFORMED, entry_page  # imports matplotlib
+    from nmpm.zoo.pages import complete_card, entry_page  # imports jinja2
 
-    try:
+    with suppress(ZooError), complete_card(load):
         return entry_page(card, [path.name for path in entry.iterdir()], load)
-    except MALFORMED:
-        return ""
+    return ""
 
 
 def hub_metadata(card: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
 
 from nmpm._support.bounded_files import read_yaml
+from nmpm._support.messages import one_line
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import DataError, ZooError
 from nmpm.evaluation.figures import PREDICTORS, Unit, figures_unit, with_unit
@@ -53,8 +55,6 @@ TRADE = "../benchmarks/trade/goop/trade.png"
 PLAIN = "eager float32"
 """Runtime and precision of a model as `Zoo.load` gives it."""
 COLUMNS = {"mse@100": "frames 1 – 100", "mse": "all frames"}
-MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, TemplateError)
-"""What pages and charts raise where a card or a table lacks something, or has other kinds of values."""
 _TEMPLATES = Environment(
     loader=PackageLoader("nmpm.zoo"),
     undefined=StrictUndefined,
@@ -63,6 +63,18 @@ _TEMPLATES = Environment(
     keep_trailing_newline=True,
     autoescape=False,  # noqa: S701 (Markdown)
 )
+
+
+@contextmanager
+def complete_card(name: object) -> Iterator[None]:
+    """Raise ZooError where a card, or a table beside it, lacks something or has other kinds of values."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, TemplateError) as error:
+        raise ZooError(
+            f"The card of {name} or a table beside it is not complete ({type(error).__name__}: {one_line(error)}):"
+            f" `nmpm zoo card {name} --yaml` shows what it has; `nmpm zoo add` writes a new one from the run."
+        ) from error
 
 
 def entry_page(card: Mapping[str, Any], files: Collection[str] = (), load: str | None = None) -> str:
@@ -148,8 +160,9 @@ def index_page(root: Path, names: Sequence[str]) -> str:
     for name in names:
         try:
             card, recipe = read_card(root / name), read_recipe(read_yaml(root / name / CONFIG))
-            entries.append((name, lifecycle(card), _figure_cells(card), _scene_cells(card, recipe)))
-        except (ZooError, DataError, *MALFORMED):
+            with complete_card(name):
+                entries.append((name, lifecycle(card), _figure_cells(card), _scene_cells(card, recipe)))
+        except (ZooError, DataError):
             continue
     picture = TRADE if (root / TRADE).is_file() else None
     return _TEMPLATES.get_template("index.md").render(entries=entries, factor=f"{FACTOR:g}", picture=picture)

@@ -156,10 +156,7 @@ class Pretrained:
         Args:
             scene: With another domain, bounds or obstacles, or other particles' volume, such as
                 `dataclasses.replace(model.scene, bounds=…, domain=…)`. Materials, gravity, time step and kinds of
-                boundary must be this model's.
-
-        Raises:
-            ConfigError: if one of them is not, or the domain is not a whole number of cells.
+                boundary must be this model's, and the domain a whole number of cells; else ConfigError.
         """
         return dataclasses.replace(self, emulator=self.emulator.over(scene))
 

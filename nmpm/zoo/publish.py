@@ -66,12 +66,15 @@ def add(run: Path, name: str, root: str | Path | None = None, about: str = "") -
     digest = float32_digest(read_checkpoint(checkpoint)["state_dict"])
     if figures.get("weights", digest) != digest:
         raise ZooError(f"{report} is of other weights than {checkpoint}: test these by `nmpm test {run}`.")
-    emulator = round_network(load_module(checkpoint).emulator.eval().requires_grad_(False))
-    weights = serialise(emulator)
+    trained = load_module(checkpoint).emulator.eval().requires_grad_(False)
+    emulator = round_network(trained)
+    precision = torch.float32 if emulator is trained else torch.float16
+    weights = serialise(emulator, precision)
     stress = {key: _read_json(run / f"{key}.json") for key in STRESS_REPORTS if (run / f"{key}.json").is_file()}
     try:
         rows = figures["per_trajectory"]["model"]
-        card = _card(name, about, figures, rows, emulator) | {"sha256": hashlib.sha256(weights).hexdigest()}
+        card = _card(name, about, figures, rows, emulator)
+        card |= {"weights": str(precision).removeprefix("torch."), "sha256": hashlib.sha256(weights).hexdigest()}
         card |= {key: stress_digest(content["size"], content["lines"]) for key, content in stress.items()}
     except (KeyError, TypeError) as error:
         raise ZooError(f"A report in {run} lacks {error}: write it again by `nmpm test` or `nmpm stress`.") from error
@@ -132,15 +135,9 @@ def round_network(emulator: Emulator) -> Emulator:
     return half if moved < NOTICED else emulator
 
 
-def stored_precision(emulator: Emulator) -> str:
-    """What `serialise` stores the network's weights in, for cards: "float16" or "float32"."""
-    weights = [value for value in emulator.processor.state_dict().values() if value.is_floating_point()]
-    return "float16" if weights and all(map(_is_half, weights)) else "float32"
-
-
-def serialise(emulator: Emulator) -> bytes:
-    """The safetensors file of an emulator's tensors; network weights that float16 holds exactly are stored in it."""
-    tensors = {n: v.half() if _is_weight(n, v) and _is_half(v) else v for n, v in emulator.state_dict().items()}
+def serialise(emulator: Emulator, precision: torch.dtype) -> bytes:
+    """The safetensors file of an emulator's tensors, its network's real weights in a precision of their own."""
+    tensors = {n: v.to(precision) if _is_weight(n, v) else v for n, v in emulator.state_dict().items()}
     return save({name: value.contiguous() for name, value in tensors.items()})
 
 
@@ -155,10 +152,6 @@ def _is_weight(name: str, value: Tensor) -> bool:
     return name.startswith(_NETWORK) and value.is_floating_point()
 
 
-def _is_half(value: Tensor) -> bool:
-    return torch.equal(value, value.half().to(value.dtype))
-
-
 def _card(
     name: str, about: str, figures: Mapping[str, Any], rows: Sequence[Mapping[str, float]], emulator: Emulator
 ) -> dict[str, Any]:
@@ -168,7 +161,6 @@ def _card(
         "dataset": figures["dataset"],
         "about": about,
         "license": "MIT",
-        "weights": stored_precision(emulator),
         "training": figures["training"],
         "test_scenes": len(rows),
         "test": figures["test"],

@@ -12,7 +12,6 @@ from filelock import BaseFileLock, FileLock
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_plain, to_yaml
-from nmpm._support.messages import one_line
 from nmpm._support.shipped import user_home
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.card import CARD
@@ -20,7 +19,7 @@ from nmpm.zoo.entries import load_entry, read_card
 from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts
 from nmpm.zoo.measures.simulator import floor_facts, twin_facts
 from nmpm.zoo.measures.speed import speed_facts
-from nmpm.zoo.pages import CHART, MALFORMED, draw_chart, entry_page, index_page
+from nmpm.zoo.pages import CHART, complete_card, draw_chart, entry_page, index_page
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.registry import Zoo
 
@@ -102,15 +101,11 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
     """
     try:
         check_plain(card, folder / CARD)
-        chart = draw_chart(folder, card["name"])
-        page = entry_page(card, [path.name for path in folder.iterdir()] + [CHART] * (chart is not None))
     except DataError as error:
         raise ZooError(str(error)) from error
-    except MALFORMED as error:
-        raise ZooError(
-            f"{folder / CARD} or a table beside it is not complete ({type(error).__name__}: {one_line(error)})."
-            " `nmpm zoo card NAME --yaml` shows what the card has; `nmpm zoo add` writes a new one from the run."
-        ) from error
+    with complete_card(card.get("name", folder)):
+        chart = draw_chart(folder, card["name"])
+        page = entry_page(card, [path.name for path in folder.iterdir()] + [CHART] * (chart is not None))
     _write(folder / CARD, to_yaml(card))
     if chart is not None:
         with atomic_write(folder / CHART) as part:

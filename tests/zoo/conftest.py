@@ -1,6 +1,7 @@
 """A zoo with one small model, and a home of its own for each test."""
 
 import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import yaml
 from safetensors.torch import save
 from scenes import box
 
+from nmpm._support.shipped import shipped_folder
 from nmpm.decoders import Flip
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.processors import UNet
+from nmpm.training.module import EmulatorModule
 from nmpm.transfer import Quadratic
 
 
@@ -52,3 +55,35 @@ def write_entry() -> Callable[..., Path]:
 def root(tmp_path, small, write_entry) -> Path:
     write_entry(tmp_path / "zoo" / "small", small)
     return tmp_path / "zoo"
+
+
+@pytest.fixture
+def run(tmp_path, small) -> Path:
+    """The folder that a training leaves."""
+    module = EmulatorModule.of(small, unroll=3)
+    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams), "nmpm_format": 1}
+    folder = tmp_path / "runs" / "mine"
+    (folder / "checkpoints").mkdir(parents=True)
+    for name in ("best", "last"):
+        torch.save(content, folder / "checkpoints" / f"{name}.ckpt")
+    training = {"steps": 7, "horizon": 99, "seconds": 90.0, "precision": "32-true", "hardware": "a CPU", "devices": 1}
+    report = {
+        "dataset": "goop, simulated by nmpm",
+        "test": {"mse": 0.00055842194, "mse@100": 3.4241e-05, "still/mse": 0.0535708, "free_fall/mse": 0.03128},
+        "per_trajectory": {"model": [{"mse": 0.1, "mse@100": 0.05}, {"mse": 0.2}]},
+        "training": training | {"parameters": 1234},
+        "curve": [[45.0, 35, 0.4], [90.0, 70, 0.3]],
+        "versions": {"nmpm": "0"},
+    }
+    (folder / "report.json").write_text(json.dumps(report))
+    return folder
+
+
+@pytest.fixture
+def goop(tmp_path) -> Path:
+    """A copy of a complete entry, without its variants."""
+    folder = tmp_path / "copy" / "goop"
+    folder.mkdir(parents=True)
+    for path in (shipped_folder("zoo") / "goop").glob("*.*"):
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder

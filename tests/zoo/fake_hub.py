@@ -51,12 +51,6 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, *_) -> None:
         pass
 
-    def do_GET(self) -> None:
-        self._read(body=True)
-
-    def do_HEAD(self) -> None:
-        self._read(body=False)
-
     def do_POST(self) -> None:
         content = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         path = self.path.partition("?")[0]
@@ -88,7 +82,7 @@ class Handler(BaseHTTPRequestHandler):
         url = f"{self.server.url}/{repository}/commit/{oid}"
         return self._answer({"success": True, "commitOid": oid, "commitUrl": url})
 
-    def _read(self, body: bool) -> None:
+    def do_GET(self) -> None:
         path = self.path.partition("?")[0]
         self.server.requests.append(f"{self.command} {path}")
         parts = path.strip("/").split("/")
@@ -121,9 +115,12 @@ class Handler(BaseHTTPRequestHandler):
         for key, value in (("ETag", etag), ("X-Repo-Commit", oid), ("Content-Length", str(len(content)))):
             self.send_header(key, value)
         self.end_headers()
-        if body:
+        if self.command == "GET":
             self.wfile.write(content[: len(content) // 2] if name in self.server.cut else content)
         return None
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
 
     def _answer(self, content: dict | list, status: int = 200, headers: dict | None = None) -> None:
         text = json.dumps(content).encode()

@@ -16,19 +16,23 @@ from safetensors.torch import save
 
 from nmpm.errors import ConfigError, DataError, ZooError
 from nmpm.training.module import EmulatorModule
-from nmpm.zoo.entries import CELLS, build, read_recipe
-from nmpm.zoo.registry import Zoo, load_model
+from nmpm.zoo.entries import CELLS, read_recipe
+from nmpm.zoo.registry import load_model
 from tests.data.fuzzing import FUZZ, VALUES, changed, places
 
+REFUSALS = (ZooError, DataError, ConfigError)
 
-def complaint(root) -> str:
-    """The message for the entry `small`, in which the folder counts for nothing."""
-    with pytest.raises(ZooError) as caught:
-        Zoo.load("small", root)
-    message = str(caught.value).replace(str(root), "")
-    assert "\n" not in message
-    assert len(message) < 900
-    return message
+
+def refuse_or_load(path) -> str:
+    """The message of an entry or checkpoint that is refused, in which its folder counts for nothing."""
+    try:
+        load_model(path)
+    except REFUSALS as error:
+        message = str(error).replace(str(path.parent), "")
+        assert "\n" not in message
+        assert len(message) < 900
+        return message
+    return ""
 
 
 def change(root, **values) -> None:
@@ -55,50 +59,32 @@ POINTWISE = {"class_path": "nmpm.processors.Pointwise", "init_args": {"hidden": 
         ({"frames": 10**6}, "frames: 1,000,000 are more than 4,096"),
         ({"processor": POINTWISE}, "processor: its network has more than 5,000 tensors"),
         ({"processor__init_args__width": 10**6}, "processor: its network has more than 1,000,000,000 parameters"),
-        ({"processor__init_args__depth": 10**12}, "depth: an integer is larger"),
         ({"processor__class_path": "a" * 100_000}, "is not known"),
         ({"processor__init_args": ["width"]}, "must map keys to values"),
-        ({"processor__width": 8, "decoder__x": 1}, "has the unknown keys width beside class_path and init_args"),
         ({"decoder__" + "x" * 100_000: 1}, "has the unknown keys xxx"),
         ({"scene__dt": float("inf")}, "dt: inf is not finite"),
-        ({"scene__materials": [f"m{i}" for i in range(30_000)]}, "more than 5,000 modules"),
         ({"scene": None}, "config.yaml does not describe a model"),
-        (
-            {"scene__bounds": [["0", "1"], ["0", "1"]]},
-            "scene: bounds = [['0', '1'], ['0', '1']] should be a list, each",
-        ),
         ({"scene__bounds": [[False, True], [0, 1]]}, "should be a list, each [a finite number, a finite number]"),
-        ({"scene__gravity_varies": "no"}, "scene: gravity_varies = 'no' should be true or false"),
-        ({"processor__init_args__width": 8.0}, "UNet: width = 8.0 should be a whole number"),
         ({"constraints": {"energy": "x" * 100_000, "bounds": "no" * 100_000}}, "energy = 'xxx"),
-        ({"k" * 100_000: 1}, "unknown kkk"),
     ],
 )
 def test_recipes_of_impossible_models(root, values, message):
     change(root, **values)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert message in complaint(root)
+    assert message in refuse_or_load(root / "small")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300 * 2**10  # KiB
 
 
-@pytest.mark.parametrize("file", ["card.yaml", "config.yaml", "model.safetensors"])
-def test_pipes_in_place_of_files(root, file):
-    path = root / "small" / file
+def test_pipes_alias_bombs_and_weights_of_too_many_bytes(root, monkeypatch):
+    path = root / "small" / "config.yaml"
+    lines = ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]" for i in range(1, 40))]
+    path.write_text("\n".join(lines))
+    assert "aliases repeat too much" in refuse_or_load(root / "small")
     path.unlink()
     os.mkfifo(path)
-    assert "not a regular file" in complaint(root)
-
-
-def test_an_alias_bomb(root):
-    lines = ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]" for i in range(1, 40))]
-    for file in ("card.yaml", "config.yaml"):
-        (root / "small" / file).write_text("\n".join(lines))
-        assert "aliases repeat too much" in complaint(root)
-
-
-def test_weights_of_too_many_bytes(root, monkeypatch):
+    assert "not a regular file" in refuse_or_load(root / "small")
     monkeypatch.setattr("nmpm.zoo.entries.WEIGHT_BYTES", 100)
-    assert "more than 100 bytes" in complaint(root)
+    assert "more than 100 bytes" in refuse_or_load(root / "small")
 
 
 def weights(emulator, **changes) -> bytes:
@@ -113,22 +99,12 @@ def weights(emulator, **changes) -> bytes:
         ({"k" * 5000: torch.zeros(1)}, "has the unknown tensors kkk"),
         ({"input_mean": torch.zeros(5)}, "input_mean has the shape (5,); the model of config.yaml needs (4, 1, 1)"),
         ({"input_mean": torch.zeros(4, 1, 1).to(torch.float8_e4m3fn)}, "input_mean is of torch.float8_e4m3fn"),
-        ({"input_mean": torch.zeros(4, 1, 1, dtype=torch.int64)}, "input_mean is of torch.int64"),
-        ({"input_mean": torch.zeros(4, 1, 1, dtype=torch.complex64)}, "input_mean is of torch.complex64"),
-        ({"calibrated": torch.zeros(())}, "calibrated is of torch.float32"),
         ({"input_mean": torch.full((4, 1, 1), float("inf"))}, "input_mean holds values that are not finite"),
     ],
 )
 def test_weights_of_other_models(root, small, write_entry, changes, message):
     write_entry(root / "small", small, weights(small, **changes))
-    assert message in complaint(root)
-
-
-def test_weights_in_half_precision_are_taken(root, small, write_entry):
-    write_entry(root / "small", small, weights(small, input_std=small.input_std.bfloat16()))
-    model = Zoo.load("small", root)
-    assert model.emulator.input_std.dtype == torch.float32
-    assert torch.equal(model.emulator.input_std, small.input_std)
+    assert message in refuse_or_load(root / "small")
 
 
 def header(**tensors) -> bytes:
@@ -139,87 +115,22 @@ def header(**tensors) -> bytes:
 @pytest.mark.parametrize(
     "content",
     [
-        b"",
         struct.pack("<Q", 2**63) + b"{}",
         header(w={"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}),
-        header(w={"dtype": "F32", "shape": [1], "data_offsets": [4, 0]}),
-        struct.pack("<Q", 100_000) + b"[" * 100_000,
         pickle.dumps({"a": 1}),
     ],
+    ids=["size", "offsets", "pickle"],
 )
 def test_headers_that_lie(root, small, write_entry, content):
     write_entry(root / "small", small, content)
-    assert "model.safetensors" in complaint(root)
+    assert "model.safetensors" in refuse_or_load(root / "small")
 
 
 def test_the_limits_allow_large_models(small):
-    plain = small.recipe.to_dict()
-    large = copy.deepcopy(plain)
+    large = small.recipe.to_dict()
     large["cells"] = [4096, 4096]
     large["processor"]["init_args"]["width"] = 512
     assert read_recipe(large).grid.size == CELLS
-    before = torch.random.get_rng_state()
-    read_recipe(plain)
-    assert torch.equal(torch.random.get_rng_state(), before)
-    assert sum(p.numel() for p in build(read_recipe(plain)).parameters()) == sum(p.numel() for p in small.parameters())
-
-
-def load(root) -> None:
-    try:
-        Zoo.load("small", root)
-    except (ZooError, DataError, ConfigError) as error:
-        message = str(error).replace(str(root), "")
-        assert "\n" not in message
-        assert len(message) < 900
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("file", ["config.yaml", "card.yaml"])
-def test_any_value_anywhere_in_the_texts(root, file):
-    path = root / "small" / file
-    plain = yaml.safe_load(path.read_text())
-    where = sorted(places(plain), key=str)
-
-    @FUZZ
-    @given(st.sampled_from(where), VALUES)
-    def check(place, value):
-        path.write_text(yaml.safe_dump(changed(plain, place, value), allow_unicode=False))
-        load(root)
-
-    check()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("file", ["config.yaml", "card.yaml"])
-def test_any_bytes_in_the_texts(root, file):
-    path = root / "small" / file
-    content = path.read_bytes()
-
-    @FUZZ
-    @given(
-        st.integers(0, len(content)),
-        st.integers(0, 40),
-        st.binary(max_size=12) | st.text("&*!-[]{}:,\n 0e.'\"?|>%@").map(str.encode),
-    )
-    def check(start, removed, added):
-        path.write_bytes(content[:start] + added + content[start + removed :])
-        load(root)
-
-    check()
-
-
-@pytest.mark.slow
-def test_any_bytes_in_the_weights(root, small, write_entry):
-    content = (root / "small" / "model.safetensors").read_bytes()
-    (size,) = struct.unpack("<Q", content[:8])
-
-    @FUZZ
-    @given(st.integers(0, size + 100), st.integers(0, 20), st.binary(max_size=12))
-    def check(start, removed, added):
-        write_entry(root / "small", small, content[:start] + added + content[start + removed :])
-        load(root)
-
-    check()
 
 
 @pytest.fixture
@@ -238,35 +149,45 @@ def checkpoint(tmp_path, small):
     return write
 
 
-def load_checkpoint(path) -> None:
-    try:
-        load_model(path)
-    except (DataError, ConfigError) as error:
-        message = str(error).replace(str(path), "")
-        assert "\n" not in message
-        assert len(message) < 900
-
-
 @pytest.mark.slow
-def test_any_value_anywhere_in_a_checkpoint(checkpoint):
+@pytest.mark.parametrize("file", ["config.yaml", "card.yaml", "a.ckpt"])
+def test_any_value_anywhere(root, checkpoint, file):
+    path = root / "small" / file
+    plain = {} if file == "a.ckpt" else yaml.safe_load(path.read_text())
+    where = checkpoint.places if file == "a.ckpt" else sorted(places(plain), key=str)
+
     @FUZZ
-    @given(st.sampled_from(checkpoint.places), VALUES)
+    @given(st.sampled_from(where), VALUES)
     def check(place, value):
-        load_checkpoint(checkpoint(place, value))
+        if file == "a.ckpt":
+            refuse_or_load(checkpoint(place, value))
+        else:
+            path.write_text(yaml.safe_dump(changed(plain, place, value), allow_unicode=False))
+            refuse_or_load(root / "small")
 
     check()
 
 
 @pytest.mark.slow
-def test_any_bytes_in_a_checkpoint(checkpoint):
-    path = checkpoint()
+@pytest.mark.parametrize("file", ["config.yaml", "card.yaml", "model.safetensors", "a.ckpt"])
+def test_any_bytes_anywhere(root, small, write_entry, checkpoint, file):
+    path = checkpoint() if file == "a.ckpt" else root / "small" / file
     content = path.read_bytes()
+    end = struct.unpack("<Q", content[:8])[0] + 100 if file == "model.safetensors" else len(content)
 
     @FUZZ
-    @given(st.integers(0, len(content)), st.integers(0, 20), st.binary(max_size=12))
+    @given(
+        st.integers(0, end),
+        st.integers(0, 40),
+        st.binary(max_size=12) | st.text("&*!-[]{}:,\n 0e.'\"?|>%@").map(str.encode),
+    )
     def check(start, removed, added):
-        path.write_bytes(content[:start] + added + content[start + removed :])
-        load_checkpoint(path)
+        damaged = content[:start] + added + content[start + removed :]
+        if file == "model.safetensors":
+            write_entry(root / "small", small, damaged)
+        else:
+            path.write_bytes(damaged)
+        refuse_or_load(path if file == "a.ckpt" else root / "small")
 
     check()
 
@@ -275,8 +196,7 @@ def test_any_bytes_in_a_checkpoint(checkpoint):
     ("place", "value", "message"),
     [
         (("cells",), [8192, 8192], "are more than 16,777,216"),
-        (("processor", "init_args", "depth"), 10**12, "an integer is larger"),
-        (("processor",), POINTWISE, "more than 5,000 tensors"),
+        (("processor", "init_args", "width"), 10**6, "more than 1,000,000,000 parameters"),
     ],
 )
 def test_checkpoints_of_impossible_models(checkpoint, place, value, message):

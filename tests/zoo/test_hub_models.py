@@ -7,7 +7,6 @@ import yaml
 from huggingface_hub import constants
 from huggingface_hub.utils import _http
 
-from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.errors import ZooError
 from nmpm.zoo import Zoo, load_model
@@ -36,7 +35,6 @@ def test_a_pushed_model_is_loaded_by_its_id_rolled_out_and_pulled(hub, root, tmp
     state = Zoo.load("small", root).example(count=50)
     expected = Zoo.load("small", root).rollout(state, 8)
     assert torch.equal(Zoo.load(identifier).rollout(state, 8), expected)
-    assert main(["rollout", identifier, "--frames", "4", "--particles", "50"]) == 0
     assert main(["zoo", "pull", identifier, "small/mine"]) == 0
     assert torch.equal(Zoo.load("small/mine").rollout(state, 8), expected)
     assert main(["zoo", "pull", identifier, "small"]) == 0
@@ -47,20 +45,12 @@ def test_a_pushed_model_is_loaded_by_its_id_rolled_out_and_pulled(hub, root, tmp
         assert "exists: choose another name" in capsys.readouterr().err
 
 
-def test_a_revision_stays_what_it_was(hub, root, small, write_entry):
-    first = push(root / "small", "lab/small")
-    small.input_std.fill_(3.0)
-    write_entry(root / "small", small)
-    second = push(root / "small", "lab/small")
-    assert first.revision != second.revision
-    assert (load_model(str(first)).emulator.input_std == 2.0).all()
-    assert (load_model(str(second)).emulator.input_std == 3.0).all()
-    assert (load_model("lab/small@main").emulator.input_std == 3.0).all()
-
-
-def test_a_cached_model_loads_offline_and_others_say_why_not(hub, root, monkeypatch):
+def test_a_cached_revision_loads_offline_and_others_say_why_not(hub, root, small, write_entry, monkeypatch):
     identifier = push(root / "small", "lab/small")
-    load_model(str(identifier))
+    small.input_std.fill_(3.0)
+    push(write_entry(root / "small", small), "lab/small")
+    assert (load_model("lab/small@main").emulator.input_std == 3.0).all()
+    assert (load_model(str(identifier)).emulator.input_std == 2.0).all()
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     _http.close_session()
     try:
@@ -69,22 +59,15 @@ def test_a_cached_model_loads_offline_and_others_say_why_not(hub, root, monkeypa
         assert len(hub.requests) == asked
         with pytest.raises(ZooError, match="not in the cache"):
             load_model("lab/other@main")
+        with pytest.raises(ZooError, match="holds no model 'lab/small'"):
+            load_model("lab/small")
+        assert main(["zoo", "pull", "lab/small"]) == 1
     finally:
         monkeypatch.undo()
         _http.close_session()
 
 
-def test_weights_that_are_not_those_of_the_card_are_refused(hub, root):
-    push(root / "small", "lab/small")
-    oid = hub.commit("lab/small", {"model.safetensors": b"other"})
-    with pytest.raises(ZooError, match="SHA-256"):
-        load_model(f"lab/small@{oid}")
-    with pytest.raises(ZooError, match="SHA-256"):
-        pull(HubId("lab/small", oid), root / "pulled", "pulled")
-    assert not (root / "pulled").exists()
-
-
-def test_private_and_unknown_models_and_revisions(hub, root, monkeypatch):
+def test_private_unknown_and_wrong_models(hub, root, monkeypatch):
     identifier = push(root / "small", "lab/hidden", private=True)
     assert download(identifier).is_dir()
     monkeypatch.delenv("HF_TOKEN")
@@ -95,16 +78,13 @@ def test_private_and_unknown_models_and_revisions(hub, root, monkeypatch):
     push(root / "small", "lab/small")
     with pytest.raises(ZooError, match="no revision lava"):
         load_model("lab/small@lava")
+    oid = hub.commit("lab/small", {"model.safetensors": b"other"})
+    with pytest.raises(ZooError, match="SHA-256"):
+        pull(HubId("lab/small", oid), root / "pulled", "pulled")
+    assert not (root / "pulled").exists()
     hub.commits["lab/empty"] = [("a" * 40, {"README.md": b""})]
     with pytest.raises(ZooError, match="it has no card"):
         load_model("lab/empty@main")
-
-
-def test_without_a_revision_nothing_is_fetched(hub):
-    with pytest.raises(ZooError, match="holds no model 'lab/small'"):
-        load_model("lab/small")
-    assert main(["zoo", "pull", "lab/small"]) == 1
-    assert hub.requests == []
 
 
 def test_the_hub_is_told_library_licence_and_results(hub, root):
@@ -141,15 +121,6 @@ def test_a_damaged_file_of_the_cache_is_fetched_again_or_named_with_what_to_dele
     asked = len(hub.requests)
     load_model(str(identifier))
     assert not [line for line in hub.requests[asked:] if line.startswith("GET") and "resolve" in line]
-
-
-@pytest.fixture
-def goop(tmp_path):
-    """A copy of a complete entry, without its variants."""
-    (tmp_path / "copy" / "goop").mkdir(parents=True)
-    for path in (shipped_folder("zoo") / "goop").glob("*.*"):
-        (tmp_path / "copy" / "goop" / path.name).write_bytes(path.read_bytes())
-    return tmp_path / "copy" / "goop"
 
 
 def test_a_pulled_model_has_its_own_name_and_source_and_can_be_pushed_on(hub, goop, home):
@@ -195,16 +166,13 @@ def test_commands_of_the_zoo_take_folders_and_ids(hub, goop, capsys):
     for model in (str(goop), str(identifier)):
         assert main(["zoo", "card", model]) == 0
         assert capsys.readouterr().out.startswith("# goop\n")
-        assert main(["zoo", "verify", model]) == 0
-        assert "All that was measured is confirmed" in capsys.readouterr().out
-        assert main(["zoo", "push", model, "lab/other"]) == 0
-        capsys.readouterr()
+    assert main(["zoo", "push", str(identifier), "lab/other"]) == 0
+    capsys.readouterr()
     assert main(["zoo", "refresh", str(goop), "--failures", "Late splashes become dust."]) == 0
     assert capsys.readouterr().out == f"wrote {goop}\n"
     assert not (goop.parent / "README.md").exists()
     assert Zoo.card("goop", goop.parent)["failures"] == "Late splashes become dust."
     assert main(["zoo", "refresh", str(identifier)]) == 1
     assert f"`nmpm zoo pull {identifier} NAME` makes an entry of it" in capsys.readouterr().err
-    for command in (["card"], ["push"], ["refresh"]):
-        assert main(["zoo", *command, str(goop.parent), *(["lab/x"] if command == ["push"] else [])]) == 1
-        assert "`nmpm zoo add RUN NAME` makes an entry of a run" in capsys.readouterr().err
+    assert main(["zoo", "card", str(goop.parent)]) == 1
+    assert "`nmpm zoo add RUN NAME` makes an entry of a run" in capsys.readouterr().err

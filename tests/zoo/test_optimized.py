@@ -40,11 +40,13 @@ class Slow(Eager):
         return super().fields(network, grid, precision)
 
 
-@pytest.mark.parametrize("order", [("openvino", "eager"), ("eager", "openvino")])
-def test_the_fastest_as_measured_is_taken(model, monkeypatch, order):
-    runtimes = {name: {"openvino": Slow, "eager": Eager}[name] for name in order}
-    monkeypatch.setattr("nmpm.emulator.runtimes.RUNTIMES", runtimes)
-    monkeypatch.setattr(optimization, "RUNTIMES", runtimes)
+def use(monkeypatch, **runtimes) -> None:
+    for module in ("nmpm.emulator.runtimes", "nmpm.zoo.optimization"):
+        monkeypatch.setattr(f"{module}.RUNTIMES", runtimes)
+
+
+def test_the_fastest_as_measured_is_taken(model, monkeypatch):
+    use(monkeypatch, openvino=Slow, eager=Eager)
     assert model.optimized().emulator.runtime.name == "eager"
 
 
@@ -64,12 +66,6 @@ def test_what_runs_here_is_taken_and_checked(model, caplog, monkeypatch):
         model.optimized("openvino", "float61")
     with pytest.raises(ConfigError, match="runs on CPUs; the model is on meta"):
         model.to("meta").optimized("openvino")
-    with pytest.raises(ConfigError, match="openvino has no gradients"):
-        quick.differentiable_rollout(model.example(count=50).map(needs_gradients), 8)
-
-
-def needs_gradients(values):
-    return values.clone().requires_grad_() if values.is_floating_point() else values
 
 
 def test_without_a_faster_one_it_is_torch(model, monkeypatch):
@@ -83,8 +79,7 @@ def test_without_a_faster_one_it_is_torch(model, monkeypatch):
 
 
 def test_a_runtime_that_computes_something_else_is_refused(model, monkeypatch):
-    monkeypatch.setattr("nmpm.emulator.runtimes.RUNTIMES", {"openvino": Wrong, "eager": Eager})
-    monkeypatch.setattr(optimization, "RUNTIMES", {"openvino": Wrong, "eager": Eager})
+    use(monkeypatch, openvino=Wrong, eager=Eager)
     with pytest.raises(ConfigError, match="openvino computes something else than torch: positions after one bundle"):
         model.optimized("openvino")
     assert isinstance(model.optimized().emulator.runtime, Eager)

@@ -113,15 +113,11 @@ def test_gravity_where_it_varies():
         ({"position": [["a", "b"]]}, "cannot be read as an array of numbers"),
         ({"position": POSITIONS > 0}, "bool values; real numbers"),
         ({"velocity": np.zeros((19, 2))}, r"velocity has the shape \(19, 2\).*\(20, 2\)"),
-        ({"velocity": np.full((20, 2), np.inf)}, "must be finite"),
         ({"material": "gopp"}, "Material 'gopp' is unknown.* Did you mean goop"),
-        ({"material": ["goop"] * 19}, r"material has the shape \(19,\)"),
         ({"material": np.full(20, 7)}, "particle 0: material 7 is not an index.*Type ids"),
-        ({"material": np.full(20, -1)}, "material -1 is not an index"),
         ({"material": np.full(20, 0.5)}, "material 0.5 is not an index"),
         ({"gravity": (0.0, -1.62)}, r"knows only \[0.0, -9.81\]"),
         ({"gravity": (0.0, -9.81 * 0.0025**2)}, "per frame squared: divide it by dt²"),
-        ({"gravity": (0.0, -9.81, 0.0)}, r"gravity has the shape \(3,\)"),
     ],
 )
 def test_mistakes_are_named(model, given, message):
@@ -146,12 +142,10 @@ def test_velocities_per_frame_are_suspected(model):
     with pytest.warns(UserWarning, match=r"if yours are per frame, divide them by dt = 0.0025 s") as caught:
         model.state(POSITIONS, per_second * model.scene.dt)
     assert caught[0].filename == __file__
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("speed", [0.0, 1e-6, 0.1, 1.5])
-def test_plausible_velocities_are_not(model, speed):
-    model.state(POSITIONS, velocity=(speed, 0.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for speed in (0.0, 1e-6, 0.1, 1.5):  # plausible
+            model.state(POSITIONS, velocity=(speed, 0.0))
 
 
 def test_bodies_of_all_scenes_or_of_each_beside_particles():
@@ -165,17 +159,6 @@ def test_bodies_of_all_scenes_or_of_each_beside_particles():
     both = model.state(POSITIONS, obstacle=filled, bodies=[disc])
     summed = solid(model.state(POSITIONS, obstacle=filled)) + solid(together)[:1] - model.emulator.walls
     torch.testing.assert_close(solid(both), summed.clamp(max=1))
-    assert both.obstacle_share.dtype == torch.float32
-    assert model.rollout(both, 3).isfinite().all()
-
-
-def test_gradients_reach_the_parameters_of_bodies():
-    model = model_of(box(obstacles=True))
-    radius = torch.tensor(0.05, requires_grad=True)
-    state = model.state(POSITIONS, velocity=(0.0, -1.0), bodies=[Disc((0.5, 0.3), radius)])
-    model.differentiable_rollout(state, 4).sum().backward()
-    assert radius.grad.isfinite()
-    assert radius.grad != 0
 
 
 def test_bodies_that_do_not_fit_are_refused():
@@ -185,8 +168,6 @@ def test_bodies_that_do_not_fit_are_refused():
         model_of(box()).state(POSITIONS, bodies=[disc])
     with pytest.raises(DataError, match="one for each of 1 scenes; this one has 2"):
         model.state(POSITIONS, bodies=[[disc], [disc]])
-    with pytest.raises(DataError, match="one list of bodies"):
-        model.state(POSITIONS, bodies=[disc, [disc]])
     state = model.state(POSITIONS, bodies=[disc])
     with pytest.raises(DataError, match="fill them with particles"):
         predicted_trajectory(model.scene, state, model.rollout(state, 2), "a test")
@@ -205,13 +186,11 @@ def test_particles_that_start_outside_of_the_bounds_are_counted(model):
         model.rollout(outside.map(lambda values: values[:, [0, 3]] if values.shape[1:2] == (4,) else values), 2)
 
 
-@pytest.mark.parametrize("frames", [-1, 7.5, "8", None, True, float("nan")])
+@pytest.mark.parametrize("frames", [-1, 7.5, True])
 def test_frames_are_a_whole_number(model, frames):
-    state = model.state(POSITIONS)
-    for predict in (model.rollout, model.predict, model.differentiable_rollout):
+    for predict in (model.rollout, model.differentiable_rollout):
         with pytest.raises(ConfigError, match=f"frames = {frames!r}: it must be a whole number, at least [01]"):
-            predict(state, frames)
-    assert model.rollout(state, np.int64(3)).shape[1] == 3
+            predict(model.state(POSITIONS), frames)
 
 
 def test_particles_that_start_inside_an_obstacle_are_named():
