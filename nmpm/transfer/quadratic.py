@@ -113,7 +113,7 @@ class Affine(Quadratic):
         values = (membership[:, :, None, :, None] * terms.unsqueeze(-2)).flatten(-2)
         sums = _scattered(stencil, values, grid.size).unflatten(-1, (materials, -1))
         count, place_sum, moved_sum, square_sum, product_sum = sums.split([1, dim, dim, dim**2, dim**2], dim=-1)
-        total = torch.where(count > 0, count, torch.ones_like(count))
+        total = _divisor(count)
         mean, flow = place_sum / total, moved_sum / total
         variance = (square_sum / total).unflatten(-1, (dim, dim)) - mean.unsqueeze(-1) * mean.unsqueeze(-2)
         covariance = (product_sum / total).unflatten(-1, (dim, dim)) - flow.unsqueeze(-1) * mean.unsqueeze(-2)
@@ -132,8 +132,13 @@ def _own(slope: Tensor, count: Tensor, membership: Tensor, stencil: Stencil) -> 
     gathered = gather(stencil, weighted.reshape(batch, size, -1)).unflatten(-1, (materials, -1))
     weighted_sum: Tensor = (gathered * membership.unsqueeze(-1)).sum(dim=-2)
     summed, mass = weighted_sum.split([dim**2, 1], dim=-1)
-    mean: Tensor = (summed / torch.where(mass > 0, mass, torch.ones_like(mass))).unflatten(-1, (dim, dim))
+    mean: Tensor = (summed / _divisor(mass)).unflatten(-1, (dim, dim))
     return mean
+
+
+def _divisor(count: Tensor) -> Tensor:
+    """Numbers of particles, and 1 where so small a share of one is seen that gradients of quotients overflow."""
+    return torch.where(count > torch.finfo(count.dtype).tiny, count, torch.ones_like(count))
 
 
 def _scattered(stencil: Stencil, values: Tensor, size: int) -> Tensor:

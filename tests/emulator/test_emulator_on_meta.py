@@ -7,41 +7,34 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from scenes import box, cloud
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
-from nmpm.emulator import Emulator, EmulatorRecipe
-from nmpm.emulator.constraints import Constraints
+from nmpm.emulator import Emulator
 from nmpm.emulator.contact import Contact
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.rollouts import unroll
 from nmpm.grid import Grid
 from nmpm.particles import Window
-from nmpm.processors import FFNO, FNO, TFNO, Axial, ConvNeXt, Identity, Pointwise, UNet, UNetModern
+from nmpm.processors import FFNO, FNO, TFNO, Axial, ConvNeXt, Identity, UNet, UNetModern
 from nmpm.training.losses import position_error
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, scatter_backend, without_kernels
+from tests.scenes import CHANNEL, box, cloud, emulator_of, window_of
 
-TRANSFERS = (Nearest(), Linear(), Quadratic(), Affine())
-DECODERS = (Absolute(), Residual(), Flip(), Blend(), Acceleration())
-PROCESSORS = (
-    UNet(width=4, depth=1, perceptron=(5,)),
-    UNetModern(width=4, growth=(1, 2), groups=2),
-    ConvNeXt(width=6, depth=1, kernel=5),
-    FNO(modes=4, width=6, layers=1),
-    TFNO(modes=4, width=6, layers=1, rank=0.5),
-    FFNO(modes=4, width=6, layers=1),
-    Axial(width=8, layers=1, heads=2, patch=4),
-    Pointwise(hidden=(6,)),
-    Identity(),
-)
-CHANNEL = {"boundary": ("periodic", "wall"), "domain": ((0.1, 0.9), (0.08, 0.92))}
-SCENES = {
-    "walls": box(materials=("water", "sand"), densities=(1000.0, 1600.0)),
-    "obstacles": box(obstacles=True),
-    "periodic": box(materials=("water", "sand"), **CHANNEL),
-    "periodic with obstacles": box(obstacles=True, **CHANNEL),
-    "three axes": box(3, obstacles=True),
-}
+PARTS = [
+    {"processor": UNet(width=4, depth=1, perceptron=(5,))},
+    {"processor": UNetModern(width=4, growth=(1, 2), groups=2)},
+    {"processor": ConvNeXt(width=6, depth=1, kernel=5)},
+    {"processor": FNO(modes=4, width=6, layers=1)},
+    {"processor": TFNO(modes=4, width=6, layers=1, rank=0.5)},
+    {"processor": FFNO(modes=4, width=6, layers=1)},
+    {"processor": Axial(width=8, layers=1, heads=2, patch=4)},
+    {"processor": Identity()},
+    *({"transfer": part} for part in (Nearest(), Linear(), Quadratic(), Affine())),
+    *({"decoder": part} for part in (Absolute(), Residual(), Flip(), Blend(), Acceleration())),
+]
+WALLS = box(materials=("water", "sand"), densities=(1000.0, 1600.0))
+SCENES = {"walls": WALLS, "channel": box(obstacles=True, **CHANNEL), "three axes": box(3, obstacles=True)}
 
 
 @pytest.fixture(autouse=True)
@@ -50,23 +43,18 @@ def _no_autocast(monkeypatch):
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
 
 
-def window(scene, frames: int = 6) -> Window:
+def window(scene) -> Window:
     state = cloud(scene, count=9, batch=2, statics=4)
-    steps = torch.arange(-1, frames - 1).view(1, -1, 1, 1)
-    path = state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)
-    rest = (state.material, state.mask, state.obstacle, state.obstacle_mask, state.gravity)
-    return Window(path, *rest).to("meta")
+    steps = torch.arange(-1, 5).view(1, -1, 1, 1)
+    return window_of(state, state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)).to("meta")
 
 
-def emulator_of(
-    scene, transfer=Linear(), processor=PROCESSORS[-2], decoder=Residual(), frames=2, **constraints
-) -> Emulator:
-    cells, held = (8,) * scene.dim, Constraints(**constraints)
-    return EmulatorRecipe(scene, cells, frames, transfer, processor, decoder, 0.1, held).build().to("meta")
+def on_meta(scene, **parts) -> Emulator:
+    return emulator_of(scene, (8,) * scene.dim, 2, **parts).to("meta")
 
 
-def train(emulator: Emulator, batch: Window, bundles: int = 1) -> None:
-    predicted = torch.cat([bundle.position for bundle in unroll(emulator.train(), batch.initial, bundles)], dim=1)
+def train(emulator: Emulator, batch: Window) -> None:
+    predicted = torch.cat([bundle.position for bundle in unroll(emulator.train(), batch.initial, 2)], dim=1)
     loss = position_error(predicted, batch.target[:, : predicted.shape[1]], batch.mask, emulator.grid)
     if loss.requires_grad:
         loss.backward()
@@ -74,49 +62,51 @@ def train(emulator: Emulator, batch: Window, bundles: int = 1) -> None:
     assert all(weight.grad is None or weight.grad.device.type == "meta" for weight in emulator.parameters())
 
 
+class WatchCopies(TorchDispatchMode):
+    """Raises where an operation has tensors of the CPU and of the device, which a CUDA graph cannot record."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        tensors = [value for value in (*args, out) if isinstance(value, torch.Tensor)]
+        assert len({value.device.type for value in tensors}) < 2, f"{function} copies between host and device"
+        return out
+
+
 @torch.no_grad()
 def roll(emulator: Emulator, batch: Window, monitor: Monitor | None = None) -> None:
     bundles = list(unroll(emulator.eval(), batch.initial, 2, monitor))
     assert [bundle.position.shape for bundle in bundles] == [(2, emulator.frames, 9, emulator.scene.dim)] * 2
     assert {bundle.position.device.type for bundle in bundles} == {"meta"}
-
-
-PARTS = [
-    *({"processor": part} for part in PROCESSORS),
-    *({"transfer": part} for part in TRANSFERS),
-    *({"decoder": part} for part in DECODERS),
-]
+    context = emulator.context(batch.initial)
+    with WatchCopies():
+        emulator.predict(batch.initial, context)
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: type(next(iter(part.values()))).__name__)
 def test_each_part_trains_and_rolls_out(part):
-    emulator, batch = emulator_of(SCENES["walls"], **part, energy=True, rest_speed=0.01), window(SCENES["walls"])
-    train(emulator, batch, bundles=2)
+    emulator, batch = on_meta(WALLS, **part, energy=True, rest_speed=0.01), window(WALLS)
+    train(emulator, batch)
     with without_kernels(), scatter_backend("sorted" if "transfer" in part else "native"):
         roll(emulator, batch)
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("bounds", ["stop", "reflect"])
-def test_each_kind_of_scene_with_all_constraints_and_without(name, bounds):
-    for limits in ({"energy": True, "rest_speed": 0.1, "density_cap": 2.0}, {"solids": False}):
-        roll(emulator_of(SCENES[name], bounds=bounds, **limits), window(SCENES[name]))
+def test_each_kind_of_scene_with_all_constraints_and_without(name):
+    for limits in ({"energy": True, "rest_speed": 0.1, "density_cap": 2.0}, {"solids": False, "bounds": "reflect"}):
+        roll(on_meta(SCENES[name], **limits), window(SCENES[name]))
 
 
-def test_bounds_that_raise_errors_are_read_back_once_per_bundle(monkeypatch):
-    checked = []
+def test_bounds_that_raise_errors_and_a_monitor_read_back_once_each(monkeypatch):
+    checked, read = [], []
     monkeypatch.setattr("nmpm.emulator.advection.check_within_bounds", lambda path, *_: checked.append(path.shape))
-    emulator, batch = emulator_of(SCENES["walls"], bounds="error", energy=True), window(SCENES["walls"])
-    roll(emulator, batch)
-    train(emulator, batch, bundles=2)
-    assert len(checked) == 4
-
-
-def test_a_monitor_reads_back_only_at_the_end(monkeypatch):
-    read = []
     monkeypatch.setattr(Monitor, "read", lambda self: read.append(self._frames))
-    roll(emulator_of(SCENES["walls"]), window(SCENES["walls"]), Monitor())
-    assert read == [4]
+    emulator, batch = on_meta(WALLS, bounds="error", energy=True), window(WALLS)
+    for _ in unroll(emulator.train(), batch.initial, 2):
+        pass
+    assert len(checked) == 2  # once per bundle
+    with torch.no_grad():
+        list(unroll(emulator.eval(), batch.initial, 2, Monitor()))
+    assert (len(checked), read) == (4, [4])
 
 
 def test_what_the_stand_in_finds():
@@ -127,3 +117,5 @@ def test_what_the_stand_in_finds():
         Contact(torch.zeros(1, 1, 8, 8), grid).hold_all(start, path)
     with pytest.raises(RuntimeError, match="meta"):
         Contact(torch.zeros(1, 1, 8, 8, device="meta"), grid).hold_touching(start, path)
+    with pytest.raises(AssertionError, match="copies between host and device"), WatchCopies():
+        torch.ones(2).to("meta")

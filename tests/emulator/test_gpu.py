@@ -5,34 +5,29 @@ import os
 
 import pytest
 import torch
-from scenes import box, cloud
 
+from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend
-from nmpm.emulator import Emulator, EmulatorRecipe, rollout
-from nmpm.emulator.constraints import Constraints
+from nmpm.emulator import Emulator, rollout
 from nmpm.emulator.prediction import TensorSteps
 from nmpm.emulator.runtimes import Triton, cuda_graph
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from nmpm.transfer import Quadratic, without_kernels
+from tests.scenes import CHANNEL, box, cloud, emulator_of, with_obstacle
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported
-SMALL = UNet(width=4, depth=1, perceptron=(4,))
-FAST = {"count": 60, "batch": 2, "speed": 0.04}
 
 
-def emulator_of(scene, reach: float = 0.3, frames: int = 3, cells=16, decoder=None, **held) -> Emulator:
+def moving(scene, reach: float = 0.3, cells=16, frames: int = 3, **parts) -> Emulator:
     """With random weights that move particles by about `reach` cells in a frame."""
-    torch.manual_seed(0)
-    parts = {} if decoder is None else {"decoder": decoder}
-    recipe = EmulatorRecipe(scene, cells, frames, processor=SMALL, constraints=Constraints(**held), **parts)
-    emulator = recipe.build().eval().requires_grad_(False)
-    emulator.output_scale.fill_(reach)
-    return emulator
+    network = UNet(width=4, depth=1, perceptron=(4,))
+    return emulator_of(scene, cells, frames, processor=network, scale=reach, **parts).requires_grad_(False)
 
 
+FAST = {"count": 60, "batch": 2, "speed": 0.04}
 CASES = {
     "free": (box(), {}, {}),
     "one frame": (box(), {"frames": 1, "rest_speed": 0.1}, {}),
@@ -53,25 +48,18 @@ CASES = {
         {"decoder": Blend(), "energy": True, "rest_speed": 0.1},
         {"batch": 2},
     ),
-    "periodic": (
-        box(boundary=("periodic", "wall"), domain=((0.1, 0.9), (0.08, 0.92))),
-        {"energy": True, "rest_speed": 0.2, "cells": (16, 14)},
-        {"count": 120},
-    ),
+    "periodic": (box(**CHANNEL), {"energy": True, "rest_speed": 0.2, "cells": (16, 14)}, {"count": 120}),
 }
 
 
 def state_of(scene, **motion) -> Particles:
-    """A cloud in which obstacles are a wall of two cells, some of them padded; gravity is not the same everywhere."""
+    """A cloud, some of it padded, where there are obstacles with a wall of two cells; gravity may differ."""
     state = cloud(scene, **{"speed": 0.005} | motion)
-    batch = len(state.position)
     state.mask[:, -3:] = False
-    gravity = torch.tensor([[0.0, 2e-4], [-3e-4, 1e-4]])[:batch] if scene.gravity_varies else state.gravity
     if scene.obstacles:
-        sides = torch.linspace(0.5, 0.6, 6), torch.linspace(0.2, 0.6, 20)
-        wall = torch.cartesian_prod(*sides).expand(batch, -1, -1)
-        state = dataclasses.replace(state, obstacle=wall, obstacle_mask=torch.ones(wall.shape[:2], dtype=torch.bool))
-    return dataclasses.replace(state, gravity=gravity)
+        state = with_obstacle(state, lattice(((0.49, 0.61), (0.2, 0.6)), 0.02))
+    gravity = torch.tensor([[0.0, 2e-4], [-3e-4, 1e-4]])[: len(state.position)]
+    return dataclasses.replace(state, gravity=gravity) if scene.gravity_varies else state
 
 
 def run_again(function, _):
@@ -104,7 +92,7 @@ def triton(monkeypatch, device):
 @pytest.mark.parametrize("name", CASES)
 def test_bundles_are_those_of_tensor_operations(name, device):
     scene, form, motion = CASES[name]
-    emulator, state = emulator_of(scene, **form).to(device), state_of(scene, **motion).to(device)
+    emulator, state = moving(scene, **form).to(device), state_of(scene, **motion).to(device)
     with torch.no_grad():
         context = emulator.context(state)
         for _ in range(2):
@@ -119,34 +107,34 @@ def test_bundles_are_those_of_tensor_operations(name, device):
 
 @pytest.mark.usefixtures("triton")
 def test_rollouts_go_on_from_states_of_any_size_and_precision(device):
-    emulator = emulator_of(box(), energy=True).to(device)
-    quick = emulator.with_runtime("triton")
+    emulator = moving(box(), energy=True).to(device)
     for count in (60, 1, 60):
         state = cloud(box(), count, seed=count).to(device)
-        for own in (state, state.double()):
+        for given in (state, state.double()):
             with without_kernels():
-                expected = rollout(emulator, own, 6)
-            got = rollout(quick, own, 6)
-            assert got.dtype == expected.dtype
-            torch.testing.assert_close(got, expected, rtol=0, atol=1e-4 * emulator.grid.spacing[0])
+                expected = rollout(emulator, given, 6)
+            predicted = rollout(emulator.with_runtime("triton"), given, 6)
+            assert predicted.dtype == expected.dtype
+            torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-4 * emulator.grid.spacing[0])
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda own: own, "needs a CUDA GPU; the model is on cpu"),
-        (lambda own: own.to("cuda"), "needs Triton"),
-        (lambda own: emulator_of(box(3)), "has no kernels for 3 dimensions: use cuda-graph or eager"),
+        (lambda emulator: emulator, "needs a CUDA GPU; the model is on cpu"),
+        (lambda emulator: emulator.to("cuda"), "needs Triton"),
+        (lambda _: moving(box(3)), "has no kernels for 3 dimensions: use cuda-graph or eager"),
         (Emulator.double, "torch.float64"),
-        (lambda own: own.with_constraints(Constraints(bounds="reflect")), "constraints.bounds reflect"),
-        (lambda own: own.rebuilt(dataclasses.replace(own.recipe, transfer=Quadratic())), "the transfer Quadratic"),
-        (lambda own: emulator_of(box(evolving=("heat",))), r"fields \(heat\)"),
+        (lambda _: moving(box(), bounds="reflect"), "constraints.bounds reflect"),
+        (lambda _: moving(box(), transfer=Quadratic()), "the transfer Quadratic"),
+        (lambda _: moving(box(evolving=("heat",))), r"fields \(heat\)"),
     ],
+    ids=["cpu", "no Triton", "3-D", "float64", "bounds", "transfer", "fields"],
 )
 def test_what_the_kernels_do_not_take_is_refused(change, reason, monkeypatch):
-    monkeypatch.setattr(Emulator, "to", lambda own, _: own)
+    monkeypatch.setattr(Emulator, "to", lambda emulator, _: emulator)
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    emulator = change(emulator_of(box()))
+    emulator = change(moving(box()))
     if "cpu" not in reason:
         monkeypatch.setattr(Emulator, "device", torch.device("cuda"))
     with pytest.raises(ConfigError, match=f"The runtime triton .*{reason}"):

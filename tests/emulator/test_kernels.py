@@ -122,18 +122,6 @@ def test_bundles_of_any_kind(
     assert share <= 0.02 if count > 1 else share == 0 or rest or energy
 
 
-@pytest.mark.parametrize(("dim", "cap", "obstacles"), [(2, 0.8, True), (3, 0.02, False)])
-def test_crowds_spread_alike(dim, cap, obstacles):
-    scene = scene_of(dim, (True, False, True), 2, obstacles, slim=True)
-    emulator = emulator_of(scene, cells=12, scale=0.01, density_cap=cap)
-    particles = cloud(scene, 600, 2, 0.0, statics=5 * obstacles)
-    middle = torch.tensor([sum(ends) / 2 for ends in scene.bounds])
-    particles.position[0] = middle + 0.02 * (particles.position[0] - middle)
-    moved = predict_both(emulator, particles)[0][0] - predict_both(emulator.unconstrained(), particles)[0][0]
-    assert moved[0].abs().max() > 10 * LIMIT
-    assert share_that_differs(emulator, particles) <= 0.002
-
-
 def test_single_frames_and_bfloat16():
     emulator = emulator_of(box(), cells=12, frames=1, rest_speed=0.01).with_network(torch.bfloat16)
     assert share_that_differs(emulator, cloud(box(), 60)) == 0

@@ -1,18 +1,16 @@
 """Only what lies on something rests, to the bit; what rests is not computed again; kernels beside tensor operations."""
 
-import numpy as np
+import dataclasses
+
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, unroll
-from nmpm.emulator.fused.rest import find_support
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.rollouts import rollout
-from nmpm.emulator.support import REACH, Support, floor_rows
+from nmpm.emulator.support import REACH, Support
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.transfer import without_kernels
@@ -78,57 +76,23 @@ def test_gaps_of_less_than_the_reach_are_bridged(gap, held):
     assert bool(support[0, 2, 3 + gap]) == held
 
 
-def random_support(seed: int, shape: tuple[int, ...], periodic: tuple[bool, ...], obstacles: bool) -> Support:
-    """Two scenes with random material, obstacles, and wall layers of random thickness."""
-    generator = torch.Generator().manual_seed(seed)
-    layer = (3 * torch.rand(len(shape), 2, generator=generator)).tolist()
-    sides = [
-        (0.0, float(n)) if wraps else (low, n - high)
-        for n, wraps, (low, high) in zip(shape, periodic, layer, strict=True)
-    ]
-    boundary = tuple("periodic" if wraps else "wall" for wraps in periodic)
-    domain = tuple((0.0, float(n)) for n in shape)
-    scene = box(len(shape), bounds=tuple(sides), domain=domain, boundary=boundary, obstacles=True)
-    filled = torch.rand(2, 1, *shape, generator=generator) * (torch.rand(2, 1, *shape, generator=generator) < 0.35)
-    share = torch.rand(2, 1, *shape, generator=generator) * (torch.rand(2, 1, *shape, generator=generator) < 0.15)
-    grid = Grid(shape, (0.0,) * len(shape), (1.0,) * len(shape), periodic)
-    return Support(filled, share if obstacles else None, scene, grid)
+PULLS = {"down": (0.0, -1.0), "to the right": (1.0, 0.0), "diagonal": (0.7, 0.7), "along a channel": (1.0, 0.0)}
 
 
-@given(
-    seed=st.integers(0, 10_000),
-    shape=st.lists(st.integers(7, 12), min_size=2, max_size=3).map(tuple),
-    wraps=st.lists(st.booleans(), min_size=3, max_size=3),
-    gravity=st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), min_size=6, max_size=6),
-    obstacles=st.booleans(),
-)
-@settings(max_examples=12)
-def test_kernels_and_masks_find_the_same_cells(seed, shape, wraps, gravity, obstacles):
-    dim = len(shape)
-    support = random_support(seed, shape, tuple(wraps[:dim]), obstacles)
-    pull = torch.tensor(gravity).view(2, 1, 3)[..., :dim]
-    expected = support.supported_cells(pull)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nmpm.emulator.support.is_eager_cpu", lambda _: False)
-        assert torch.equal(support.supported_cells(pull), expected)
-    floors, held = np.array(floor_rows(support.scene, support.grid)), np.empty(support.grid.size, np.bool_)
-    for scene in range(2):
-        state = support.filled[scene].flatten(1).T.contiguous().numpy()
-        share = np.empty(0, np.float32) if support.obstacle is None else support.obstacle[scene].flatten().numpy()
-        grid = (support.grid.shape, support.grid.periodic)
-        find_support(state, (0, 1), share, pull[scene, 0].numpy(), grid, floors, held)
-        assert np.array_equal(held, expected[scene].flatten().numpy())
-
-
-def test_kernels_hold_what_tensor_operations_hold():
-    scene = box(2, ("water", "sand"), obstacles=True, **CHANNEL)
+@pytest.mark.parametrize("name", PULLS)
+def test_kernels_and_masks_hold_the_same_particles(name, monkeypatch):
+    changes = CHANNEL if "channel" in name else {}
+    scene = box(2, ("water", "sand"), obstacles=True, gravity=None, gravity_varies=True, **changes)
     position = 0.11 + 0.78 * torch.rand(60, 2, generator=torch.Generator().manual_seed(2))
     emulator, state = motionless(scene), state_at_rest(scene, position, lattice(((0.3, 0.5),) * 2, 0.02))
+    state = dataclasses.replace(state, gravity=9.81 * scene.dt**2 * torch.tensor([PULLS[name]]))
     fused = emulator(state).position
     with without_kernels():
         tensors = emulator(state).position
+        monkeypatch.setattr("nmpm.emulator.support.is_eager_cpu", lambda _: False)
+        torch.testing.assert_close(emulator(state).position, tensors, rtol=0, atol=0)
     moved = (tensors[:, -1] - state.position).norm(dim=-1) > 1e-5
-    assert 0.1 < moved.float().mean() < 0.95
+    assert ("channel" in name) or 0.1 < moved.float().mean() < 0.95
     torch.testing.assert_close(fused, tensors, rtol=0, atol=1e-6)
 
 
