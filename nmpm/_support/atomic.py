@@ -104,11 +104,13 @@ def _empty_folders(path: Path) -> Iterator[tuple[Path, Path]]:
         _acquire(held, path)
     try:
         _bring_back(former, path)
-        _delete(new, former)
+        for folder in (new, former):
+            shutil.rmtree(folder, ignore_errors=True)
         new.mkdir()
         yield new, former
     finally:
-        _delete(new, former)
+        for folder in (new, former):
+            shutil.rmtree(folder, ignore_errors=True)
         lock.unlink(missing_ok=True)  # while it is held: who waits for it starts over with a new file
         held.release()
 
@@ -118,19 +120,12 @@ def _bring_back(former: Path, path: Path) -> None:
         os.replace(former, path)
 
 
-def _delete(*folders: Path) -> None:
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
     """Lets one process, and one of its threads, at a time work in a folder, which is created if missing.
 
-    The lock is the operating system's: it ends with the process, however that ends.
-
-    Raises:
-        DataError: if the folder cannot be created or written.
+    The lock is the operating system's: it ends with the process, however that ends. Raises DataError if the folder
+    cannot be created or written.
     """
     lock = FileLock(folder / ".lock")
     try:

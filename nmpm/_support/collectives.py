@@ -64,17 +64,11 @@ def any_rank(condition: bool, device: torch.device) -> bool:
 
 
 def global_mean(mean: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """A mean over this rank's particles as part of the mean over the particles of all ranks (`all_reduce`).
-
-    Nothing is read back from the device.
-
-    Args:
-        mean: () over this rank's particles.
-        count: () their number.
+    """A mean over this rank's `count` particles as part of the mean over those of all ranks (`all_reduce`).
 
     Returns:
-        () this rank's part, in which gradients flow, and () the mean over the particles of all ranks. The parts' mean
-        over ranks is the latter, whatever the counts.
+        () this rank's part, in which gradients flow, and () the mean over all particles, which the parts' mean over
+        ranks is, whatever the counts. Nothing is read back from the device.
     """
     _, world = rank_and_world_size()
     if world == 1:

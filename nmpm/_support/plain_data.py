@@ -149,11 +149,12 @@ def load_plugins() -> tuple[str, ...]:
 
 
 def _find_class(name: str, base: type[T]) -> type[T]:
-    for prepare in (lambda: None, load_plugins):
-        prepare()
+    classes = {class_path(kind): kind for kind in _subclasses(base)}
+    if name not in classes:
+        load_plugins()
         classes = {class_path(kind): kind for kind in _subclasses(base)}
-        if name in classes:
-            return classes[name]
+    if name in classes:
+        return classes[name]
     raise ConfigError(
         f"{base.__name__} {one_line(repr(name), 100)} is not known.{suggestion(name[:100], classes)} Known are"
         f" {', '.join(sorted(classes))}. If it is yours, import its module first: modules that a file names are never"

@@ -26,13 +26,8 @@ class Step(Protocol):
 def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
     """Shows how much is done and the time left; on terminals it vanishes at the end.
 
-    Args:
-        what: Description of the work.
-        total: Number of steps; None where it is unknown.
-        done: Steps that are done already.
-
-    Yields:
-        A function to call after each step.
+    `what` describes the work of `total` steps, None where that is unknown, of which some are `done` already. Yields a
+    function to call after each step.
     """
     console = Console(stderr=True)
     # Without ipywidgets rich would warn at every bar of a notebook.

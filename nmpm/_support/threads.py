@@ -57,12 +57,8 @@ def for_each(work: Callable[[int], object], count: int, threads: int) -> None:
 def map_ranges(function: Callable[[int, int], T], ranges: list[tuple[int, int]], threads: int) -> list[T]:
     """The function's results for each range (low, high), in order.
 
-    Threads live for one call: none is left behind for a process that forks, and none is needed for a single range.
-
-    Args:
-        function: Is called from several threads; it should release the interpreter's lock.
-        ranges: From `split`.
-        threads: How many work at most.
+    The function is called from up to `threads` threads, and should release the interpreter's lock. Threads live for
+    one call: none is left behind for a process that forks, and none is needed for a single range.
     """
     if threads == 1 or len(ranges) < 2:
         return [function(low, high) for low, high in ranges]
@@ -152,22 +148,14 @@ class AbandonedError(Exception):
 
 
 def raise_if_abandoned() -> None:
-    """Stops work whose result is no longer needed.
-
-    Raises:
-        AbandonedError: if the current task was cancelled or the program is about to exit.
-    """
+    """Raise AbandonedError if the current task was cancelled or the program is about to exit."""
     cancelled = _cancelled.get()
     if not threading.main_thread().is_alive() or (cancelled is not None and cancelled.is_set()):
         raise AbandonedError
 
 
 class Task(Generic[T]):
-    """Calls a function in a thread of its own, from now on.
-
-    Args:
-        function: What to call.
-    """
+    """Calls a function in a thread of its own, from now on."""
 
     def __init__(self, function: Callable[[], T]) -> None:
         self._future: Future[T] = Future()
@@ -184,11 +172,9 @@ class Task(Generic[T]):
             self._future.set_exception(error)
 
     def result(self) -> T:
-        """Waits for the function and returns its value.
+        """Wait for the function and return its value, or raise its exception.
 
-        Raises:
-            AbandonedError: if this task, or the one that waits for it, is cancelled.
-            Exception: what the function raised.
+        Raises AbandonedError if this task, or the one that waits for it, is cancelled.
         """
         while not self._future.done():
             raise_if_abandoned()

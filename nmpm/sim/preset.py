@@ -13,6 +13,7 @@ import numpy as np
 
 from nmpm._support.bounded_files import FILE_NAME
 from nmpm._support.messages import one_line
+from nmpm._support.numbers import check_whole
 from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
@@ -196,8 +197,8 @@ class Preset(abc.ABC):
         return cos * x - sin * y, sin * x + cos * y
 
     def with_frames(self, frames: int) -> Self:
-        """The same with another number of frames."""
-        return dataclasses.replace(self, frames=frames)
+        """The same with another number of frames; ConfigError if it is not a positive whole number."""
+        return dataclasses.replace(self, frames=check_whole("frames", frames, 1))
 
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""

@@ -11,21 +11,13 @@ from scipy.spatial import cKDTree
 
 from nmpm.errors import ConfigError
 from nmpm.sim import load_preset
-from nmpm.sim.mpm.layouts import RampRanges, SimulatedRamp, distance_to_ramps
+from nmpm.sim.mpm.layouts import RampRanges
 
 GOOP = load_preset("goop")
 
 
 RAMPS = RampRanges(number=(2, 4), length=(0.1, 0.3), thickness=0.03, angle=(10.0, 50.0), gap=0.05)
 BOX = ((0.1, 0.9), (0.1, 0.9))
-
-ramps = st.builds(
-    SimulatedRamp,
-    centre=st.tuples(st.floats(0.2, 0.8), st.floats(0.2, 0.8)),
-    length=st.floats(0.05, 0.4),
-    thickness=st.floats(0.01, 0.05),
-    angle=st.floats(-math.pi, math.pi),
-)
 
 
 @settings(max_examples=15, deadline=None)
@@ -47,26 +39,6 @@ def test_blocks_keep_to_the_preset(seed):
         if len(others):
             apart = cKDTree(others).query(start.position[block.ravel() == this])[0]
             assert apart.min() >= gap
-
-
-@given(ramp=ramps, seed=st.integers(0, 1000))
-@settings(max_examples=15, deadline=None)
-def test_distances_are_those_to_the_densely_sampled_outline(ramp, seed):
-    points = np.random.default_rng(seed).uniform(0, 1, (200, 2))
-    corners = ramp.outline()[::24]
-    sides = [np.linspace(a, b, 2000) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    nearest = cKDTree(np.concatenate(sides)).query(points)[0]
-    distance = ramp.distance(points)
-    np.testing.assert_allclose(np.abs(distance), nearest, atol=2e-4)
-    along = np.array([math.cos(ramp.angle), math.sin(ramp.angle)])
-    across = np.array([-along[1], along[0]])
-    local = points - np.array(ramp.centre)
-    inside = (np.abs(local @ along) < ramp.length / 2) & (np.abs(local @ across) < ramp.thickness / 2)
-    np.testing.assert_array_equal(distance < 0, inside)
-    shift = np.array([0.4, -1.5])
-    np.testing.assert_allclose(ramp.moved(shift).distance(points + shift), distance, atol=1e-12)
-    both = distance_to_ramps((ramp, ramp.moved(shift)), points)
-    np.testing.assert_array_equal(both, np.minimum(distance, ramp.moved(shift).distance(points)))
 
 
 @given(seed=st.integers(0, 2**32), low=st.tuples(st.floats(0.15, 0.5), st.floats(0.4, 0.6)))

@@ -5,7 +5,6 @@ import dataclasses
 import h5py
 import numpy as np
 import pytest
-from columns import lattice
 
 from nmpm.sim import InitialState, load_preset
 from nmpm.sim.mpm.solids import Sand
@@ -79,15 +78,3 @@ def test_walls_that_hold_let_particles_a_cell_and_a_half_beyond_the_box():
     assert dataclasses.replace(WATERDROP, walls="separate").reach == WATERDROP.box
     deepest = np.array([[0.1, 0.086], [0.5, 0.0915]])
     assert WATERDROP.simulate_from(InitialState(deepest, np.zeros((2, 2))), 5).position.min() > 0.085
-
-
-def test_coarser_grids_converge_to_the_fine_one():
-    position = lattice((0.4, 0.3), (0.784, 0.684), GOOP.spacing)
-    start = InitialState(position, np.tile([1.0, 0.0], (len(position), 1)))
-    fine = GOOP.simulate_from(start, 120).position
-    coarse = [GOOP.coarsened(factor).simulate_from(start, 120) for factor in (2, 4, 8)]
-    errors = [np.mean((made.position - fine) ** 2) for made in coarse]
-    still = np.mean((fine - fine[0]) ** 2)
-    assert errors[0] < errors[1] < errors[2] < still
-    assert errors[0] < 0.05 * still
-    assert all(made.attributes["held_back"] == 0 for made in coarse)
