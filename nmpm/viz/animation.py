@@ -149,7 +149,14 @@ class GifPalette:
         mosaic = Image.fromarray(np.concatenate(list(samples)))
         frequent = mosaic.quantize(TRANSPARENT - len(kept), method=Image.Quantize.MEDIANCUT).getpalette() or []
         self._colours = np.array(kept + np.reshape(frequent, (-1, 3)).tolist(), dtype=np.uint8)
-        self._table = self._build_table(np.array(kept, dtype=np.uint8))
+        # The nearest entry to the centre of every table cell; the cell of a kept colour has that colour's entry.
+        levels = (np.arange(1 << BITS, dtype=np.float32) + 0.5) * (1 << 8 - BITS)
+        cells = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+        colours = self._colours.astype(np.float32)
+        # |a - b|^2 without |a|^2, which does not change the nearest entry.
+        distance = np.square(colours).sum(axis=1) - 2 * cells @ colours.T
+        self._table = np.asarray(np.argmin(distance, axis=1), dtype=np.uint8)
+        self._table[_table_index(np.array(kept, dtype=np.uint8))] = np.arange(len(kept))
 
     def quantize(self, frame: NDArray[np.uint8]) -> Image.Image:
         """Converts a frame (H, W, 3) to an image with this palette."""
@@ -157,17 +164,6 @@ class GifPalette:
         padding = np.zeros((PALETTE_SIZE - len(self._colours), 3), dtype=np.uint8)
         image.putpalette(np.concatenate([self._colours, padding]).tobytes())
         return image
-
-    def _build_table(self, kept: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The nearest entry to the centre of every table cell; the cell of a kept colour has that colour's entry."""
-        levels = (np.arange(1 << BITS, dtype=np.float32) + 0.5) * (1 << 8 - BITS)
-        cells = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
-        colours = self._colours.astype(np.float32)
-        # |a - b|^2 without |a|^2, which does not change the nearest entry.
-        distance = np.square(colours).sum(axis=1) - 2 * cells @ colours.T
-        table = np.asarray(np.argmin(distance, axis=1), dtype=np.uint8)
-        table[_table_index(kept)] = np.arange(len(kept))
-        return table
 
 
 def _table_index(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:

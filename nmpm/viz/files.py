@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +40,17 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
     scene, names, static, label = _describe(split, trajectory, family)
     moving = ~np.isin(trajectory.particle_type, sorted(static))
     fields = read_fields(split, index, scene.particle_fields)
-    positions = _beside_truth(split, index, trajectory, label)
+    position = trajectory.position
+    positions = {label: position}
+    truth = split.fields(index).get(TRUTH) if label == "prediction" else None
+    if truth is not None:
+        if truth.dtype.kind not in "iuf" or truth.ndim != 3 or truth.shape[1:] != position.shape[1:] or not len(truth):
+            raise DataError(
+                f"{split.where(index)}: truth has the shape {truth.shape} and the type {truth.dtype}, beside positions"
+                f" of the shape {position.shape}. Both should be (frames, particles, dimensions) of the same particles."
+            )
+        common = min(len(truth), len(position))
+        positions = {TRUTH: truth[:common], label: position[:common]}
     frames = len(positions[label])
     return LabelledTrajectories(
         positions={name: position[:, moving] for name, position in positions.items()},
@@ -76,21 +83,6 @@ def label_trajectory(
         gravity=trajectory_gravity(trajectory.attributes, scene, title),
         title=title,
     )
-
-
-def _beside_truth(split: Split, index: int, trajectory: Trajectory, label: str) -> dict[str, np.ndarray]:
-    """The positions of a prediction, after those of its truth where the file has it."""
-    position = trajectory.position
-    truth = split.fields(index).get(TRUTH) if label == "prediction" else None
-    if truth is None:
-        return {label: position}
-    if truth.dtype.kind not in "iuf" or truth.ndim != 3 or truth.shape[1:] != position.shape[1:] or not len(truth):
-        raise DataError(
-            f"{split.where(index)}: truth has the shape {truth.shape} and the type {truth.dtype}, beside positions of"
-            f" the shape {position.shape}. Both should be (frames, particles, dimensions), of the same particles."
-        )
-    frames = min(len(truth), len(position))
-    return {TRUTH: truth[:frames], label: position[:frames]}
 
 
 def combine(
@@ -141,24 +133,23 @@ def combine(
 def _describe(
     split: Split, trajectory: Trajectory, family: str | None
 ) -> tuple[Scene, dict[int, str], frozenset[int], str]:
-    """Scene, names of type ids, static ids, label: from a rollout's own attributes, otherwise from metadata.json."""
-    if "scene" in trajectory.attributes:
-        return *_read_facts(trajectory.attributes, split.path), "prediction"
-    metadata = read_metadata(split.path.parent, family)
-    label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
-    return infer_scene(split.path.parent, Options(family)), dict(metadata.particle_types), metadata.static_types, label
+    """Scene, names of type ids, ids that do not move, and label, from metadata.json or a prediction's attributes.
 
-
-def _read_facts(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[int, str], frozenset[int]]:
-    """Scene, names of type ids, and ids that do not move, as `nmpm.data.predictions` stores them."""
+    `nmpm.data.predictions` stores these attributes.
+    """
+    attributes, path = trajectory.attributes, split.path
+    if "scene" not in attributes:
+        metadata = read_metadata(path.parent, family)
+        label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
+        return infer_scene(path.parent, Options(family)), dict(metadata.particle_types), metadata.static_types, label
     texts = {key: attributes.get(key) for key in ("scene", "particle_types")}
     if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
         raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
-    scene, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
+    plain, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
     static = np.asarray(attributes.get("static_types")).tolist()
     keys = JsonKeys(path, {"particle_types": names, "static_types": static})
     try:
-        facts = Scene.from_dict(scene)
+        scene = Scene.from_dict(plain)
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from error
-    return facts, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids)
+    return scene, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids), "prediction"

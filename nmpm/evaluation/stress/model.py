@@ -46,11 +46,7 @@ class ModelUnderTest:
         return self.emulator.device
 
     def starts(self, count: int) -> Particles:
-        """Initial states of scenes of the kind that the model was trained on: the simulator's, else one thrown block.
-
-        Args:
-            count: Scenes; without a simulator there is one.
-        """
+        """Initial states of `count` scenes of the kind that the model was trained on; else one thrown block."""
         if self.preset is not None:
             return simulate_window(self, self.preset, count, 0).initial
         scene = self.emulator.scene
@@ -68,13 +64,7 @@ class ModelUnderTest:
 
 
 def simulate_window(model: ModelUnderTest, preset: Preset, count: int, frames: int) -> Window:
-    """Scenes of a preset with `frames` frames after the two that an emulator starts from, on the model's device.
-
-    Args:
-        model: Says which scenes.
-        preset: Draws their initial states and simulates them.
-        count: Scenes.
-        frames: Frames after the first two.
+    """Some scenes of a preset with `frames` frames after the two that an emulator starts from, on the model's device.
 
     Raises:
         UnstableError: if the simulator does not stay stable from several seeds in a row.

@@ -9,13 +9,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
 from nmpm._support.atomic import atomic_write
 
-VERDICTS = {True: "pass", False: "FAIL", None: "–"}
+_VERDICTS = {True: ("pass", "green"), False: ("FAIL", "red"), None: ("–", "dim")}
 
 
 @dataclass(frozen=True)
@@ -82,10 +81,8 @@ FULL = Effort(
 )
 
 
-def row(result: TestResult) -> tuple[str, str, str]:
-    """Verdict, what was tested, and what was measured, in words."""
-    figures = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in result.figures.items())
-    return VERDICTS[result.passed], result.name, figures
+def _figures(result: TestResult) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in result.figures.items())
 
 
 def table(title: str, results: Sequence[TestResult]) -> Table:
@@ -99,9 +96,8 @@ def table(title: str, results: Sequence[TestResult]) -> Table:
             group = result.group
             drawn.add_section()
             drawn.add_row("", f"[bold]{group}[/bold]", "")
-        verdict, name, figures = row(result)
-        colour = {True: "green", False: "red", None: "dim"}[result.passed]
-        drawn.add_row(f"[{colour}]{verdict}[/{colour}]", name, figures)
+        verdict, colour = _VERDICTS[result.passed]
+        drawn.add_row(f"[{colour}]{verdict}[/{colour}]", result.name, _figures(result))
     return drawn
 
 
@@ -114,13 +110,8 @@ def summary(results: Sequence[TestResult]) -> str:
 
 def as_json(subject: str, size: str, seconds: float, results: Sequence[TestResult]) -> str:
     """The whole report as JSON."""
-    plain: dict[str, Any] = {
-        "model": subject,
-        "size": size,
-        "seconds": round(seconds, 1),
-        "lines": [asdict(result) for result in results],
-    }
-    return json.dumps(plain, indent=1)
+    lines = [asdict(result) for result in results]
+    return json.dumps({"model": subject, "size": size, "seconds": round(seconds, 1), "lines": lines}, indent=1)
 
 
 def write(folder: Path, text: str, results: Sequence[TestResult], stem: str = "stress") -> list[Path]:
@@ -129,16 +120,12 @@ def write(folder: Path, text: str, results: Sequence[TestResult], stem: str = "s
     paths = [folder / f"{stem}.{suffix}" for suffix in ("json", "md", "png")]
     with atomic_write(paths[0]) as part:
         part.write_text(text + "\n", encoding="utf-8")
+    rows = ["| | test | measured | needed |", "|---|---|---|---|"]
+    rows += [f"| {_VERDICTS[each.passed][0]} | {each.name} | {_figures(each)} | {each.needs} |" for each in results]
     with atomic_write(paths[1]) as part:
-        part.write_text(_markdown(results), encoding="utf-8")
+        part.write_text("\n".join(rows) + "\n", encoding="utf-8")
     _draw(paths[2], results)
     return paths
-
-
-def _markdown(results: Sequence[TestResult]) -> str:
-    head = ["| | test | measured | needed |", "|---|---|---|---|"]
-    body = [f"| {' | '.join(row(result))} | {result.needs} |" for result in results]
-    return "\n".join(head + body) + "\n"
 
 
 def _draw(path: Path, results: Sequence[TestResult]) -> None:

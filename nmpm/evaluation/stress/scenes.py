@@ -17,22 +17,22 @@ from nmpm.evaluation.stress.model import ModelUnderTest, simulate_window
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, rms_distance, trace_bundles, trace_rollout
 from nmpm.particles import Particles, Window
-from nmpm.scene import Scene
 
 SPEEDS = (0.0, 1e-3, 1.0, 3.0, 10.0)
 GRAVITIES = (0.0, 0.5, 2.0, -1.0)
 VOLUME_SHARE = 0.1
 """Share of the box that the block of material fills, whatever its number of particles."""
 
-_SPEEDS, _COUNTS, _SIZES = "fast and slow", "many and few", "size and symmetry"
+_COUNTS, _SIZES = "many and few", "size and symmetry"
 
 
 def speeds(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
     """Initial speeds and gravity times a factor, beside the simulator where there is one that stays stable."""
-    for factor in SPEEDS:
-        yield _speed_result(model, f"initial speed × {factor:g}", _changed_window(model, effort, speed=factor))
-    for factor in GRAVITIES:
-        yield _speed_result(model, f"gravity × {factor:g}", _changed_window(model, effort, gravity=factor))
+    changes = {f"initial speed × {factor:g}": (factor, 1.0) for factor in SPEEDS}
+    changes |= {f"gravity × {factor:g}": (1.0, factor) for factor in GRAVITIES}
+    for name, (speed, gravity) in changes.items():
+        trace, figures = compare_window(model, _changed_window(model, effort, speed, gravity))
+        yield TestResult("fast and slow", name, trace.valid, figures, INVARIANTS)
 
 
 def compare_window(model: ModelUnderTest, window: Window) -> tuple[Trace, dict[str, float]]:
@@ -52,12 +52,7 @@ def compare_window(model: ModelUnderTest, window: Window) -> tuple[Trace, dict[s
     return trace, trace.figures() | errors
 
 
-def _speed_result(model: ModelUnderTest, name: str, window: Window) -> TestResult:
-    trace, figures = compare_window(model, window)
-    return TestResult(_SPEEDS, name, trace.valid, figures, INVARIANTS)
-
-
-def _changed_window(model: ModelUnderTest, effort: Effort, *, speed: float = 1.0, gravity: float = 1.0) -> Window:
+def _changed_window(model: ModelUnderTest, effort: Effort, speed: float, gravity: float) -> Window:
     """Scenes with initial speeds and gravity times a factor: simulated, or two frames and nothing to compare with."""
     if model.preset is not None:
         with suppress(UnstableError):
@@ -139,23 +134,17 @@ def _wide(model: ModelUnderTest, times: int, effort: Effort) -> TestResult:
         preset = model.preset.widened(times)
         window, scene = simulate_window(model, preset, effort.scenes, effort.compared), preset.scene
     else:
-        window, scene = Window.of(model.starts(1)), widen_scene(model.emulator.scene, times)
+        window, scene = Window.of(model.starts(1)), model.emulator.scene
+        longer = (times - 1) * (scene.domain[0][1] - scene.domain[0][0])
+        (low, high), (first, last) = scene.bounds[0], scene.domain[0]
+        bounds, domain = ((low, high + longer), *scene.bounds[1:]), ((first, last + longer), *scene.domain[1:])
+        scene = dataclasses.replace(scene, bounds=bounds, domain=domain)
     try:
         wide = model.with_emulator(model.emulator.over(scene))
     except ConfigError as error:
         return TestResult(_SIZES, f"{name}: {error}", None, {})
     trace, figures = compare_window(wide, window)
     return TestResult(_SIZES, name, trace.valid, figures, INVARIANTS)
-
-
-def widen_scene(scene: Scene, times: int) -> Scene:
-    """A scene whose domain is `times` as wide, with the same wall layers."""
-    longer = (times - 1) * (scene.domain[0][1] - scene.domain[0][0])
-    return dataclasses.replace(
-        scene,
-        bounds=((scene.bounds[0][0], scene.bounds[0][1] + longer), *scene.bounds[1:]),
-        domain=((scene.domain[0][0], scene.domain[0][1] + longer), *scene.domain[1:]),
-    )
 
 
 def _with_cells(model: ModelUnderTest, name: str, factor: float, effort: Effort) -> TestResult:
@@ -182,7 +171,7 @@ def _symmetries(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
     mirror = centre.new_ones(scene.dim)
     mirror[0] = -1
 
-    def mirror_first_axis(values: Tensor) -> Tensor:
+    def reflect(values: Tensor) -> Tensor:
         return values * mirror
 
     def turn(values: Tensor) -> Tensor:
@@ -191,7 +180,7 @@ def _symmetries(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
     def back(values: Tensor) -> Tensor:
         return torch.stack([values[..., 1], -values[..., 0], *values.unbind(-1)[2:]], dim=-1)
 
-    moves = {"reflection": (mirror_first_axis, mirror_first_axis)}
+    moves = {"reflection": (reflect, reflect)}
     if scene.dim > 1 and scene.bounds[0] == scene.bounds[1] and grid.shape[0] == grid.shape[1]:
         moves["a quarter turn, gravity with it"] = (turn, back)
     for name, (there, home) in moves.items():

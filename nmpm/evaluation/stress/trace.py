@@ -80,15 +80,17 @@ def trace_bundles(emulator: Emulator, start: Particles, bundles: Iterable[Tensor
     scene, real = emulator.scene, start.mask
     begun = energy_above_lowest(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
     spacing = start.position.new_tensor(emulator.grid.spacing)
+    negligible = (
+        0.5 * (1e-6 * max(high - low for low, high in scene.domain)) ** 2
+    )  # a millionth of the domain per frame
     gains, speeds, losses, volumes = [], [], [], []
     last, frame = start.position, 0
     for bundle in bundles:
         path = torch.cat([last.unsqueeze(1), bundle], dim=1)
         steps = path.diff(dim=1)
-        gains.append(
-            (energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=_negligible_energy(scene))
-        )
-        speeds.append(_largest((steps / spacing).norm(dim=-1), real))
+        gains.append((energy_above_lowest(scene, start, bundle, steps) - begun) / begun.clamp(min=negligible))
+        speed = torch.where(real.unsqueeze(1), (steps / spacing).norm(dim=-1), 0.0)
+        speeds.append(speed.amax(-1) if real.shape[1] else speed.sum(-1))
         losses.append((is_lost(scene, bundle) & real.unsqueeze(1)).sum(-1))
         last = bundle[:, -1]
         if every and (frame + bundle.shape[1]) // every > frame // every:
@@ -157,15 +159,3 @@ def filled_volume(emulator: Emulator, start: Particles, position: Tensor) -> Ten
     fraction = volume_fraction(scene, grid, emulator.transfer, start.mask, cells)
     volume = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
     return fraction.clamp(max=1.0).flatten(1).sum(1) / volume
-
-
-def _largest(values: Tensor, real: Tensor) -> Tensor:
-    """(B, T): largest of (B, T, N) over real particles, 0 where there are none."""
-    if not values.shape[-1]:
-        return values.new_zeros(values.shape[:2])
-    return torch.where(real.unsqueeze(1), values, 0.0).amax(-1)
-
-
-def _negligible_energy(scene: Scene) -> float:
-    """A negligible energy: that of a speed of a millionth of the domain per frame."""
-    return 0.5 * (1e-6 * max(high - low for low, high in scene.domain)) ** 2

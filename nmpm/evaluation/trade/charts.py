@@ -45,7 +45,6 @@ _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
 _FAR = 100  # a line further below all points than this factor is named in the title, not drawn
 _MOVES = 300  # of the names that are in each other's way
 _PANEL = 420  # pixels of a square panel's side
-_DPI = 130
 
 
 def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
@@ -182,7 +181,7 @@ def _first_forms(points: Sequence[Point]) -> list[Point]:
     return list(first.values())[::-1]
 
 
-def _figure(width: float, height: float, dpi: int = _DPI) -> Figure:
+def _figure(width: float, height: float, dpi: int = 130) -> Figure:
     figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -52,7 +52,7 @@ class Choice(ABC):
     Args:
         kind: Kind of predictor.
         name: Unique among the choices that are compared.
-        settings: Its settings, by column of the table.
+        settings: By column of the table.
         batch: Scenes predicted at once when it is timed; predictions do not depend on it.
         device: Where it computes.
     """
@@ -99,11 +99,7 @@ def digest(plain: Any) -> str:
 
 
 def require_finite(position: Tensor) -> Tensor:
-    """The positions (B, T, N, D).
-
-    Raises:
-        DataError: if any is not finite, naming the first such frame.
-    """
+    """The positions (B, T, N, D); raises DataError if any is not finite, naming the first such frame."""
     broken = (~position.isfinite()).flatten(2).any(-1).any(0)
     if bool(broken.any()):
         raise DataError(f"Positions are not finite from predicted frame {int(broken.nonzero()[0, 0]) + 1} on.")

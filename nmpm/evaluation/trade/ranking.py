@@ -178,11 +178,7 @@ _BEST = {Kind.MODEL: "the best emulator", Kind.SIMULATOR: "the best simulator se
 
 
 def recommend(points: Sequence[Point]) -> list[Recommendation]:
-    """Recommend a choice for any budget of milliseconds per frame of one scene: steps from the least budget on.
-
-    Args:
-        points: All of them; those that predict several scenes at once are left out, as a budget is for one scene.
-    """
+    """Recommend a choice for any budget of milliseconds per frame of one scene: steps from the least budget on."""
     ranks = rank(points)
     unit = Unit.of(one.mean for one in ranks.values())
 

@@ -90,11 +90,7 @@ class Scenes:
 
 
 def find_scenes(dataset: str, count: int) -> Scenes:
-    """Test scenes of a dataset, `count` at most; of an embedded one that is missing, only these are simulated.
-
-    Args:
-        dataset: Name of an embedded dataset, or a folder in native layout.
-        count: The dataset may have fewer.
+    """Test scenes of an embedded dataset or a folder in native layout, `count` at most; simulated if missing.
 
     Raises:
         ConfigError: if there is no such dataset.
@@ -130,12 +126,7 @@ def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
 
 
 def read_scenes(name: str, folder: Path, count: int) -> Scenes:
-    """The first `count` test trajectories of a dataset in native layout.
-
-    Args:
-        name: Of the dataset.
-        folder: Holds `test.h5` and `metadata.json`.
-        count: Fewer where the split has fewer.
+    """The first `count` test trajectories of a dataset in native layout; fewer where the split has fewer.
 
     Raises:
         DataError: if files are missing or wrong.

@@ -129,11 +129,7 @@ def shipped_sweep_text(name: str) -> str:
 
 
 def read_sweep(text: str, where: str) -> Sweep:
-    """The sweep of a YAML text; what it leaves out is as `nmpm trade` has it.
-
-    Args:
-        text: Content of the file.
-        where: Name of the file, for errors.
+    """The sweep of a YAML text; what it leaves out is as `nmpm trade` has it. Errors name the file `where`.
 
     Raises:
         DataError: if it is not plain YAML.

@@ -20,9 +20,6 @@ def view(what: LabelledTrajectories | Path | str, truth: Path | str | None = Non
         what: Labelled trajectories, or an HDF5 file, whose first trajectory is shown.
         truth: An HDF5 file whose first trajectory starts in the same way; errors are against it.
         every: Shows every so many frames.
-
-    Raises:
-        DataError, ConfigError: as `page_of_files` does.
     """
     if isinstance(what, LabelledTrajectories):
         return ViewerPage(what, every)
