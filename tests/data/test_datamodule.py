@@ -15,7 +15,6 @@ from nmpm.particles import Window
 
 TRAIN = ((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))
 
-
 pytestmark = pytest.mark.filterwarnings("ignore:`isinstance.treespec", "ignore:.*was called without a model")
 
 
@@ -25,9 +24,7 @@ class Recorder(LightningModule):
     def __init__(self, fail_at: int | None = None) -> None:
         super().__init__()
         self.offset = torch.nn.Parameter(torch.zeros(2))
-        self.fail_at = fail_at
-        self.seen: list[float] = []
-        self.evaluated: list[torch.Size] = []
+        self.fail_at, self.seen, self.evaluated = fail_at, list[float](), list[torch.Size]()
 
     def training_step(self, batch: Window, batch_idx: int) -> torch.Tensor:
         if len(self.seen) == self.fail_at:
@@ -47,15 +44,9 @@ class Recorder(LightningModule):
 
 def trainer_of(folder, *callbacks, **options) -> Trainer:
     known = {
-        "accelerator": "cpu",
-        "logger": False,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-        "default_root_dir": folder,
-        "limit_val_batches": 0,
-        "enable_checkpointing": bool(callbacks),
-        "max_epochs": -1,
-    }
+        "accelerator": "cpu", "logger": False, "enable_progress_bar": False, "enable_model_summary": False,
+        "default_root_dir": folder, "limit_val_batches": 0, "enable_checkpointing": bool(callbacks), "max_epochs": -1,
+    }  # fmt: skip
     return Trainer(callbacks=list(callbacks), **(known | options))
 
 
@@ -63,80 +54,67 @@ def module_of(folder, **options) -> TrajectoryDataModule:
     return TrajectoryDataModule(**({"path": str(folder), "horizon": 3, "batch_size": 2, "buffer_size": 2} | options))
 
 
-SETTINGS = {
-    "plain": {},
-    "accumulating": {"accumulate_grad_batches": 2},
-    "in short epochs": {"limit_train_batches": 5},
-    "accumulating in short epochs": {"limit_train_batches": 5, "accumulate_grad_batches": 2},
-    "validating": {"val_check_interval": 3, "check_val_every_n_epoch": None, "limit_val_batches": 1.0},
-    "validating in short epochs": {"val_check_interval": 2, "limit_train_batches": 6, "limit_val_batches": 1.0},
-}
+VALIDATING = {"val_check_interval": 3, "check_val_every_n_epoch": None, "limit_val_batches": 1.0}
+SETTINGS = [  # options of the trainer, the step after which it stops, and whether it goes on from last.ckpt
+    ({}, 3, True),
+    ({"limit_train_batches": 5, "accumulate_grad_batches": 2}, 3, True),
+    (VALIDATING, 5, False),
+    *(
+        pytest.param(*values, marks=pytest.mark.slow)
+        for values in (
+            ({"accumulate_grad_batches": 2}, 5, True),
+            ({"limit_train_batches": 5}, 6, False),
+            ({"val_check_interval": 2, "limit_train_batches": 6, "limit_val_batches": 1.0}, 6, True),
+        )
+    ),
+]
 
 
 @pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`", "ignore:.fit.ckpt_path=")
 class TestResuming:
-    @pytest.mark.parametrize(("name", "stop"), list(zip(SETTINGS, (3, 5, 6, 3, 5, 6), strict=True)))
-    @pytest.mark.parametrize("last", [True, pytest.param(False, marks=pytest.mark.slow)])
-    def test_resumed_training_sees_the_same_batches(self, make_dataset, tmp_path, name, stop, last):
-        folder, options = make_dataset(train=TRAIN), SETTINGS[name]
-        straight = Recorder()
+    @pytest.mark.parametrize(("options", "stop", "last"), SETTINGS)
+    def test_resumed_training_sees_the_same_batches(self, make_dataset, tmp_path, options, stop, last):
+        folder = make_dataset(train=TRAIN)
+        straight, first, second = Recorder(), Recorder(), Recorder()
         trainer_of(tmp_path, max_steps=11, **options).fit(straight, datamodule=module_of(folder))
-
-        first = Recorder()
-        saving = ModelCheckpoint(
-            tmp_path / "saved", filename="{step}", save_top_k=-1, every_n_train_steps=1, save_last=last
-        )
+        name, saved = "{step}", tmp_path / "saved" / ("last.ckpt" if last else f"step={stop}.ckpt")
+        saving = ModelCheckpoint(saved.parent, name, save_top_k=-1, every_n_train_steps=1, save_last=last)
         trainer_of(tmp_path, saving, max_steps=stop, **options).fit(first, datamodule=module_of(folder))
-        second = Recorder()
-        saved = tmp_path / "saved" / ("last.ckpt" if last else f"step={stop}.ckpt")
         trainer_of(tmp_path, max_steps=11, **options).fit(second, datamodule=module_of(folder), ckpt_path=saved)
-
         assert first.seen + second.seen == straight.seen
         assert len(straight.seen) >= 11
         assert torch.equal(second.offset, straight.offset)
 
-    def test_an_interrupted_batch_is_repeated(self, make_dataset, tmp_path):
-        folder = make_dataset(train=TRAIN)
+    def test_an_interrupted_batch_is_repeated_and_a_new_run_starts_at_the_beginning(self, make_dataset, tmp_path):
+        module = module_of(make_dataset(train=TRAIN))
         straight, broken, resumed = Recorder(), Recorder(fail_at=4), Recorder()
-        trainer_of(tmp_path, max_steps=9).fit(straight, datamodule=module_of(folder))
+        trainer_of(tmp_path, max_steps=9).fit(straight, datamodule=module)
         with pytest.raises(RuntimeError, match="interrupted"):
-            trainer_of(tmp_path, OnExceptionCheckpoint(tmp_path, "broken"), max_steps=9).fit(
-                broken, datamodule=module_of(folder)
-            )
+            trainer_of(tmp_path, OnExceptionCheckpoint(tmp_path, "broken"), max_steps=9).fit(broken, datamodule=module)
         saved = tmp_path / "broken.ckpt"
-        trainer_of(tmp_path, max_steps=9).fit(resumed, datamodule=module_of(folder), ckpt_path=saved)
+        trainer_of(tmp_path, max_steps=9).fit(resumed, datamodule=module, ckpt_path=saved)
         assert broken.seen + resumed.seen == straight.seen
         assert torch.equal(resumed.offset, straight.offset)
 
-    def test_a_new_run_starts_at_the_beginning(self, make_dataset, tmp_path):
-        module = module_of(make_dataset(train=TRAIN))
-        first, second = Recorder(), Recorder()
-        trainer_of(tmp_path, max_steps=4).fit(first, datamodule=module)
-        trainer_of(tmp_path, max_steps=4).fit(second, datamodule=module)
-        assert first.seen == second.seen
-
 
 @pytest.mark.filterwarnings("ignore:predict returned None")
-class TestTrainer:
-    def test_runs_every_stage(self, make_dataset, tmp_path):
-        module, model = module_of(make_dataset(train=TRAIN)), Recorder()
-        trainer = trainer_of(tmp_path, max_steps=2, limit_val_batches=1.0)
-        trainer.fit(model, datamodule=module)
-        model.evaluated.clear()
-        for stage in (trainer.validate, trainer.test, trainer.predict):
-            stage(model, datamodule=module)
-        whole = [torch.Size((2, 12, 5, 2)), torch.Size((2, 12, 6, 2)), torch.Size((1, 15, 4, 2))]
-        assert model.evaluated == whole + whole[1:]
+def test_every_stage_runs(make_dataset, tmp_path):
+    module, model = module_of(make_dataset(train=TRAIN)), Recorder()
+    trainer = trainer_of(tmp_path, max_steps=2, limit_val_batches=1.0)
+    trainer.fit(model, datamodule=module)
+    model.evaluated.clear()
+    for stage in (trainer.validate, trainer.test, trainer.predict):
+        stage(model, datamodule=module)
+    whole = [torch.Size((2, 12, 5, 2)), torch.Size((2, 12, 6, 2)), torch.Size((1, 15, 4, 2))]
+    assert model.evaluated == whole + whole[1:]
 
 
 def as_rank(module: TrajectoryDataModule, rank: int, world: int, device: str = "cpu") -> TrajectoryDataModule:
     progress = SimpleNamespace(total=SimpleNamespace(processed=0))
     loop = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=progress))
+    strategy = SimpleNamespace(root_device=torch.device(device))
     module.trainer = SimpleNamespace(  # type: ignore[assignment]
-        global_rank=rank,
-        world_size=world,
-        fit_loop=loop,
-        strategy=SimpleNamespace(root_device=torch.device(device)),
+        global_rank=rank, world_size=world, fit_loop=loop, strategy=strategy
     )
     return module
 
@@ -145,17 +123,16 @@ class TestEvaluation:
     @pytest.mark.parametrize(("world", "batch_size"), [(1, 2), (2, 8), (3, 1)])
     def test_each_trajectory_is_on_exactly_one_rank(self, make_dataset, world, batch_size):
         sizes = ((12, 5), (15, 4), (12, 6), (12, 7), (15, 3), (13, 2), (12, 3))
-        folder = make_dataset(test=sizes)
-        seen: Counter[int] = Counter()
+        folder, seen = make_dataset(test=sizes), Counter[int]()
         for rank in range(world):
             module = as_rank(module_of(folder, eval_batch_size=batch_size), rank, world)
-            loader = module.test_dataloader()
+            loader, split = module.test_dataloader(), module.data_source.recordings("test").split
             assert len(loader) == len(loader.batches) >= 1
             for batch, window in zip(loader.batches, loader, strict=True):
                 assert len(batch) == len(window.frames) <= batch_size
                 seen.update(batch)
                 for row, index in enumerate(batch):
-                    truth = torch.from_numpy(module.data_source.recordings("test").split.read(index).position)
+                    truth = torch.from_numpy(split.read(index).position)
                     assert torch.equal(window.frames[row, :, window.mask[row]], truth)
         assert seen == Counter(range(7))
 
@@ -171,44 +148,23 @@ class TestEvaluation:
         assert loader.batches == ((),)
         assert window.frames.shape[:2] == (0, 12)
 
-    def test_nothing_to_predict(self, make_dataset):
-        with pytest.raises(DataError, match="trajectory 00000: it has 2 frames, an evaluation needs 3"):
-            module_of(make_dataset(valid=((2, 5),))).val_dataloader()
+
+def test_ranks_train_on_different_windows(make_dataset):
+    loaders = [as_rank(module_of(make_dataset(train=TRAIN)), rank, 2).train_dataloader() for rank in (0, 1)]
+    batches = [[window.frames.sum() for window in islice(loader, 6)] for loader in loaders]
+    assert not set(map(float, batches[0])) & set(map(float, batches[1]))
 
 
-class TestEmbedded:
-    @pytest.fixture(autouse=True)
-    def empty_home(self, tmp_path, monkeypatch):
-        monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
-
-    def test_simulates_on_first_use(self, tmp_path):
-        options = {"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 6}
-        module = TrajectoryDataModule(name="goop", horizon=3, batch_size=2, generate=options)
-        model = Recorder()
-        trainer_of(tmp_path, max_steps=2).fit(model, datamodule=module)
-        assert len(model.seen) == 2
-        assert len(module.data_source.recordings("train")) == 2
-
-    def test_counts_outside_of_counts(self):
-        with pytest.raises(ConfigError, match=r"'count', 'train' is not an option.*generate: {counts: {train: 4, "):
-            TrajectoryDataModule(name="goop", generate={"train": 4, "count": 3}).prepare_data()
-
-
-class TestModule:
-    def test_ranks_train_on_different_windows(self, make_dataset):
-        loaders = [as_rank(module_of(make_dataset(train=TRAIN)), rank, 2).train_dataloader() for rank in (0, 1)]
-        batches = [[window.frames.sum() for window in islice(loader, 6)] for loader in loaders]
-        assert not set(map(float, batches[0])) & set(map(float, batches[1]))
-
+class TestGpu:
     @pytest.mark.parametrize(("free", "held_on"), [(10**9, "cuda"), (1000, "cpu")])
-    def test_the_buffer_is_on_the_gpu_if_it_fits(self, make_dataset, monkeypatch, free, held_on):
+    def test_the_buffer_is_on_it_if_it_fits(self, make_dataset, monkeypatch, free, held_on):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
         module = as_rank(module_of(make_dataset()), 0, 1, device="cuda")
         source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
         assert module.buffer_device(source, plan).type == held_on
 
     @pytest.mark.parametrize(("loader", "device", "pinned"), [("train", "cuda", True), ("val", "cpu", False)])
-    def test_batches_for_a_gpu_are_pinned(self, make_dataset, monkeypatch, device, pinned, loader):
+    def test_batches_for_it_are_pinned(self, make_dataset, monkeypatch, device, pinned, loader):
         calls = []
         monkeypatch.setattr(Window, "pin_memory", lambda window: calls.append(window) or window)
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 0))
@@ -218,7 +174,7 @@ class TestModule:
         assert bool(calls) == pinned
 
     @pytest.mark.parametrize(("device", "non_blocking"), [("cuda:0", True), ("cpu", False)])
-    def test_copies_to_a_gpu_do_not_block(self, make_dataset, monkeypatch, device, non_blocking):
+    def test_copies_to_it_do_not_block(self, make_dataset, monkeypatch, device, non_blocking):
         copies = []
         monkeypatch.setattr(Window, "to", lambda window, *args, **options: copies.append((args, options)) or window)
         module = module_of(make_dataset())
@@ -226,41 +182,57 @@ class TestModule:
         assert module.transfer_batch_to_device(window, torch.device(device), 0) is window
         assert copies == [((torch.device(device),), {"non_blocking": non_blocking})]
 
-    @pytest.mark.parametrize(
-        ("options", "named"),
-        [
-            ({}, "Neither data.path nor data.name"),
-            ({"path": "???"}, "data.path is not set.*give --data.path FOLDER"),
-            ({"path": "a", "horizon": 0}, "horizon = 0"),
-            ({"path": "a", "limit_eval": 0}, "limit_eval = 0"),
-            ({"path": "a", "source": "simulate"}, "needs the `name` .*--data.source disk"),
-            (
-                {"name": "WaterRamps", "source": "hub", "generate": {"frames": 3}},
-                "generate cannot be combined with the published dataset WaterRamps",
-            ),
-            (
-                {"name": "goop", "family": "deepmind"},
-                "family cannot be combined with the simulated dataset goop; leave it out: --data.family null",
-            ),
-        ],
-    )
-    def test_contradictory_options_are_refused(self, options, named):
-        with pytest.raises(ConfigError, match=named):
-            TrajectoryDataModule(**options)
 
-    def test_a_path_replaces_a_name(self, make_dataset):
-        module = module_of(make_dataset(), name="waterramps", generate={"frames": 3})
-        assert module.description == "dataset"
-        assert module.scene.materials == ("goop",)
-        assert TrajectoryDataModule(path="???", name="goop").description == "goop, simulated by nmpm"
+@pytest.mark.usefixtures("home")
+def test_an_embedded_dataset_is_simulated_on_first_use(tmp_path):
+    options = {"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 6}
+    module, model = module_of(None, path=None, name="goop", generate=options), Recorder()
+    trainer_of(tmp_path, max_steps=2).fit(model, datamodule=module)
+    assert len(model.seen) == 2
+    assert len(module.data_source.recordings("train")) == 2
 
-    def test_a_split_of_another_name(self, make_dataset):
-        folder, name = make_dataset(), "validation"
-        (folder / "valid.h5").rename(folder / f"{name}.h5")
-        with pytest.raises(DataError, match=f"no valid.h5 there.*Rename {name}.h5 to valid.h5"):
-            module_of(folder).val_dataloader()
-        assert any(f"Rename {name}.h5" in finding for finding in inspect(FolderSource(folder)).findings)
 
-    def test_trajectory_shorter_than_the_horizon(self, make_dataset):
-        with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* needs 10.*horizon"):
-            module_of(make_dataset(train=TRAIN), horizon=8).train_dataloader()
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({}, "Neither data.path nor data.name"),
+        ({"path": "???"}, "data.path is not set.*give --data.path FOLDER"),
+        ({"path": "a", "horizon": 0}, "horizon = 0"),
+        ({"path": "a", "limit_eval": 0}, "limit_eval = 0"),
+        ({"path": "a", "source": "simulate"}, "needs the `name` .*--data.source disk"),
+        (
+            {"name": "WaterRamps", "source": "hub", "generate": {"frames": 3}},
+            "generate cannot be combined with the published dataset WaterRamps",
+        ),
+        (
+            {"name": "goop", "family": "deepmind"},
+            "family cannot be combined with the simulated dataset goop; leave it out: --data.family null",
+        ),
+        (
+            {"name": "goop", "generate": {"train": 4, "count": 3}},
+            r"'count', 'train' is not an option.*generate: {counts: {train: 4, ",
+        ),
+    ],
+)
+def test_contradictory_options_are_refused(options, named):
+    with pytest.raises(ConfigError, match=named):
+        TrajectoryDataModule(**options).prepare_data()
+
+
+def test_a_path_replaces_a_name(make_dataset):
+    module = module_of(make_dataset(), name="waterramps", generate={"frames": 3})
+    assert module.description == "dataset"
+    assert module.scene.materials == ("goop",)
+    assert TrajectoryDataModule(path="???", name="goop").description == "goop, simulated by nmpm"
+
+
+def test_files_that_do_not_suffice_are_named(make_dataset):
+    folder = make_dataset(train=TRAIN, valid=((2, 5),))
+    with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* needs 10.*horizon"):
+        module_of(folder, horizon=8).train_dataloader()
+    with pytest.raises(DataError, match="trajectory 00000: it has 2 frames, an evaluation needs 3"):
+        module_of(folder).val_dataloader()
+    (folder / "valid.h5").rename(folder / "validation.h5")
+    with pytest.raises(DataError, match=r"no valid.h5 there.*Rename validation.h5 to valid.h5"):
+        module_of(folder).val_dataloader()
+    assert any("Rename validation.h5" in finding for finding in inspect(FolderSource(folder)).findings)

@@ -16,15 +16,11 @@ from nmpm.errors import DataError
 SHAPES = arrays.array_shapes(min_dims=3, max_dims=3, min_side=1, max_side=3)
 
 
-def runs(count: int = 2, frames: int = 9, particles: int = 6) -> list[Trajectory]:
-    rng = np.random.default_rng(count)
+def runs() -> list[Trajectory]:
+    rng = np.random.default_rng(0)
     return [
-        Trajectory(
-            rng.random((frames, particles, 2), dtype=np.float32),
-            np.full(particles, 7),
-            {"seed": i, "gravity": [0.0, -9.81], "generator": "made up 1.0"},
-        )
-        for i in range(count)
+        Trajectory(rng.random((9, 6, 2), np.float32), np.full(6, 7), {"seed": i, "gravity": [0.0, -9.81]})
+        for i in range(2)
     ]
 
 
@@ -34,15 +30,8 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "train.h5"
 
 
-def error_of(path: Path) -> str:
-    with pytest.raises(DataError) as caught:
-        Split(path).read(0)
-    assert len(str(caught.value)) < 800
-    return str(caught.value)
-
-
 @given(position=arrays.arrays(np.float32, SHAPES, elements=st.floats(-10, 10, width=32)), seed=st.integers(0, 2**31))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_what_was_written_is_read_again(tmp_path_factory, position, seed):
     path = tmp_path_factory.mktemp("split") / "train.h5"
     types = np.arange(position.shape[1])
@@ -76,18 +65,14 @@ def test_the_layout_is_lagrangebenchs(file):
             assert np.issubdtype(group["particle_type"].dtype, np.integer)
 
 
-def test_same_trajectories_give_the_same_bytes(file):
+def test_same_trajectories_give_the_same_bytes_and_interrupted_writing_leaves_the_old_file(file):
     before = file.read_bytes()
     time.sleep(1.1)  # a time stamp would have changed by then
     write_split(file, iter(runs()))
     assert file.read_bytes() == before
 
-
-def test_interrupted_writing_leaves_the_old_file(file):
-    before = file.read_bytes()
-
     def broken():
-        yield runs()[0]
+        yield runs()[1]
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -99,16 +84,20 @@ def test_interrupted_writing_leaves_the_old_file(file):
 
 
 def test_files_that_are_no_split_are_named(file):
-    assert "no such file (beside it: train.h5)" in error_of(file.with_name("test.h5"))
+    def refused(message: str, path: Path = file) -> None:
+        with pytest.raises(DataError, match=message):
+            Split(path)
+
+    refused(r"test\.h5: no such file \(beside it: train\.h5\)", file.with_name("test.h5"))
     whole = file.read_bytes()
     for content in (b"nothing", whole[: len(whole) // 2]):
         file.write_bytes(content)
-        assert "train.h5: cannot be read as HDF5" in error_of(file)
+        refused("train.h5: cannot be read as HDF5")
     h5py.File(file, "w").close()
-    assert "no trajectory" in error_of(file)
+    refused("no trajectory")
     with h5py.File(file, "a") as opened:
         opened["position"] = np.zeros((3, 2, 2))
-    assert "'position' is not a group" in error_of(file)
+    refused("'position' is not a group")
 
 
 def test_missing_keys_are_named_and_hdf5_is_free_for_other_threads(file):
@@ -126,22 +115,22 @@ def test_missing_keys_are_named_and_hdf5_is_free_for_other_threads(file):
 @pytest.mark.parametrize(
     ("key", "value", "named"),
     [
-        ("position", np.zeros((9, 6, 2), int), "int64 of shape (9, 6, 2)"),
-        ("position", np.zeros((9, 12), np.float32), "float32 of shape (9, 12)"),
-        ("position", np.zeros((0, 6, 2), np.float32), "shape (0, 6, 2)"),
+        ("position", np.zeros((9, 6, 2), int), r"int64 of shape \(9, 6, 2\)"),
+        ("position", np.zeros((9, 12), np.float32), r"float32 of shape \(9, 12\)"),
+        ("position", np.zeros((0, 6, 2), np.float32), r"shape \(0, 6, 2\)"),
         ("position", np.zeros((9, 6, 4), np.float32), "4 dimensions"),
         ("position", np.zeros((9, 5, 2), np.float32), "position has 5 particles but particle_type has 6"),
         ("position", np.zeros((9, 6, 3), np.float32), "3 dimensions, 2 in the others"),
         ("particle_type", np.zeros(6, np.float32), "particle_type should be integers"),
     ],
+    ids=["integers", "axes", "empty", "dim", "count", "others", "types"],
 )
 def test_wrong_arrays_are_named(file, key, value, named):
     with h5py.File(file, "a") as opened:
         del opened["00001"][key]
         opened["00001"][key] = value
-    message = error_of(file)
-    assert "trajectory 00001" in message
-    assert named in message
+    with pytest.raises(DataError, match=f"trajectory 00001.*{named}"):
+        Split(file)
 
 
 @pytest.mark.parametrize(("bad", "start"), [(np.nan, 0), (np.inf, 5)])
@@ -156,9 +145,8 @@ def test_positions_that_are_not_finite_are_named(file, bad, start):
         Trajectory(position, np.zeros(6, int))
 
 
-def test_recorded(recorded):
-    for name, trajectories in (("deepmind-waterdrop", 9), ("lagrangebench-3d-lj", 1)):
-        metadata = read_metadata(recorded / name, "deepmind")
-        split = Split(recorded / name / "train.h5")
-        assert len(split) == trajectories
-        assert split.read(0, stop=5).position.shape == (5, split.particles(0), metadata.dim)
+@pytest.mark.parametrize(("name", "trajectories"), [("deepmind-waterdrop", 9), ("lagrangebench-3d-lj", 1)])
+def test_recorded(recorded, name, trajectories):
+    metadata, split = read_metadata(recorded / name, "deepmind"), Split(recorded / name / "train.h5")
+    assert len(split) == trajectories
+    assert split.read(0, stop=5).position.shape == (5, split.particles(0), metadata.dim)

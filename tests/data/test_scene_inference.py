@@ -11,7 +11,7 @@ from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 
 
-def lattice(spacing: float, low: float = 0.3, count: int = 8, dim: int = 2, frames: int = 3) -> np.ndarray:
+def lattice(spacing: float = 0.01, low: float = 0.3, count: int = 8, dim: int = 2, frames: int = 3) -> np.ndarray:
     """(T, N, D) particles at rest on a square lattice."""
     axis = low + spacing * np.arange(count)
     points = np.stack(np.meshgrid(*[axis] * dim), axis=-1).reshape(1, -1, dim)
@@ -26,6 +26,8 @@ BOX = Metadata(
     particle_types={0: "rigid", 3: "boundary", 5: "water", 7: "goop"},
     static_types=frozenset({3}),
 )
+HEAVY = replace(BOX, gravity=(0.0, -9.81))
+CHANNEL = ("periodic", "wall")
 
 
 @pytest.fixture(scope="module")
@@ -43,40 +45,40 @@ def run(position: np.ndarray, types: int | np.ndarray = 7, **attributes: object)
     return Trajectory(position, np.broadcast_to(types, position.shape[1]), attributes)
 
 
+STILL = run(lattice())
+
+
 class TestExtents:
     @given(shift=st.floats(-3, 3), scale=st.floats(0.1, 10))
     @settings(max_examples=8, deadline=None)
-    def test_contains_the_observed_positions(self, scene_of, shift, scale):
+    def test_contain_the_observed_positions(self, scene_of, shift, scale):
         position = shift + scale * lattice(0.05)
         scene = scene_of(run(position.astype(np.float32)))
         for (low, high), (outer_low, outer_high) in zip(scene.bounds, scene.domain, strict=True):
             assert outer_low < low <= min(0.1, np.float32(position.min()))
             assert outer_high > high >= max(0.9, np.float32(position.max()))
 
-    def test_stated_domain(self, scene_of):
+    def test_a_stated_domain_is_taken_if_it_contains_the_positions(self, scene_of):
         stated = replace(BOX, domain=((0.0, 1.0), (0.05, 0.95)))
-        assert scene_of(run(lattice(0.01)), metadata=stated).domain == ((0.0, 1.0), (0.05, 0.95))
-        position = lattice(0.01)
+        assert scene_of(STILL, metadata=stated).domain == ((0.0, 1.0), (0.05, 0.95))
+        position = lattice()
         position[:, 0, 1] = 0.04
         with pytest.raises(DataError, match=r"domain \[0.05, 0.95\] on axis 1 .* from 0.04 to .*Widen"):
             scene_of(run(position), metadata=stated)
 
-    def test_no_layer_on_a_periodic_axis(self, scene_of):
-        scene = scene_of(run(lattice(0.01)), boundary=["periodic", "wall"])
-        assert scene.boundary == ("periodic", "wall")
+    def test_the_domain_of_a_periodic_axis_is_the_period(self, scene_of):
+        scene = scene_of(STILL, boundary=CHANNEL)
+        assert scene.boundary == CHANNEL
         assert scene.domain[0] == scene.bounds[0] == (0.1, 0.9)
         assert scene.domain[1] != scene.bounds[1]
-
-    def test_a_domain_that_is_not_the_period_is_refused(self, scene_of):
         stated = replace(BOX, periodic=(True, False), domain=((0.08, 0.92),) * 2)
         with pytest.raises(DataError, match=r"metadata.json: axis 0 is periodic.*\[0.1, 0.9\].*\[0.08, 0.92\].*same"):
-            scene_of(run(lattice(0.01)), metadata=stated)
-        period = replace(stated, bounds=((0.08, 0.92), (0.1, 0.9)))
-        assert scene_of(run(lattice(0.01)), metadata=period).domain == stated.domain
-        assert scene_of(run(lattice(0.01)), metadata=stated, bounds=[(0, 1)] * 2).domain[0] == (0, 1)
+            scene_of(STILL, metadata=stated)
+        assert scene_of(STILL, metadata=replace(stated, bounds=((0.08, 0.92), (0.1, 0.9)))).domain == stated.domain
+        assert scene_of(STILL, metadata=stated, bounds=[(0, 1)] * 2).domain[0] == (0, 1)
 
     def test_arguments_override_the_metadata(self, scene_of):
-        scene = scene_of(run(lattice(0.01)), bounds=[(0, 2), (0, 1)], gravity=[0, -1])
+        scene = scene_of(STILL, bounds=[(0, 2), (0, 1)], gravity=[0, -1])
         assert scene.bounds == ((0, 2), (0, 1))
         np.testing.assert_allclose(scene.domain, [(-0.05, 2.05), (-0.025, 1.025)])
         assert scene.gravity == (0, -1)
@@ -84,15 +86,14 @@ class TestExtents:
     @pytest.mark.parametrize(
         "arguments", [{"gravity": [0.0]}, {"bounds": [(0, 1)]}, {"boundary": ["wall"]}, {"boundary": ["wall", "open"]}]
     )
-    def test_arguments_that_do_not_fit(self, scene_of, arguments):
+    def test_arguments_that_do_not_fit_are_named(self, scene_of, arguments):
         with pytest.raises(ConfigError, match=next(iter(arguments))):
-            scene_of(run(lattice(0.01)), **arguments)
+            scene_of(STILL, **arguments)
 
 
 class TestParticles:
-    def test_materials_that_occur_in_order_of_id(self, scene_of):
-        position = lattice(0.01)
-        scene = scene_of(run(position, 7), run(position, 5))
+    def test_materials_that_occur_in_any_split_that_there_is_are_in_order_of_id(self, scene_of):
+        scene = scene_of(STILL, run(lattice(), 5), split="test")
         assert scene.materials == ("water", "goop")
         assert not scene.obstacles
 
@@ -105,74 +106,49 @@ class TestParticles:
     def test_spacing_wraps_on_a_periodic_axis(self, scene_of):
         # Two columns that are neighbours across the border only.
         position = np.array([[[0.105, 0.2], [0.895, 0.2], [0.105, 0.6], [0.895, 0.6]]] * 3)
-        scene = scene_of(run(position), boundary=["periodic", "wall"])
-        assert scene.particle_volume == pytest.approx(0.01**2, rel=1e-4)
+        assert scene_of(run(position), boundary=CHANNEL).particle_volume == pytest.approx(0.01**2, rel=1e-4)
 
-    def test_volume_that_cannot_be_estimated(self, scene_of):
+    def test_trajectories_that_do_not_fit_the_metadata_are_named(self, scene_of):
         with pytest.raises(DataError, match="particle_volume"):
-            scene_of(run(lattice(0.02, count=1)))
-
-    def test_unknown_type(self, scene_of):
+            scene_of(run(lattice(count=1)))
         with pytest.raises(DataError, match=r"trajectory 00001: unknown particle type 6 \(known: 0 rigid"):
-            scene_of(run(lattice(0.01)), run(lattice(0.01), 6))
-
-    def test_dimensions_contradict(self, scene_of):
+            scene_of(STILL, run(lattice(), 6))
         with pytest.raises(DataError, match=r"positions have 3 dimensions, metadata.json has dim = 2"):
-            scene_of(run(lattice(0.01, dim=3)))
-
-    def test_another_split_where_train_is_missing(self, scene_of):
-        assert scene_of(run(lattice(0.01)), split="test").materials == ("goop",)
+            scene_of(run(lattice(dim=3)))
 
 
 class TestGravity:
-    def test_the_same_in_all_trajectories(self, scene_of):
-        scene = scene_of(*[run(lattice(0.01), gravity=[0.0, -2.0])] * 2)
-        assert scene.gravity == (0, -2)
-        assert not scene.gravity_varies
+    @pytest.mark.parametrize(
+        ("metadata", "attributes", "gravity", "varies"),
+        [
+            (BOX, ([0.0, -2.0], [0.0, -2.0]), (0, -2), False),
+            (BOX, ([0.0, -2.0], [1.0, 0.0]), None, True),
+            (HEAVY, (None, [0.0, -2.0]), (0, -9.81), True),
+            (HEAVY, (np.array([0, -9.81], np.float32), None), (0, -9.81), False),
+        ],
+        ids=["the same", "varies", "one differs", "float32"],
+    )
+    def test_of_metadata_and_trajectories(self, scene_of, metadata, attributes, gravity, varies):
+        scene = scene_of(
+            *(STILL if own is None else run(lattice(), gravity=own) for own in attributes), metadata=metadata
+        )
+        assert (scene.gravity, scene.gravity_varies) == (gravity, varies)
 
-    def test_varies(self, scene_of):
-        scene = scene_of(run(lattice(0.01), gravity=[0.0, -2.0]), run(lattice(0.01), gravity=[1.0, 0.0]))
-        assert scene.gravity is None
-        assert scene.gravity_varies
-
-    def test_one_differs_from_the_metadata(self, scene_of):
-        known = replace(BOX, gravity=(0.0, -9.81))
-        scene = scene_of(run(lattice(0.01)), run(lattice(0.01), gravity=[0.0, -2.0]), metadata=known)
-        assert scene.gravity == (0, -9.81)
-        assert scene.gravity_varies
-
-    def test_float32_is_no_other_gravity(self, scene_of):
-        known = replace(BOX, gravity=(0.0, -9.81))
-        single = run(lattice(0.01), gravity=np.array([0, -9.81], np.float32))
-        scene = scene_of(single, run(lattice(0.01)), metadata=known)
-        assert scene.gravity == (0, -9.81)
-        assert not scene.gravity_varies
-
-    def test_trajectories_that_all_contradict_the_metadata_are_refused(self, scene_of):
-        known = replace(BOX, gravity=(0.0, -9.81))
-        other = [run(lattice(0.01), gravity=[0.0, -5.0])] * 2
-        with pytest.raises(
-            DataError, match=r"train.h5.*\[0.0, -5.0\].*metadata.json states \[0.0, -9.81\].*--gravity=0,-5.*attribute"
-        ):
-            scene_of(*other, metadata=known)
-
-    def test_a_gravity_that_contradicts_the_files_is_refused(self, scene_of):
-        known = replace(BOX, gravity=(0.0, -9.81))
-        assert scene_of(run(lattice(0.01)), metadata=known, gravity=[0, -9.81]).gravity == (0, -9.81)
+    def test_contradictions_are_refused(self, scene_of):
+        mend = r"train.h5.*\[0.0, -5.0\].*metadata.json states \[0.0, -9.81\].*--gravity=0,-5.*attribute"
+        with pytest.raises(DataError, match=mend):
+            scene_of(*[run(lattice(), gravity=[0.0, -5.0])] * 2, metadata=HEAVY)
+        assert scene_of(STILL, metadata=HEAVY, gravity=[0, -9.81]).gravity == (0, -9.81)
         with pytest.raises(ConfigError, match=r"gravity = \[0.0, -1.0\] contradicts .*metadata.json.*\[0.0, -9.81\]"):
-            scene_of(run(lattice(0.01)), metadata=known, gravity=[0, -1])
-        heavy = run(lattice(0.01), gravity=np.array([0, -2], np.float32))
-        assert scene_of(heavy, gravity=[0, -2]).gravity == (0, -2)
+            scene_of(STILL, metadata=HEAVY, gravity=[0, -1])
+        single = run(lattice(), gravity=np.array([0, -2], np.float32))
+        assert scene_of(single, gravity=[0, -2]).gravity == (0, -2)
         with pytest.raises(ConfigError, match=r"contradicts .*train.h5.*\[0.0, -2.0\].*nmpm convert.*--gravity=0,-1"):
-            scene_of(heavy, gravity=[0, -1])
+            scene_of(single, gravity=[0, -1])
 
 
-class TestRecorded:
-    def test_waterdrop(self, recorded):
-        scene = infer_scene(recorded / "deepmind-waterdrop", Options("deepmind", gravity=(0, -9.81)))
-        assert scene.dim == 2
-        assert scene.dt == 0.0025
-        assert scene.materials == ("water",)
-        assert not scene.obstacles
-        assert 0.0082**2 < scene.particle_volume < 0.0088**2
-        np.testing.assert_allclose(scene.domain, [(0.08, 0.92)] * 2)
+def test_recorded_waterdrop(recorded):
+    scene = infer_scene(recorded / "deepmind-waterdrop", Options("deepmind", gravity=(0, -9.81)))
+    assert (scene.dim, scene.dt, scene.materials, scene.obstacles) == (2, 0.0025, ("water",), False)
+    assert 0.0082**2 < scene.particle_volume < 0.0088**2
+    np.testing.assert_allclose(scene.domain, [(0.08, 0.92)] * 2)

@@ -11,13 +11,11 @@ def test_statistics_of_moving_particles_equal_those_computed_at_once():
     statistics = MotionStatistics(made_up_metadata())
     for trajectory in trajectories:
         statistics.add(trajectory)
-    steps = [np.diff(t.position[:, t.particle_type == 7].astype(np.float64), axis=0) for t in trajectories]
-    velocity = np.concatenate([step.reshape(-1, 2) for step in steps])
-    acceleration = np.concatenate([np.diff(step, axis=0).reshape(-1, 2) for step in steps])
-    found = statistics.result()
-    for key, values in (("vel", velocity), ("acc", acceleration)):
-        np.testing.assert_allclose(found[f"{key}_mean"], values.mean(0), rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(found[f"{key}_std"], values.std(0), rtol=1e-9)
+    moving = [trajectory.position[:, trajectory.particle_type == 7].astype(np.float64) for trajectory in trajectories]
+    for key, order in (("vel", 1), ("acc", 2)):
+        values = np.concatenate([np.diff(position, order, axis=0).reshape(-1, 2) for position in moving])
+        np.testing.assert_allclose(statistics.result()[f"{key}_mean"], values.mean(0), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(statistics.result()[f"{key}_std"], values.std(0), rtol=1e-9)
 
 
 def test_displacements_use_the_minimum_image():
@@ -27,10 +25,8 @@ def test_displacements_use_the_minimum_image():
     statistics.add(Trajectory(position[:2], np.array([7])))
     assert set(statistics.result()) == {"vel_mean", "vel_std"}  # two frames have no acceleration
     statistics.add(Trajectory(position, np.array([7])))
-    found = statistics.result()
-    assert found["vel_mean"] == pytest.approx([0.3, 0.0], abs=1e-6)
-    assert found["vel_std"] == pytest.approx([0.0, 0.0], abs=1e-6)
-    assert found["acc_std"] == pytest.approx([0.0, 0.0], abs=1e-6)
+    for key, expected in (("vel_mean", [0.3, 0.0]), ("vel_std", [0.0, 0.0]), ("acc_std", [0.0, 0.0])):
+        assert statistics.result()[key] == pytest.approx(expected, abs=1e-6)
 
 
 def test_small_differences_are_ignored():
@@ -42,7 +38,7 @@ def test_small_differences_are_ignored():
     assert find_disagreements(measured, {"vel_std": "unknown"}) == []
 
 
-def test_first_moving_particle():
+def test_first_moving_particle_relative_to_the_extent():
     position = np.zeros((4, 3, 2), np.float32)
     position[2, 2] = 0.01
     particles, extent = np.array([True, False, True]), ((0.0, 1.0), (0.0, 1.0))

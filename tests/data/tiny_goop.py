@@ -7,7 +7,7 @@ from pathlib import Path
 from nmpm.sim import load_preset
 
 GOOP = load_preset("goop")
-TINY = dataclasses.replace(GOOP, frames=30, blocks=dataclasses.replace(GOOP.blocks, particles=(150, 200)))
+TINY = dataclasses.replace(GOOP, frames=20, blocks=dataclasses.replace(GOOP.blocks, particles=(60, 90)))
 COUNTS = {"train": 4, "valid": 1, "test": 2}
 
 

@@ -75,40 +75,23 @@ def test_what_varies(tmp_path):
     first.attributes["gravity"], second.attributes["gravity"] = [0.0, -1.0], [1.0, 0.0]
     found = look(tmp_path, first, second)
     assert found.varies == ("gravity", "materials", "particles", "frames", "obstacles")
-    assert found.splits["train"].frames == (12, 14)
-    assert found.splits["train"].particles == (5, 6)
-    assert found.splits["train"].static == (0, 2)
+    train = found.splits["train"]
+    assert (train.frames, train.particles, train.static) == ((12, 14), (5, 6), (0, 2))
     same = made_up_trajectory(12, 30, statics=3)
     same.attributes["gravity"] = np.array([0.0, -9.81], np.float32)  # no other gravity than the metadata's
     found = look(tmp_path / "same", same, made_up_trajectory(12, 30, statics=3, seed=1))
     assert (found.varies, found.findings, found.notes) == ((), (), ())
 
 
-def jump(position):
-    position[7:, 11, 0] += 0.5
-
-
-def coincide(position):
-    position[:, 4] = position[:, 20]
-
-
-def move_a_wall(position):
-    position[:, 31, 1] += np.linspace(0, 0.05, 12, dtype=np.float32)
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (jump, "train, trajectory 00000: particle 11 jumps by 0."),
-        (coincide, "frame 0: 1 particles have the position of another, e.g. of particle 4"),
-        (move_a_wall, "particle 31, of the static type 3, moves"),
-    ],
-)
-def test_anomalies_of_positions(tmp_path, change, named):
+def test_anomalies_of_positions(tmp_path):
     run = made_up_trajectory(12, 30, statics=2)
-    change(run.position)
-    (finding,) = look(tmp_path, run).findings
-    assert named in finding
+    run.position[7:, 11, 0] += 0.5
+    run.position[:, 4] = run.position[:, 20]
+    run.position[:, 31, 1] += np.linspace(0, 0.05, 12, dtype=np.float32)
+    jump, twin, wall = look(tmp_path, run).findings
+    assert "train, trajectory 00000: particle 11 jumps by 0." in jump
+    assert "frame 0: 1 particles have the position of another, e.g. of particle 4" in twin
+    assert "particle 31, of the static type 3, moves" in wall
 
 
 def test_statements_that_disagree_with_the_trajectories(tmp_path):
@@ -162,20 +145,20 @@ def test_the_family_is_guessed_where_nothing_states_it(folder):
 
 @pytest.mark.parametrize(
     ("plain", "named"),
-    [("{", "not valid JSON"), ({}, "'dim' is missing"), (KEYS | {"dt": -1}, "dt = -1"),
-     (KEYS | {"bounds": [[1, 0]] * 2}, "bounds ="), (KEYS | {"dim": 3}, "dim = 3"),
-     (KEYS | {"particle_types": 7}, "particle_types = 7"), (KEYS | {"domain": [[0.5, 0.6]] * 2}, "domain")],
-)  # fmt: skip
-def test_wrong_metadata_become_findings(folder, plain, named):
+    [
+        ("{", ["not valid JSON"]),
+        ({}, ["'dim' is missing"]),
+        (KEYS | {"bounds": [[1, 0]] * 2}, ["bounds ="]),
+        (KEYS | {"dim": 3}, ["dim = 3"]),
+        (KEYS | {"domain": [[0.5, 0.6]] * 2}, ["domain"]),
+        (KEYS | {"dt": -1, "gravity": [1], "particle_types": 7}, ["dt = -1", "gravity = [1]", "particle_types = 7"]),
+    ],
+)
+def test_wrong_metadata_become_findings_all_at_once(folder, plain, named):
     found = look_at(folder, plain)
-    assert any(named in finding for finding in found.findings)
+    for words in named:
+        assert any(words in finding for finding in found.findings)
     assert found.splits["train"].frames == (12, 12)
-
-
-def test_all_wrong_keys_are_named_at_once(folder):
-    found = look_at(folder, KEYS | {"dt": -1, "gravity": [1], "particle_types": {"3": "boundary", "7": "goop"}})
-    assert [finding.split(": ")[1].split(" =")[0] for finding in found.findings] == ["dt", "gravity"]
-    assert found.dt == 1
 
 
 def test_missing_metadata_and_a_damaged_split_become_findings(folder):
@@ -189,8 +172,8 @@ def test_missing_metadata_and_a_damaged_split_become_findings(folder):
     assert found.gravity == (0.0, -9.81)
 
 
-def test_foreign_data_that_convert_refuses_are_inspected(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+@pytest.mark.usefixtures("home")
+def test_foreign_data_that_convert_refuses_are_inspected(tmp_path, capsys):
     position, types = made()
     right, unknown = records.trajectory_record(position, types), records.trajectory_record(position, types * 0 + 9)
     damaged = records.trajectory_record(position * np.nan, types)
@@ -205,7 +188,7 @@ def test_foreign_data_that_convert_refuses_are_inspected(tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize(
-    "name", ["multimaterial", *(pytest.param(n, marks=pytest.mark.slow) for n in ("goop", "wbcsph"))]
+    "name", ["goop", *(pytest.param(name, marks=pytest.mark.slow) for name in ("multimaterial", "wbcsph"))]
 )
 def test_nothing_is_odd_about_simulated_data(name, tmp_path):
     generate(load_preset(name).with_frames(4), tmp_path / name, {"train": 1, "valid": 0, "test": 1}, seed=1, workers=1)

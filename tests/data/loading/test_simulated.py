@@ -22,20 +22,16 @@ def live(**changes) -> SimulatedRecordings:
     return SimulatedRecordings(TINY, **({"workers": 2} | changes))
 
 
-def test_an_index_is_always_the_same_trajectory():
-    (three, four), (_, again), (other,) = live().load([3, 4]), live().load([5, 3]), live(seed=1).load([3])
+def test_an_index_is_always_the_same_trajectory_and_simulated_once(simulated_seeds):
+    recordings = live()
+    (three, four), (_, again), (other,) = recordings.load([3, 4]), live().load([5, 3]), live(seed=1).load([3])
     assert torch.equal(three.frames, again.frames)
     for differing in (four, other):
         assert three.frames.shape != differing.frames.shape or not torch.equal(three.frames, differing.frames)
-
-
-def test_simulates_no_trajectory_twice_for_the_same_request(monkeypatch):
-    seeds, simulate = [], MpmPreset.simulate
-    monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: seeds.append(seed) or simulate(preset, seed))
-    recordings = live()
-    for indices in ([0, 1], [2, 3], [0, 1], [2, 3]):
+    simulated_seeds.clear()
+    for indices in ([0, 1], [3, 4], [0, 1], [3, 4]):
         recordings.load(indices)
-    assert len(seeds) == len(set(seeds)) == 4
+    assert len(simulated_seeds) == 2
 
 
 def test_resumes_at_any_batch():
@@ -78,28 +74,19 @@ def test_a_horizon_longer_than_the_trajectories_is_refused():
         TrajectoryBuffer(live(), dataclasses.replace(PLAN, length=10))
 
 
-class TestDataModule:
-    @pytest.fixture
-    def module(self, tmp_path, monkeypatch) -> TrajectoryDataModule:
-        monkeypatch.setenv("NMPM_HOME", str(tmp_path))
-        options = {"counts": {"train": 5, "valid": 1, "test": 1}, "frames": 6}
-        return TrajectoryDataModule(
-            name="goop", source="simulate", horizon=3, batch_size=2, buffer_size=2, generate=options
-        )
-
-    def test_calibration_and_training_share_their_trajectories(self, module, monkeypatch):
-        seeds, simulate, others = [], MpmPreset.simulate, threading.enumerate()  # such as that of other tests' progress
-        monkeypatch.setattr(MpmPreset, "simulate", lambda preset, seed, _: seeds.append(seed) or simulate(preset, seed))
-        calibration = list(islice(module.train_dataloader(), 2))
-        training = list(islice(module.train_dataloader(), 2))
-        module.teardown("fit")
-        assert [torch.equal(a.frames, b.frames) for a, b in zip(calibration, training, strict=True)] == [True, True]
-        assert len(seeds) == len(set(seeds))
-        assert not [thread for thread in threading.enumerate() if thread not in others]
-
-    def test_training_trajectories_are_not_written(self, module):
-        window = next(iter(module.train_dataloader()))
-        assert window.frames.shape[:2] == (2, 5)
-        assert len(next(iter(module.val_dataloader())).frames) == 1
-        assert sorted(path.name for path in module.data_source.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
-        assert "simulated by nmpm while training" in module.description
+@pytest.mark.usefixtures("home")
+def test_calibration_and_training_share_their_trajectories_which_are_not_written(simulated_seeds):
+    options = {"counts": {"train": 5, "valid": 1, "test": 1}, "frames": 6}
+    module = TrajectoryDataModule(
+        name="goop", source="simulate", horizon=3, batch_size=2, buffer_size=2, generate=options
+    )
+    others = threading.enumerate()  # such as that of other tests' progress
+    calibration, training = (list(islice(module.train_dataloader(), 2)) for _ in range(2))
+    module.teardown("fit")
+    assert all(torch.equal(one.frames, other.frames) for one, other in zip(calibration, training, strict=True))
+    assert training[0].frames.shape[:2] == (2, 5)
+    assert len(simulated_seeds) == len(set(simulated_seeds))
+    assert not [thread for thread in threading.enumerate() if thread not in others]
+    assert len(next(iter(module.val_dataloader())).frames) == 1
+    assert sorted(path.name for path in module.data_source.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
+    assert "simulated by nmpm while training" in module.description
