@@ -185,8 +185,9 @@ class Split:
         Raises:
             DataError: if they cannot be read or a position is not finite.
         """
+        name = self._entries[index].name  # an IndexError ends iterations, within `open_hdf5` it would be a DataError
         with open_hdf5(self.path) as file:
-            group = file[self._entries[index].name]
+            group = file[name]
             position = np.asarray(group["position"][start:stop], dtype=np.float32)
             particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
             attributes = dict(group.attrs)

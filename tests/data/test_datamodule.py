@@ -155,32 +155,24 @@ def test_ranks_train_on_different_windows(make_dataset):
     assert not set(map(float, batches[0])) & set(map(float, batches[1]))
 
 
-class TestGpu:
-    @pytest.mark.parametrize(("free", "held_on"), [(10**9, "cuda"), (1000, "cpu")])
-    def test_the_buffer_is_on_it_if_it_fits(self, make_dataset, monkeypatch, free, held_on):
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
-        module = as_rank(module_of(make_dataset()), 0, 1, device="cuda")
-        source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
-        assert module.buffer_device(source, plan).type == held_on
-
-    @pytest.mark.parametrize(("loader", "device", "pinned"), [("train", "cuda", True), ("val", "cpu", False)])
-    def test_batches_for_it_are_pinned(self, make_dataset, monkeypatch, device, pinned, loader):
-        calls = []
-        monkeypatch.setattr(Window, "pin_memory", lambda window: calls.append(window) or window)
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 0))
-        module = as_rank(module_of(make_dataset()), 0, 1, device)
-        windows = list(islice(getattr(module, f"{loader}_dataloader")(), 2))
-        assert all(any(window is call for call in calls) for window in windows) == pinned
-        assert bool(calls) == pinned
-
-    @pytest.mark.parametrize(("device", "non_blocking"), [("cuda:0", True), ("cpu", False)])
-    def test_copies_to_it_do_not_block(self, make_dataset, monkeypatch, device, non_blocking):
-        copies = []
-        monkeypatch.setattr(Window, "to", lambda window, *args, **options: copies.append((args, options)) or window)
-        module = module_of(make_dataset())
-        window = next(iter(module.train_dataloader()))
-        assert module.transfer_batch_to_device(window, torch.device(device), 0) is window
-        assert copies == [((torch.device(device),), {"non_blocking": non_blocking})]
+@pytest.mark.parametrize(
+    ("device", "free", "held_on"), [("cuda", 10**9, "cuda"), ("cuda", 0, "cpu"), ("cpu", 0, "cpu")]
+)
+def test_on_a_gpu_the_buffer_is_there_if_it_fits_or_else_batches_are_pinned_and_copied_without_blocking(
+    make_dataset, monkeypatch, device, free, held_on
+):
+    pinned, copied = [], []
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free, 2 * free))
+    monkeypatch.setattr(Window, "pin_memory", lambda window: pinned.append(window) or window)
+    module = as_rank(module_of(make_dataset()), 0, 1, device)
+    source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
+    assert module.buffer_device(source, plan).type == held_on
+    if held_on == "cpu":
+        windows = [*islice(module.train_dataloader(), 2), next(iter(module.val_dataloader()))]
+        assert [any(window is call for call in pinned) for window in windows] == [device == "cuda"] * 3
+        monkeypatch.setattr(Window, "to", lambda window, *args, **options: copied.append((args, options)) or window)
+        assert module.transfer_batch_to_device(windows[0], torch.device(device), 0) is windows[0]
+        assert copied == [((torch.device(device),), {"non_blocking": device == "cuda"})]
 
 
 @pytest.mark.usefixtures("home")

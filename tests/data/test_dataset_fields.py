@@ -44,15 +44,11 @@ def data_of(folder, **options):
     return TrajectoryDataModule(path=str(folder), horizon=4, batch_size=4, buffer_size=3, passes=1.0, **options)
 
 
-def test_the_kinds_follow_from_the_data(folder):
+def test_the_kinds_follow_from_the_data_and_a_configuration_declares_others(folder):
     scene = infer_scene(folder)
-    assert scene.evolving == ("temperature",)
-    assert scene.properties == ("stiffness",)
+    assert (scene.evolving, scene.properties) == (("temperature",), ("stiffness",))
     assert scene.parameters == ("friction", "force")
     assert "pressure" not in scene.fields
-
-
-def test_a_configuration_declares_other_fields_than_the_metadata(folder):
     assert data_of(folder, fields=["still"]).scene.properties == ("still",)
     assert data_of(folder, fields=[]).scene.fields == ()
     source = FolderSource(folder, Options(fields=["force"]))
@@ -60,22 +56,32 @@ def test_a_configuration_declares_other_fields_than_the_metadata(folder):
     assert source.recordings("test")[0].fields.keys() == {"force"}
 
 
-def test_a_declared_field_that_is_missing_or_no_field_is_named(folder):
-    with pytest.raises(DataError, match=r"trajectory 00000: it has no field temprature.*it has: force, friction"):
-        infer_scene(folder, Options(fields=["temprature"]))
-    with pytest.raises(DataError, match=r"wind is float64 of shape \(12, 2\); a field is \(T, N\)"):
-        infer_scene(folder, Options(fields=["wind"]))
-    with pytest.raises(ConfigError, match="cannot be called 'gravity'"):
-        infer_scene(folder, Options(fields=["gravity"]))
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("temprature", DataError, r"trajectory 00000: it has no field temprature.*it has: force, friction"),
+        ("wind", DataError, r"wind is float64 of shape \(12, 2\); a field is \(T, N\)"),
+        ("gravity", ConfigError, "cannot be called 'gravity'"),
+    ],
+)
+def test_a_declared_field_that_is_missing_or_no_field_is_named(folder, name, error, message):
+    with pytest.raises(error, match=message):
+        infer_scene(folder, Options(fields=[name]))
+
+
+def test_fields_that_do_not_fit_are_named(folder):
     with pytest.raises(ConfigError, match="fields cannot be combined with the simulated dataset goop"):
         TrajectoryDataModule(name="goop", fields=["temperature"])
-
-
-def test_a_field_of_a_moving_particle_must_be_finite(folder):
     with h5py.File(folder / "test.h5", "r+") as file:
         file["00001/temperature"][3, 2] = np.inf
     with pytest.raises(DataError, match="temperature of particle 2 in frame 3 is inf"):
         data_of(folder).data_source.recordings("test")[1]
+    with h5py.File(folder / "train.h5", "r+") as file:
+        del file["00002/stiffness"]
+        file["00002/stiffness"] = 1.0
+    data = data_of(folder)
+    with pytest.raises(DataError, match="stiffness has another shape in some trajectories"):
+        collate(list(data.data_source.recordings("train")), data.scene)
 
 
 def test_a_batch_pads_fields_without_touching_them(folder):
@@ -86,15 +92,15 @@ def test_a_batch_pads_fields_without_touching_them(folder):
         "temperature": (3, 12, 8), "friction": (3, 1, 1), "stiffness": (3, 1, 8), "pressure": (3, 12, 8),
         "force": (3, 1, 1),
     }  # fmt: skip
+    assert window.fields["force"].flatten().tolist() == [0, 1, 2]
     for row, (recording, count) in enumerate(zip(recordings, COUNTS, strict=True)):
-        stored = h5py.File(folder / "test.h5")[f"0000{row}"]
-        temperature = torch.from_numpy(stored["temperature"][:, :count]).float()
-        assert torch.equal(window.fields["temperature"][row, :, :count], temperature)
+        with h5py.File(folder / "test.h5") as file:
+            temperature = torch.from_numpy(file[f"0000{row}/temperature"][:, :count]).float()
         assert torch.equal(recording.fields["temperature"], temperature)
+        assert torch.equal(window.fields["temperature"][row, :, :count], temperature)
+        assert (window.fields["temperature"][row, :, count:] == 0).all()
         assert torch.equal(window.initial.fields["temperature"][row, :count], temperature[1])
         assert torch.equal(window.field_target("temperature")[row, :, :count], temperature[2:])
-        assert (window.fields["temperature"][row, :, count:] == 0).all()
-        assert float(window.fields["force"][row]) == row
     assert window.field_target("stiffness").shape == (3, 10, 8)
 
 
@@ -102,29 +108,20 @@ def test_training_windows_hold_the_frames_of_their_positions(folder):
     data = data_of(folder)
     data.setup("fit")
     window = next(iter(data.train_dataloader()))
-    recordings = data.data_source.recordings("train")
+    recordings = {recording.frames.shape[1]: recording for recording in data.data_source.recordings("train")}
     for row in range(4):
-        own = int(window.mask[row].sum())
-        recording = next(r for r in recordings if r.frames.shape[1] == own)
-        start = next(t for t in range(7) if torch.equal(recording.frames[t : t + 6], window.frames[row, :, :own]))
+        count = int(window.mask[row].sum())
+        recording, frames = recordings[count], window.frames[row, :, :count]
+        start = next(first for first in range(7) if torch.equal(recording.frames[first : first + 6], frames))
         expected = recording.fields["temperature"][start : start + 6]
-        assert torch.equal(window.fields["temperature"][row, :, :own], expected)
-        assert torch.equal(window.fields["stiffness"][row, :, :own], recording.fields["stiffness"])
-
-
-def test_trajectories_that_store_a_field_differently_are_refused(folder):
-    with h5py.File(folder / "train.h5", "r+") as file:
-        del file["00002/stiffness"]
-        file["00002/stiffness"] = 1.0
-    data = data_of(folder)
-    with pytest.raises(DataError, match="stiffness has another shape in some trajectories"):
-        collate(list(data.data_source.recordings("train")), data.scene)
+        assert torch.equal(window.fields["temperature"][row, :, :count], expected)
+        assert torch.equal(window.fields["stiffness"][row, :, :count], recording.fields["stiffness"])
 
 
 def test_an_inspection_says_what_varies_and_which_channels_that_makes(folder):
     found = inspect(FolderSource(folder))
-    assert found.channels["temperature"].endswith(": goop.temperature, predicted")
     assert found.channels["temperature"].startswith("evolves, 0.9")
+    assert found.channels["temperature"].endswith(": goop.temperature, predicted")
     assert found.channels["friction"] == "differs between trajectories, 0…0.2: friction"
     assert found.channels["pressure"] == "is the same everywhere, 3: no channel"
     assert found.channels["still"].endswith("not declared: no channel (--data.fields)")
@@ -134,8 +131,7 @@ def test_an_inspection_says_what_varies_and_which_channels_that_makes(folder):
 
 def test_arrays_are_written_with_the_fields_of_their_scene(folder, tmp_path):
     scene = infer_scene(folder, Options(fields=["temperature"]))
-    run = made_up_trajectory(12, 4, fields=("temperature",))
-    types = np.zeros(4, dtype=int)
+    run, types = made_up_trajectory(12, 4, fields=("temperature",)), np.zeros(4, dtype=int)
     path = tmp_path / "new" / "train.h5"
     with pytest.raises(DataError, match="trajectory 0 has no field temperature, which the scene has"):
         write_trajectories(path, [Trajectory(run.position, types)], scene)

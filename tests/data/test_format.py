@@ -145,8 +145,8 @@ def test_positions_that_are_not_finite_are_named(file, bad, start):
         Trajectory(position, np.zeros(6, int))
 
 
-@pytest.mark.parametrize(("name", "trajectories"), [("deepmind-waterdrop", 9), ("lagrangebench-3d-lj", 1)])
-def test_recorded(recorded, name, trajectories):
-    metadata, split = read_metadata(recorded / name, "deepmind"), Split(recorded / name / "train.h5")
-    assert len(split) == trajectories
+def test_recorded_lennard_jones(recorded):
+    folder = recorded / "lagrangebench-3d-lj"
+    metadata, split = read_metadata(folder, "deepmind"), Split(folder / "train.h5")
+    assert len(split) == 1
     assert split.read(0, stop=5).position.shape == (5, split.particles(0), metadata.dim)

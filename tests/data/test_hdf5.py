@@ -45,26 +45,19 @@ def make_virtual(file: h5py.File) -> None:
     file["00001"].create_virtual_dataset("position", layout)
 
 
-def link(name: str):
-    def change(file: h5py.File) -> None:
-        if name in file:
-            del file[name]
-        file[name] = h5py.ExternalLink("other.h5", "/00000/position")
-
-    return change
+def link(file: h5py.File) -> None:
+    file["00001/deep/er"] = h5py.ExternalLink("other.h5", "/00000/position")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (store_elsewhere, "'00001/position' is stored in another file, .*secret.bin"),
-        (link("00001"), "'00001' is an external link to 'other.h5'"),
-        (link("00001/position"), "'00001/position' is an external link to 'other.h5'"),
-        (link("00001/deep/er"), "'00001/deep/er' is an external link to 'other.h5'"),
+        (link, "'00001/deep/er' is an external link to 'other.h5'"),
         (link_through_another_link, "'hidden/door' is an external link"),
         (make_virtual, "'00001/position' is a virtual dataset"),
     ],
-    ids=["storage", "group", "dataset", "deep", "soft", "virtual"],
+    ids=["storage", "link", "soft", "virtual"],
 )
 def test_content_of_other_files_is_refused(split, change, message):
     with h5py.File(split, "a") as file:
@@ -104,59 +97,57 @@ except Exception as error:
 """
 
 
-def full(*_: object) -> int:
-    raise OSError(28, "No space left on device")
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.999])
+def test_a_full_disk_is_an_error_that_leaves_the_old_file(split, share):
+    """A limit on the size of files stands for the disk; in a process of its own, since HDF5 would crash it."""
+    before = split.read_bytes()
+    write_split(split.with_name("whole.h5"), trajectories())
+    size = int(share * split.with_name("whole.h5").stat().st_size)
+    words = [sys.executable, "-c", WRITE, str(split), str(size)]
+    run = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert run.stdout.startswith(f"DataError {split}: cannot be written (File too large): at least ")
+    assert run.stdout.count("\n") == 1
+    assert split.read_bytes() == before
+    assert sorted(path.name for path in split.parent.iterdir()) == ["other.h5", "train.h5", "whole.h5"]
 
 
-class TestFullDisk:
-    @pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.999])
-    def test_is_an_error_that_leaves_nothing(self, tmp_path, share):
-        """A limit on the size of files stands for the disk; in a process of its own, since HDF5 would crash it."""
-        write_split(tmp_path / "whole.h5", trajectories())
-        size = (tmp_path / "whole.h5").stat().st_size
-        target = tmp_path / "folder" / "train.h5"
-        words = [sys.executable, "-c", WRITE, str(target), str(int(share * size))]
-        run = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-        assert run.returncode == 0, run.stderr[-2000:]
-        assert run.stdout.startswith(f"DataError {target}: cannot be written (File too large): at least ")
-        assert run.stdout.count("\n") == 1
-        assert not list(target.parent.iterdir())
+def test_writing_stops_after_the_trajectory_that_does_not_fit(tmp_path, monkeypatch):
+    written, pwrite = [], os.pwrite
 
-    def test_the_old_file_stays(self, split, monkeypatch):
-        before = split.read_bytes()
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "pwrite", full)
-            with pytest.raises(DataError, match=r"train.h5: cannot be written \(No space left on device\).*are free"):
-                write_split(split, iter(trajectories()))
-        assert split.read_bytes() == before
-        assert sorted(path.name for path in split.parent.iterdir()) == ["other.h5", "train.h5"]
+    def fills_up(*all_):
+        if len(written) > 1:
+            raise OSError(28, "No space left on device")
+        return pwrite(*all_)
 
-    def test_stops_after_the_trajectory_that_does_not_fit(self, tmp_path, monkeypatch):
-        written, pwrite = [], os.pwrite
+    def endless():
+        while True:
+            written.append(None)
+            yield trajectories(1, 100, 5000)[0]
 
-        def endless():
-            while True:
-                written.append(None)
-                yield trajectories(1, 100, 5000)[0]
+    monkeypatch.setattr(os, "pwrite", fills_up)
+    with pytest.raises(DataError, match=r"train.h5: cannot be written \(No space left on device\).*are free"):
+        write_split(tmp_path / "train.h5", endless())
+    assert len(written) < 5
 
-        monkeypatch.setattr(os, "pwrite", lambda *all_: full() if len(written) > 1 else pwrite(*all_))
-        with pytest.raises(DataError, match="No space left"):
-            write_split(tmp_path / "train.h5", endless())
-        assert len(written) < 5
 
-    def test_content_that_was_not_written_can_be_read_back(self, tmp_path, monkeypatch):
-        """HDF5 reads what it wrote; a file whose disk is full from the start still behaves like a file."""
-        values = np.random.default_rng(0).random((300, 50))
+def test_content_that_was_not_written_can_be_read_back(tmp_path, monkeypatch):
+    """HDF5 reads what it wrote; a file whose disk is full from the start still behaves like a file."""
 
-        def write() -> None:
-            with writable_hdf5(tmp_path / "a.h5") as (file, _):
-                file.create_dataset("values", data=values, chunks=(7, 50), compression="gzip")
-                file.flush()
-                np.testing.assert_array_equal(file["values"][()], values)
+    def full(*_):
+        raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(os, "pwrite", full)
-        with pytest.raises(DataError, match="No space left"):
-            write()
+    values = np.random.default_rng(0).random((300, 50))
+    monkeypatch.setattr(os, "pwrite", full)
+
+    def write():
+        with writable_hdf5(tmp_path / "a.h5") as (file, _):
+            file.create_dataset("values", data=values, chunks=(7, 50), compression="gzip")
+            file.flush()
+            np.testing.assert_array_equal(file["values"][()], values)
+
+    with pytest.raises(DataError, match="No space left"):
+        write()
 
 
 def stored_chunks(dataset) -> list[bytes]:
@@ -179,11 +170,3 @@ def test_chunks_are_those_that_hdf5_writes(tmp_path_factory, length, width, rows
         np.testing.assert_array_equal(file["ours"][:], values)
         assert (file["ours"].dtype, file["ours"].chunks) == (values.dtype, file["theirs"].chunks)
         assert stored_chunks(file["ours"]) == stored_chunks(file["theirs"])
-
-
-def test_the_number_of_threads_does_not_matter(tmp_path):
-    values = np.random.default_rng(0).random((200, 3), dtype=np.float32)
-    for threads in (1, 2, 5):
-        with h5py.File(tmp_path / f"{threads}.h5", "w", libver=("earliest", "v108")) as file:
-            write_compressed(file, "position", values, 7, threads)
-    assert len({(tmp_path / f"{threads}.h5").read_bytes() for threads in (1, 2, 5)}) == 1

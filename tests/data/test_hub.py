@@ -1,7 +1,6 @@
 """Without any connection: what the hub would give is put in place of it."""
 
 import zipfile
-from contextlib import suppress
 from pathlib import Path
 
 import huggingface_hub
@@ -49,26 +48,21 @@ def test_archives_are_unpacked_and_trained_on(hub, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("/etc/x.h5", "does not unpack"), ("a/../../x.h5", "does not unpack"), ("readme.txt", "no data files")],
-)
-def test_archives_with_paths_outside_or_without_data_are_refused_and_leave_nothing(hub, home, name, message):
+    [
+        ("/etc/x.h5", "does not unpack"), ("a/../../x.h5", "does not unpack"), ("readme.txt", "no data files"),
+        ("damaged.h5", "cannot be unpacked"),
+    ],
+)  # fmt: skip
+def test_archives_that_are_damaged_or_lead_outside_are_refused_and_leave_nothing(hub, home, name, message):
     archive(hub / "train.zip", {name: b"x"})
+    if name == "damaged.h5":
+        (hub / "train.zip").write_bytes((hub / "train.zip").read_bytes()[:-30])
     with pytest.raises(DataError, match=message):
         hub_folder("Goop")
     assert not [path for path in home.parent.rglob("*") if path.is_file() and path.suffix in (".h5", ".txt")]
 
 
-@pytest.mark.parametrize("place", [0, 28, 70, 119, 161])
-def test_damaged_archives_are_named(hub, place):
-    archive(hub / "train.zip", {"train/sim_0.json": bytes(range(256))})
-    data = bytearray((hub / "train.zip").read_bytes())
-    data[place] ^= 0x55
-    (hub / "train.zip").write_bytes(data)
-    with suppress(DataError):  # a damaged date does no harm
-        hub_folder("Goop")
-
-
-@pytest.mark.parametrize("name", ["", "../up", "a/b/c/d", "Goop;rm"])
+@pytest.mark.parametrize("name", ["", "../up", "Goop;rm"])
 def test_malformed_names_are_refused(name):
     with pytest.raises(ConfigError, match="is not the name of a dataset"):
         hub_folder(name)

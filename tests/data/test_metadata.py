@@ -1,7 +1,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -101,13 +100,6 @@ def test_missing_files_and_keys_are_named(write_keys, tmp_path):
         read_metadata(tmp_path)
     with pytest.raises(DataError, match=r"nowhere: no such folder"):
         read_metadata(tmp_path / "nowhere")
-
-
-def test_unknown_types_are_named(write_keys):
-    metadata = read_metadata(write_keys())
-    metadata.check_types(np.array([7, 3, 7]), "here")
-    with pytest.raises(DataError, match=r"here: unknown particle type 5, 9 \(known: 3 boundary, 7 goop\).*family"):
-        metadata.check_types(np.array([9, 7, 5, 5]), "here")
 
 
 def test_densities_of_a_preset_reach_the_scene_of_its_dataset(tmp_path):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Trajectory
-from nmpm.data.statistics import MotionStatistics, find_disagreements, first_moving_particle
+from nmpm.data.statistics import MotionStatistics, find_disagreements
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 
@@ -36,12 +36,3 @@ def test_small_differences_are_ignored():
     assert "vel_std = (1.2, 2); these trajectories have (1, 2)" in sentence
     assert len(find_disagreements(measured, {"vel_std": [1.0]})) == 1
     assert find_disagreements(measured, {"vel_std": "unknown"}) == []
-
-
-def test_first_moving_particle_relative_to_the_extent():
-    position = np.zeros((4, 3, 2), np.float32)
-    position[2, 2] = 0.01
-    particles, extent = np.array([True, False, True]), ((0.0, 1.0), (0.0, 1.0))
-    assert first_moving_particle(position, particles, extent) == 2
-    assert first_moving_particle(position, np.array([True, True, False]), extent) is None
-    assert first_moving_particle(position, particles, ((0.0, 100.0),) * 2) is None

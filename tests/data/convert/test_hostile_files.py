@@ -60,14 +60,11 @@ def test_pickles_that_ask_for_much_or_change_functions(data):
 @pytest.mark.parametrize(
     "frame",
     [
-        *(b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff" + bytes(2**20), b"\x91" * 5_000),
-        *(
-            msgpack.packb(frames()[0] | {b"pos": packed(np.zeros((5, 3), "f4")) | change})
-            for change in ({b"type": b"(1000000,1000000)f4"}, {b"shape": [-1, 3]})
-        ),
+        b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff" + bytes(2**20), b"\x91" * 5_000,
+        msgpack.packb(frames()[0] | {b"pos": packed(np.zeros((5, 3), "f4")) | {b"type": b"(1000000,1000000)f4"}}),
     ],
-    ids=["list", "bytes", "depth", "type", "shape"],
-)
+    ids=["list", "bytes", "depth", "type"],
+)  # fmt: skip
 def test_messages_that_ask_for_much(tmp_path, frame):
     (tmp_path / "a.msgpack.zst").write_bytes(zstandard.ZstdCompressor().compress(b"\xdd\xff\xff\xff\xff" + frame))
     with pytest.raises(DataError, match=r"a\.msgpack\.zst"):
@@ -102,33 +99,27 @@ def test_hdf5_shapes_without_content(tmp_path, name, options):
         Split(tmp_path / "train.h5").read_with_fields(0)
 
 
-def _npy(shape: str, kind: str = "'<f4'") -> bytes:
-    text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + b"abcd"
-
-
 @pytest.mark.parametrize(
-    ("content", "limit", "message"),
+    ("kind", "shape", "limit", "message"),
     [
-        (_npy("(4294967296, 4294967296)"), None, "simulation_0"),
-        (_npy("(" * 3_000 + ")" * 3_000), None, "simulation_0"),
-        (_npy("(2,)", "[('a', '<f4', (1000000, 1000000))]"), None, "simulation_0"),
-        (bytes(100), 10, "200 times its size"),
+        ("'<f4'", "(4294967296, 4294967296)", 2**28, "simulation_0"),
+        ("'<f4'", "(" * 3_000 + ")" * 3_000, 2**28, "simulation_0"),
+        ("[('a', '<f4', (1000000, 1000000))]", "(2,)", 2**28, "simulation_0"),
+        ("'<f4'", "(2,)", 10, "200 times its size"),
     ],
     ids=["shape", "depth", "kind", "zeros"],
 )
-def test_arrays_that_ask_for_much(folder, monkeypatch, content, limit, message):
-    if limit:
-        monkeypatch.setattr("nmpm.data.convert.gns_npz.expansion_limit", lambda _: limit)
+def test_arrays_that_ask_for_much(folder, monkeypatch, kind, shape, limit, message):
+    monkeypatch.setattr("nmpm.data.convert.gns_npz.expansion_limit", lambda _: limit)
+    text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     with zipfile.ZipFile(folder / "train.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("simulation_0.npy", content)
+        archive.writestr("simulation_0.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(8))
     with pytest.raises(DataError, match=rf"train\.npz: .*{message}"):
         convert(folder, folder / "out")
 
 
-@pytest.mark.parametrize("length", [2**20, 2**64 - 1])
-def test_records_that_ask_for_much(folder, length):
-    header = struct.pack("<Q", length)
+def test_records_that_ask_for_much(folder):
+    header = struct.pack("<Q", 2**63)
     records.write_records(folder / "train.tfrecord", header + records.masked(header) + bytes(40))
     with pytest.raises(DataError, match=r"train\.tfrecord: record 0.*cannot be read"):
         convert(folder, folder / "out")
@@ -137,14 +128,11 @@ def test_records_that_ask_for_much(folder, length):
 @pytest.mark.parametrize(
     "change",
     [
-        '"dt": 1' + "0" * 400,
-        '"more": ' + "[" * 100_000 + "]" * 100_000,
-        '"particle_types": {"1' + "0" * 400 + '": "a"}',
-        '"gravity": [NaN, Infinity]',
-        '"more": "' + " " * 2**24 + '"',
+        '"dt": 1' + "0" * 400, '"more": ' + "[" * 100_000 + "]" * 100_000, '"gravity": [NaN, Infinity]',
+        '"particle_types": {"1' + "0" * 400 + '": "a"}', '"more": "' + " " * 2**24 + '"',
     ],
-    ids=["number", "depth", "key", "nan", "length"],
-)
+    ids=["number", "depth", "nan", "key", "length"],
+)  # fmt: skip
 def test_metadata_beyond_all_bounds(tmp_path, change):
     (tmp_path / "metadata.json").write_text(json.dumps(METADATA)[:-1] + f", {change}}}")
     with pytest.raises(DataError, match=r"metadata\.json") as caught:

@@ -40,6 +40,7 @@ def test_windows_equal_the_frames_of_the_file(make_dataset):
             truth = torch.from_numpy(buffer.provider.split.read(trajectory, start, start + 5).position)
             assert torch.equal(window.frames[row, :, :count], truth[:, :count])
             assert torch.equal(window.obstacle[row], truth[0, count:])
+            assert (window.frames[row, :, count:] == 0.5).all()  # padding is in the middle of the domain
 
 
 @pytest.mark.parametrize(

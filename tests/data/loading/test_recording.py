@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from nmpm.data.convert import Options
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.padded_batch import PaddedRecordings, unwrap
+from nmpm.data.loading.padded_batch import unwrap
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
@@ -25,6 +25,7 @@ def test_static_particles_are_separated(make_dataset):
     np.testing.assert_array_equal(recorded.frames, trajectory.position[:, :7])
     np.testing.assert_array_equal(recorded.obstacle, trajectory.position[0, 7:])
     assert recorded.material.tolist() == [0] * 7
+    assert len(list(recordings)) == 3  # iteration ends after the last
 
 
 def test_gravity_of_the_trajectory_comes_first(make_dataset):
@@ -56,19 +57,6 @@ def test_trajectories_that_do_not_fit_the_scene_are_named(make_dataset, place, v
     with pytest.raises(DataError, match=f"trajectory 00001: {message}"):
         recordings[1]
     recordings[2]
-
-
-def test_padding_of_a_batch(make_dataset):
-    recordings = recordings_of(make_dataset(statics=2))
-    chosen = [recordings[i] for i in range(3)]
-    window = PaddedRecordings.stack(chosen, recordings.scene).gather([0, 1, 2], [0, 3, 6], 5)
-    assert window.frames.shape == (3, 5, 7, 2)
-    assert window.mask.sum(dim=1).tolist() == [5, 7, 6]
-    assert window.obstacle_mask.all()
-    for row, start in enumerate([0, 3, 6]):
-        count = len(chosen[row].material)
-        assert torch.equal(window.frames[row, :, :count], chosen[row].frames[start : start + 5])
-        assert torch.equal(window.frames[row, :, count:], torch.full((5, 7 - count, 2), 0.5))
 
 
 @given(seed=st.integers(0, 1000), frames=st.integers(2, 40))
