@@ -61,6 +61,7 @@ def test_reads_one_member_with_all_trajectories(tmp_path):
     ("content", "message"),
     [
         (pair(positions(0)), "found 1 parts"),
+        (positions(0), "found 7 parts"),
         (pair(positions(0)[0], 5), r"shape \(T, N, D\)"),
         (pair(positions(0), np.arange(3)), "one for each of 4 particles"),
         (pair(positions(0) * np.nan, 5), "finite"),
@@ -69,7 +70,7 @@ def test_reads_one_member_with_all_trajectories(tmp_path):
             r"requests pathlib\.Path\.touch|requests builtins\.getattr",
         ),
     ],
-    ids=["parts", "shape", "types", "nan", "pickle"],
+    ids=["parts", "numbers", "shape", "types", "nan", "pickle"],
 )
 def test_inconsistent_content_is_refused_by_name(tmp_path, monkeypatch, content, message):
     monkeypatch.chdir(tmp_path)

@@ -62,8 +62,9 @@ def test_pickles_that_ask_for_much_or_change_functions(data):
     [
         b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff" + bytes(2**20), b"\x91" * 5_000,
         msgpack.packb(frames()[0] | {b"pos": packed(np.zeros((5, 3), "f4")) | {b"type": b"(1000000,1000000)f4"}}),
+        msgpack.packb(frames()[0] | {b"pos": packed(np.zeros((5, 3), "f4")) | {b"shape": [-1, 3]}}),
     ],
-    ids=["list", "bytes", "depth", "type"],
+    ids=["list", "bytes", "depth", "type", "shape"],
 )  # fmt: skip
 def test_messages_that_ask_for_much(tmp_path, frame):
     (tmp_path / "a.msgpack.zst").write_bytes(zstandard.ZstdCompressor().compress(b"\xdd\xff\xff\xff\xff" + frame))
