@@ -103,8 +103,8 @@ def read(folder, file: str, content: bytes) -> None:
             split.read_with_fields(index)
         assert all(recording.frames.isfinite().all() for recording in FolderSource(folder).recordings("train"))
     else:
-        for split in open_dataset(folder, None, Options(types={5: "water"}, dt=0.0025)).splits.values():
-            assert all(np.isfinite(trajectory.position).all() for trajectory in split)
+        for start in open_dataset(folder, None, Options(types={5: "water"}, dt=0.0025)).splits.values():
+            assert all(np.isfinite(trajectory.position).all() for trajectory in start())
 
 
 @pytest.mark.parametrize("name", FORMATS)
