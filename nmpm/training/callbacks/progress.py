@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from contextlib import ExitStack
 from datetime import timedelta
 from typing import Any
@@ -19,8 +20,8 @@ from nmpm.training.budget import seconds_left, total_steps
 class Progress(ProgressBar):
     """Shows progress without asking the device for anything but the loss, every `log_every_n_steps` steps.
 
-    While training: steps, loss, MSE of the last validation's full rollouts, and the time until `max_time`. While
-    evaluating: batches. Nothing is shown by ranks other than 0.
+    While training: steps, loss, MSE of the last validation's full rollouts, and, with `max_time`, which limit ends the
+    training and when. While evaluating: batches. Nothing is shown by ranks other than 0.
     """
 
     def __init__(self) -> None:
@@ -29,6 +30,7 @@ class Progress(ProgressBar):
         self._open_bar = ExitStack()
         self._advance: Step | None = None
         self._steps = 0  # that the bar shows
+        self._first_step, self._start = 0, math.nan  # when this process began to train
         self._loss = self._error = ""
 
     @property
@@ -43,8 +45,8 @@ class Progress(ProgressBar):
         self._enabled = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        total, self._steps = total_steps(trainer), trainer.global_step
-        self._open("training", int(total) if math.isfinite(total) else None, self._steps)
+        self._start, self._first_step, self._steps = time.monotonic(), trainer.global_step, trainer.global_step
+        self._open("training", total_steps(trainer), self._steps)
 
     def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
         if self._enabled and trainer.global_step % max(1, trainer.log_every_n_steps) == 0:  # type: ignore[attr-defined]  # (Lightning sets it)
@@ -76,41 +78,36 @@ class Progress(ProgressBar):
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._open("predicting", sum(trainer.num_predict_batches))
 
-    def on_test_batch_end(self, *_: Any) -> None:
-        self._count_batch()
-
-    def on_predict_batch_end(self, *_: Any) -> None:
-        self._count_batch()
-
-    def on_train_end(self, *_: Any) -> None:
-        self._close()
-
-    def on_test_end(self, *_: Any) -> None:
-        self._close()
-
-    def on_predict_end(self, *_: Any) -> None:
-        self._close()
-
-    def on_exception(self, *_: Any) -> None:
-        self._close()
-
-    def _open(self, what: str, total: float | None, done: int = 0) -> None:
-        if self._enabled:
-            bar = progress_bar(what, None if total is None else int(total), done)
-            self._advance = self._open_bar.enter_context(bar)
-
-    def _count_batch(self) -> None:
+    def _count_batch(self, *_: Any) -> None:
         if self._advance is not None:
             self._advance()
 
-    def _close(self) -> None:
+    on_test_batch_end = on_predict_batch_end = _count_batch
+
+    def _close(self, *_: Any) -> None:
         self._open_bar.close()
         self._advance = None
+
+    on_train_end = on_test_end = on_predict_end = on_exception = _close
+
+    def _open(self, what: str, total: float, done: int = 0) -> None:
+        if self._enabled:
+            bar = progress_bar(what, int(total) if math.isfinite(total) else None, done)
+            self._advance = self._open_bar.enter_context(bar)
 
     def _show(self, trainer: Trainer, doing: str) -> None:
         if self._advance is None:
             return
-        left = seconds_left(trainer)
-        limit = f"max_time in {timedelta(seconds=round(left))}" if math.isfinite(left) else ""
         new, self._steps = trainer.global_step - self._steps, trainer.global_step
-        self._advance(", ".join(part for part in (doing, self._loss, self._error, limit) if part), new)
+        self._advance(", ".join(part for part in (doing, self._loss, self._error, self._end(trainer)) if part), new)
+
+    def _end(self, trainer: Trainer) -> str:
+        """Which limit ends the training, and when; empty where steps alone do, whose time the bar shows."""
+        left, limit = seconds_left(trainer), "max_time"
+        if math.isinf(left):
+            return ""
+        if taken := trainer.global_step - self._first_step:
+            pace = (time.monotonic() - self._start) / taken
+            steps_left = pace * (total_steps(trainer) - trainer.global_step)
+            left, limit = min((left, limit), (steps_left, "max_steps"))
+        return f"ends by {limit} in {timedelta(seconds=round(left))}"
