@@ -26,42 +26,38 @@ LONGEST = 300
 """Characters of a message of jsonargparse's that are shown."""
 
 REMARKS = re.compile(
-    "|".join(
-        (
-            r"(\[rank: \d+\] )?Seed set to",
-            r"Found current_model_state in the checkpoint",
-            r"Using .*(Automatic Mixed Precision|precision)",
-            r"(GPU|TPU|HPU|IPU) available: ",
-            r"LOCAL_RANK: ",
-            r"You are using a CUDA device",
-            r".{0,3}Tip: For seamless cloud",
-            r"Loading `train_dataloader` to estimate",
-            r"Initializing distributed: ",
-            r"-+\ndistributed_backend=",
-            r"Restor(ing|ed all) states from",
-            r"Loaded model weights from",
-            r"`Trainer\.fit` stopped: ",
-            r"Time limit reached\.",
-            r"\s*Detected KeyboardInterrupt",
-            r"\[rank: \d+\] Received SIGTERM",
-        )
-    )
+    r"(\[rank: \d+\] )?Seed set to"
+    r"|Found current_model_state in the checkpoint"
+    r"|Using .*(Automatic Mixed Precision|precision)"
+    r"|(GPU|TPU|HPU|IPU) available: "
+    r"|LOCAL_RANK: "
+    r"|You are using a CUDA device"
+    r"|.{0,3}Tip: For seamless cloud"
+    r"|Loading `train_dataloader` to estimate"
+    r"|Initializing distributed: "
+    r"|-+\ndistributed_backend="
+    r"|Restor(ing|ed all) states from"
+    r"|Loaded model weights from"
+    r"|`Trainer\.fit` stopped: "
+    r"|Time limit reached\."
+    r"|\s*Detected KeyboardInterrupt"
+    r"|\[rank: \d+\] Received SIGTERM"
 )
 """Messages that Lightning logs in the course of every run."""
 
 WARNINGS = (
-    (r"`isinstance\(treespec, LeafSpec\)` is deprecated", r"lightning\."),
-    (r"Checkpoint directory .* exists and is not empty", r"lightning\."),
-    (r"Experiment logs directory .* exists and is not empty", r"lightning\."),
-    (r"Couldn't infer the batch indices fetched", r"lightning\."),
-    (r"It is recommended to use `self\.log\(.*sync_dist=True\)`", r"lightning\."),
-    (r"`max_epochs` was not set", r"lightning\."),
-    (r"The '\w+' does not have many workers", r"lightning\."),
-    (r"You're using the WeightAveraging callback, but loading a checkpoint outside", r"lightning\."),
-    (r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint", r"lightning\."),
-    (r"Precision .* is not supported by the model summary", r"lightning\."),
+    r"`isinstance\(treespec, LeafSpec\)` is deprecated",
+    r"Checkpoint directory .* exists and is not empty",
+    r"Experiment logs directory .* exists and is not empty",
+    r"Couldn't infer the batch indices fetched",
+    r"It is recommended to use `self\.log\(.*sync_dist=True\)`",
+    r"`max_epochs` was not set",
+    r"The '\w+' does not have many workers",
+    r"You're using the WeightAveraging callback, but loading a checkpoint outside",
+    r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint",
+    r"Precision .* is not supported by the model summary",
 )
-"""Messages and modules of warnings about what is meant to be so."""
+"""Lightning's warnings about what is meant to be so."""
 
 
 class _Remarks(logging.Filter):
@@ -73,11 +69,11 @@ class _Remarks(logging.Filter):
 def quiet_lightning() -> Iterator[None]:
     """Hide `REMARKS` and `WARNINGS` while it lasts; everything else is shown."""
     remarks = _Remarks()
-    handlers = [handler for name in ("lightning.pytorch", "lightning.fabric", "lightning", "") for handler in
-                logging.getLogger(name).handlers]  # fmt: skip
+    loggers = map(logging.getLogger, ("lightning.pytorch", "lightning.fabric", "lightning", ""))
+    handlers = [handler for logger in loggers for handler in logger.handlers]
     with warnings.catch_warnings():
-        for message, module in WARNINGS:
-            warnings.filterwarnings("ignore", message, module=module)
+        for message in WARNINGS:
+            warnings.filterwarnings("ignore", message, module=r"lightning\.")
         for handler in handlers:
             handler.addFilter(remarks)
         try:
@@ -113,7 +109,9 @@ def explain(message: str, names: Iterable[str]) -> str:
     option = f"--{key[1]}: " if key else ""
     if match := re.search(r"module '([\w.]+)' has no attribute '(\w+)'", message):
         public = [name for name in vars(sys.modules.get(match[1], object())) if not name.startswith("_")]
-        return f"{option}there is no {match[1]}.{match[2]}{_question(match[2], public, f'{match[1]}.')}"
+        near = get_close_matches(match[2], public, n=1)
+        question = f"; did you mean {match[1]}.{near[0]}?" if near else "."
+        return f"{option}there is no {match[1]}.{match[2]}{question}"
     if match := re.search(r"Expected a <class '(\w+)'>\.? Got value: (.*)", message):
         return f"{option}{match[2]} is not of type {match[1]}."
     if match := re.search(r"Expected a typing\.Literal\[(.*?)\]\.? Got value: (\S+)", message):
@@ -137,20 +135,12 @@ def is_of_other_packages(error: BaseException) -> bool:
 
 def _hint(wrong: str, names: Iterable[str], mark: str) -> str:
     """A question for the nearest of the options, else for an argument of a part that is spelt like the last word."""
-    if near := get_close_matches(wrong, list(names), n=1, cutoff=0.8):
-        return f"; did you mean {mark}{near[0]}?"
-    arguments = dict(_part_arguments())
-    near = get_close_matches(wrong.rpartition(".")[2], list(arguments), n=1, cutoff=0.75)
-    return f"; did you mean {mark}{arguments[near[0]]}?" if near else ". See --help_all for all there are."
-
-
-def _question(wrong: str, names: Iterable[str], before: str) -> str:
-    near = get_close_matches(wrong, list(names), n=1)
-    return f"; did you mean {before}{near[0]}?" if near else "."
-
-
-def _part_arguments() -> Iterator[tuple[str, str]]:
-    """Arguments of processors, transfers and decoders, and the options that set them."""
-    for part, base in PARTS.items():
-        for kind in base.__subclasses__():
-            yield from ((name, f"model.{part}.{name}") for name in vars(kind).get("__dataclass_fields__", ()))
+    arguments = {
+        name: f"model.{part}.{name}"
+        for part, base in PARTS.items()
+        for kind in base.__subclasses__()
+        for name in vars(kind).get("__dataclass_fields__", ())
+    }
+    near = get_close_matches(wrong, list(names), n=1, cutoff=0.8)
+    near += [arguments[name] for name in get_close_matches(wrong.rpartition(".")[2], arguments, n=1, cutoff=0.75)]
+    return f"; did you mean {mark}{near[0]}?" if near else ". See --help_all for all there are."

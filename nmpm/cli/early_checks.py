@@ -1,20 +1,19 @@
-"""Checks of a training command's names and paths that need neither torch nor Lightning, which take seconds to import.
+"""A training command's options, and checks of them that need neither torch nor Lightning, which take seconds to import.
 
-They find the common mistakes early; whatever they pass is checked again, by the parser and by the parts themselves.
+The checks find the common mistakes early; the parser and the parts themselves check all that passes here again.
 """
 
 from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from nmpm._support.bounded_files import read_yaml
-from nmpm._support.shipped import PACKAGE
+from nmpm._support.shipped import PACKAGE, find_config
 from nmpm.errors import ConfigError, DataError
 
 NOT_FILES = (None, "last", "best", "null", "???")
@@ -38,21 +37,50 @@ class UsageError(Exception):
     """An option or key that does not exist, or a value of the wrong kind; the message is one line."""
 
 
-def check_command(words: Sequence[str]) -> None:
-    """Check the options of a training command, and the configuration files that it names.
+class Option(NamedTuple):
+    """A word of the command line that is an option, with its value if it has one, or a word on its own."""
 
-    Args:
-        words: With the paths of the configuration files.
+    name: str
+    value: str | None = None
+
+    def __str__(self) -> str:
+        return self.name if self.value is None else f"{self.name}={self.value}"
+
+
+def read_options(words: Sequence[str]) -> list[Option]:
+    """The options that words are: `--key value`, `--key=value`, `--flag`, or words on their own.
+
+    A --config is one with the path of the file that it means.
+
+    Raises:
+        ConfigError: if there is no such configuration file.
+    """
+    options: list[Option] = []
+    rest = list(words)
+    while rest:
+        name, mark, value = rest.pop(0).partition("=")
+        option = Option(name, value if mark else None)
+        if not mark and name.startswith("-") and rest and not re.match(r"--?[a-zA-Z]", rest[0]):
+            option = Option(name, rest.pop(0))
+        if option.name in ("--config", "-c") and option.value:
+            option = Option("--config", str(find_config(option.value)))
+        options.append(option)
+    return options
+
+
+def check_options(options: Sequence[Option]) -> None:
+    """Check the options of a training command, and the configuration files that they name.
 
     Raises:
         UsageError: for a misspelt name, or a configuration that is not YAML.
         ConfigError: if dataset or checkpoint do not exist.
         DataError: if there is no such embedded dataset.
     """
-    configs = [read_config(Path(path)) for path in _config_paths(words)]
-    _check_options(words, configs)
-    _check_classes(words)
-    options = dict(pairwise(words)) | dict(word.split("=", 1) for word in words if "=" in word)
+    configs = [read_config(Path(value)) for name, value in options if name == "--config" and value]
+    for group in SIGNATURES:
+        _check_names(group, options, configs)
+    for option in options:
+        _check_class(option)
     path = _value(options, configs, "data.path")
     _check_exists("--data.path", path, "dataset")
     _check_exists("--ckpt_path", _value(options, configs, "ckpt_path"), "checkpoint")
@@ -86,54 +114,47 @@ def argument_names(group: str) -> set[str]:
 
 def class_definition(file: str, name: str) -> ast.ClassDef:
     """A class of the package, as its source has it."""
-    (kind,) = (node for node in _tree(file).body if isinstance(node, ast.ClassDef) and node.name == name)
+    (kind,) = (node for node in _statements(file) if isinstance(node, ast.ClassDef) and node.name == name)
     return kind
 
 
 def class_names(module: str) -> set[str]:
     """Classes of one of `PARTS`, read from the source."""
-    nodes = _tree(PARTS[module]).body
-    imported = {alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
-    return imported | {node.name for node in nodes if isinstance(node, ast.ClassDef)}
+    names = set()
+    for node in _statements(PARTS[module]):
+        if isinstance(node, ast.ImportFrom):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ClassDef):
+            names.add(node.name)
+    return names
 
 
-def _tree(file: str) -> ast.Module:
-    return ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
+def _statements(file: str) -> list[ast.stmt]:
+    return ast.parse((PACKAGE / file).read_text(encoding="utf-8")).body
 
 
-def _config_paths(words: Sequence[str]) -> Iterator[str]:
-    for word, following in pairwise([*words, ""]):
-        if word in ("--config", "-c"):
-            yield following
-        elif word.startswith("--config="):
-            yield word.removeprefix("--config=")
+def _check_names(group: str, options: Sequence[Option], configs: Sequence[Mapping[str, Any]]) -> None:
+    prefix, names = f"--{group}.", argument_names(group)
+    given = [name.removeprefix(prefix).partition(".")[0] for name, _ in options if name.startswith(prefix)]
+    sections = [section for config in configs if isinstance(section := config.get(group), Mapping)]
+    for name in [*given, *(str(key) for section in sections for key in section)]:
+        if name not in names and (near := get_close_matches(name, names, n=1, cutoff=0.8)):
+            what, mark = ("there is no option", "--") if name in given else ("the configuration has an unknown key", "")
+            raise UsageError(f"{what} {mark}{group}.{name}; did you mean {mark}{group}.{near[0]}?")
 
 
-def _check_options(words: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> None:
-    for group in SIGNATURES:
-        names = argument_names(group)
-        given = [match[1] for word in words if (match := re.match(rf"--{group}\.(\w+)", word))]
-        sections = [section for config in configs if isinstance(section := config.get(group), Mapping)]
-        for name in [*given, *(str(key) for section in sections for key in section)]:
-            if name not in names and (near := get_close_matches(name, names, n=1, cutoff=0.8)):
-                option = name in given
-                what = f"there is no option --{group}." if option else f"the configuration has an unknown key {group}."
-                raise UsageError(f"{what}{name}; did you mean {'--' if option else ''}{group}.{near[0]}?")
+def _check_class(option: Option) -> None:
+    module, _, kind = (option.value or "").rpartition(".")
+    names = class_names(module) if module in PARTS else set()
+    if kind not in names and (near := get_close_matches(kind, names, n=1)):
+        raise UsageError(f"{option.name}: there is no {option.value}; did you mean {module}.{near[0]}?")
 
 
-def _check_classes(words: Sequence[str]) -> None:
-    for option, word in pairwise(words):
-        name, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
-        module, _, kind = value.rpartition(".")
-        names = class_names(module) if module in PARTS else set()
-        if kind not in names and (near := get_close_matches(kind, names, n=1)):
-            raise UsageError(f"{name}: there is no {value}; did you mean {module}.{near[0]}?")
-
-
-def _value(options: Mapping[str, str], configs: Sequence[Mapping[str, Any]], key: str) -> Any:
-    """The value of an option, or else of the last configuration that has the key; None if none does."""
-    if f"--{key}" in options:
-        return options[f"--{key}"]
+def _value(options: Sequence[Option], configs: Sequence[Mapping[str, Any]], key: str) -> Any:
+    """The value of the last option, or else of the last configuration, that has the key; None if none does."""
+    for option in reversed(options):
+        if option.name == f"--{key}":
+            return option.value
     section, _, name = key.rpartition(".")
     for config in reversed(configs):
         inner = config.get(section) if section else config

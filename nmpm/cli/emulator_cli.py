@@ -20,7 +20,7 @@ from nmpm._support.threads import stated_threads
 from nmpm.cli.console import BriefParser, explain, is_of_other_packages
 from nmpm.cli.early_checks import UsageError
 from nmpm.cli.options import check_folder
-from nmpm.cli.training import CONFIG
+from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS, RunFolder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
@@ -34,14 +34,12 @@ from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.preflight import OVERALL, fitting_precision
-from nmpm.training.run_folder import RunFolder
 
 # Two savers, as ModelCheckpoint's `save_last` leaves the last checkpoint as it was whenever the best does not change.
-SAVERS: dict[str, tuple[type[ModelCheckpoint], dict[str, Any]]] = {
-    "checkpoint": (BestCheckpoint, {"filename": "best", "monitor": f"valid/{OVERALL}"}),
-    "resume": (LastCheckpoint, {"filename": "last", "every_n_train_steps": 100}),
+SAVER_DEFAULTS: dict[str, tuple[type[ModelCheckpoint], dict[str, Any]]] = {
+    "best": (BestCheckpoint, {"monitor": f"valid/{OVERALL}"}),
+    "last": (LastCheckpoint, {"every_n_train_steps": 100}),
 }
-CHECKPOINTS = "checkpoints"
 THREADS = (
     "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
     " used, as measured). Another number changes results by rounding."
@@ -75,10 +73,10 @@ class ConfiguredCLI(LightningCLI):
         return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        for name, (kind, defaults) in SAVERS.items():
-            parser.add_lightning_class_args(kind, name)
-            given = defaults | {"enable_version_counter": False}
-            parser.set_defaults({f"{name}.{key}": value for key, value in given.items()})
+        for name, (kind, defaults) in SAVER_DEFAULTS.items():
+            parser.add_lightning_class_args(kind, SAVERS[name])
+            given = defaults | {"filename": name, "enable_version_counter": False}
+            parser.set_defaults({f"{SAVERS[name]}.{key}": value for key, value in given.items()})
         parser.add_argument("--threads", type=PositiveInt | None, default=None, help=THREADS)
         if self.command == "fit":
             parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
@@ -87,12 +85,11 @@ class ConfiguredCLI(LightningCLI):
 
     def _model_scene(self, scene: Scene) -> Scene:
         """The data's scene, with fields of the checkpoint under evaluation that the data lack."""
-        config = self.config[self.subcommand]
-        if self.subcommand == "fit" or not config["ckpt_path"]:
+        if self.subcommand == "fit":
             return scene
         try:
-            path = self._run_folder(config).checkpoint(str(config["ckpt_path"]))
-            stored = read_checkpoint(path).get("hyper_parameters", {}).get("scene")
+            path = self.checkpoint_path()
+            stored = read_checkpoint(path).get("hyper_parameters", {}).get("scene") if path else None
         except NmpmError:  # is raised again when the checkpoint is loaded; here the parser would wrap it
             return scene
         return scene.with_fields_of(Scene.from_dict(stored)) if isinstance(stored, dict) else scene
@@ -129,7 +126,7 @@ class ConfiguredCLI(LightningCLI):
             trainer["precision"] = fitting_precision(configured, find_device(trainer["accelerator"]))
             self.bfloat16_replaced = trainer["precision"] != configured
         trainer["enable_model_summary"] = bool(trainer["enable_model_summary"])  # the first line says its size
-        for saver in SAVERS:
+        for saver in SAVERS.values():
             folder = Path(trainer["default_root_dir"]) / CHECKPOINTS
             config[saver]["dirpath"] = config[saver]["dirpath"] or str(folder)
             if self.subcommand == "fit":
@@ -179,15 +176,15 @@ class ConfiguredCLI(LightningCLI):
     @property
     def run_folder(self) -> RunFolder:
         """Where this run's files are."""
-        return self._run_folder(self.config_init[self.subcommand])
+        config = self.config[self.subcommand]
+        return RunFolder.of(Path(config["trainer"]["default_root_dir"]), config)
 
-    def _run_folder(self, config: Any) -> RunFolder:
-        files = {"last": self._checkpoint_file("resume"), "best": self._checkpoint_file("checkpoint")}
-        return RunFolder(Path(config["trainer"]["default_root_dir"]), files)
-
-    def _checkpoint_file(self, saver: str) -> Path:
-        config = self.config[self.subcommand][saver]
-        return Path(config["dirpath"]) / f"{config['filename']}{ModelCheckpoint.FILE_EXTENSION}"
+    def checkpoint_path(self) -> Path | None:
+        """The file of the option --ckpt_path; None without it."""
+        stated = self.config[self.subcommand]["ckpt_path"]
+        if not stated:
+            return None
+        return self.run_folder.checkpoint(stated) if stated in SAVERS else Path(stated)
 
 
 class RunConfig(SaveConfigCallback):
@@ -199,7 +196,7 @@ class RunConfig(SaveConfigCallback):
         config, root = self.config.clone(), Path(self.config["trainer"]["default_root_dir"])
         config["ckpt_path"] = None
         config.pop("start_from", None)  # unknown to other commands, and of the start alone
-        for saver in SAVERS:
+        for saver in SAVERS.values():
             folder = Path(config[saver]["dirpath"])
             config[saver]["dirpath"] = None if folder == root / CHECKPOINTS else str(folder.absolute())
         if config["data"]["path"]:

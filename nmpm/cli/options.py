@@ -97,7 +97,8 @@ def check_at_least(option: str, value: int | None, least: int) -> None:
 
 def check_output(option: str, path: Path) -> None:
     """Raise ConfigError, before the work, if a file cannot be written."""
-    _refuse(option, path, file_obstacle(path))
+    if obstacle := file_obstacle(path):
+        raise ConfigError(f"{option} {path}: {obstacle}")
 
 
 def check_picture(option: str, path: Path) -> None:
@@ -109,22 +110,27 @@ def check_picture(option: str, path: Path) -> None:
 
 def check_folder(option: str, path: Path) -> None:
     """Raise ConfigError, before the work, if a folder cannot be written or made."""
-    _refuse(option, path, name_obstacle(path))
-    if path.exists() and not path.is_dir():
-        raise ConfigError(f"{option} {path}: it is a file; name a folder.")
-    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-    if not existing.is_dir():
-        raise ConfigError(f"{option} {path}: {existing} is a file, not a folder.")
-    _refuse(option, path, folder_obstacle(existing))
+    if not (obstacle := name_obstacle(path)):
+        existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        if path.exists() and not path.is_dir():
+            obstacle = "it is a file; name a folder."
+        elif not existing.is_dir():
+            obstacle = f"{existing} is a file, not a folder."
+        else:
+            obstacle = folder_obstacle(existing)
+    if obstacle:
+        raise ConfigError(f"{option} {path}: {obstacle}")
 
 
 def check_input(option: str, path: Path) -> None:
     """Raise ConfigError if a file does not exist, or is a folder."""
-    _refuse(option, path, name_obstacle(path))
-    if path.is_dir():
-        raise ConfigError(f"{option} {path}: it is a folder; name a file in it, such as {path / 'test.h5'}.")
-    if not path.is_file():
-        raise ConfigError(f"{option} {path}: there is no such file.")
+    obstacle = name_obstacle(path)
+    if not obstacle and path.is_dir():
+        obstacle = f"it is a folder; name a file in it, such as {path / 'test.h5'}."
+    elif not obstacle and not path.is_file():
+        obstacle = "there is no such file."
+    if obstacle:
+        raise ConfigError(f"{option} {path}: {obstacle}")
 
 
 def add_data_options(parser: argparse.ArgumentParser) -> None:
@@ -169,11 +175,6 @@ def new_ids(text: str | None) -> dict[int, int] | None:
     """The pairs of `--ids`; raises ConfigError if they cannot be read."""
     pairs: dict[int, int] | None = _parse("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
     return pairs
-
-
-def _refuse(option: str, path: Path, obstacle: str) -> None:
-    if obstacle:
-        raise ConfigError(f"{option} {path}: {obstacle}")
 
 
 def _pairs(text: str) -> dict[int, int]:

@@ -122,13 +122,14 @@ def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
 
 
 def _recorded(model: Pretrained, path: Path, index: int) -> Window:
-    """A recorded trajectory."""
     from nmpm.data.format import Split, read_metadata
     from nmpm.data.loading.padded_batch import collate
     from nmpm.data.loading.recording import SplitRecordings
+    from nmpm.data.metadata import FAMILIES
     from nmpm.emulator.fields import warn_of_ignored
 
-    metadata = read_metadata(path.parent, _family(model))
+    deepmind = set(model.scene.materials) <= set(FAMILIES["deepmind"].types.values())
+    metadata = read_metadata(path.parent, "deepmind" if deepmind else None)
     warn_of_ignored(model.scene, metadata.fields)
     recordings = SplitRecordings(Split(path), metadata, model.scene)
     if index >= len(recordings):
@@ -136,12 +137,6 @@ def _recorded(model: Pretrained, path: Path, index: int) -> Window:
     if recordings.split.frames(index) < 2:
         raise ConfigError(f"--trajectory {index}: it has one frame in {path}; a rollout starts from two.")
     return collate([recordings[index]], model.scene)
-
-
-def _family(model: Pretrained) -> str | None:
-    from nmpm.data.metadata import FAMILIES
-
-    return "deepmind" if set(model.scene.materials) <= set(FAMILIES["deepmind"].types.values()) else None
 
 
 def _predict(model: Pretrained, state: Particles, frames: int, options: argparse.Namespace) -> Rollout:

@@ -154,28 +154,24 @@ class EmulatorCLI(ConfiguredCLI):
         self.run_folder.remove_unfinished()
         if resumed is None or not self.run_folder.holds(Path(config["ckpt_path"])):
             self.run_folder.check_new()
-        self._print_start()
-        sys.stdout.write(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
-        sys.stdout.flush()
+        self._print_start(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
 
     def before_validate(self) -> None:
         self._load_checkpoint()
-        self._print_start()
+        if not rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
+            self._print_start()
 
     before_test = before_predict = before_validate
 
-    def _print_start(self) -> None:
-        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
-            return
+    def _print_start(self, more: str = "") -> None:
         device, emulator = self.trainer.strategy.root_device, self.model.emulator
         hardware = self.threads.describe(self.trainer) if device.type == "cpu" else device_name(device)
         weights = sum(parameter.numel() for parameter in emulator.parameters())
+        precision = "bfloat16 is emulated on this processor; training in float32.\n" if self.bfloat16_replaced else ""
         sys.stdout.write(
             f"{self.note}Data: {self.datamodule.description}. Model: {type(emulator.recipe.processor).__name__},"
-            f" {weights:,} parameters, on {hardware}.\n"
+            f" {weights:,} parameters, on {hardware}.\n{precision}{more}"
         )
-        if self.bfloat16_replaced:
-            sys.stdout.write("bfloat16 is emulated on this processor; training in float32.\n")
         sys.stdout.flush()
 
     def fit(self, **options: Any) -> None:
@@ -244,13 +240,12 @@ class EmulatorCLI(ConfiguredCLI):
 
     def _load_checkpoint(self) -> dict[str, Any] | None:
         """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""
-        config = self.config_init[self.subcommand]
-        if not config.get("ckpt_path"):
+        path = self.checkpoint_path()
+        if path is None:
             return None
-        path = self.run_folder.checkpoint(str(config["ckpt_path"]))
         content = read_checkpoint(path)
         self.model.on_load_checkpoint(content)
-        config["ckpt_path"] = str(path)
+        self.config_init[self.subcommand]["ckpt_path"] = str(path)
         return content
 
     def _load_initial_weights(self, name: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,44 +19,21 @@ _TOLERANCE = 0.25
 """Cells by which a mirror image's walls may be off: bounds of recorded data are widened by single stray particles."""
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """Random changes of training windows, different in each step.
+def mirror_half(window: Window, scene: Scene, axes: Sequence[int]) -> Window:
+    """The windows, half of them mirrored along each axis; each rank draws for its windows."""
+    device = window.frames.device
+    for axis in axes:
+        draws = rank_slice(lambda rows: torch.rand(rows, device=device), len(window.frames))
+        window = mirror_windows(window, scene, axis, draws < 0.5)
+    return window
 
-    Args:
-        mirror: Axes along which half of the windows are mirrored.
-        jitter: Cells by which the grid is moved at most, see `with_jitter`.
-        position_noise: Standard deviation of the noise on initial positions, in domain lengths.
-    """
 
-    mirror: tuple[int, ...] = ()
-    jitter: float = 0.0
-    position_noise: float = 0.0
-
-    def check(self, scene: Scene, grid: Grid) -> None:
-        """Raise ConfigError if a scene and its grid do not allow the changes."""
-        check_mirrors(scene, grid, self.mirror)
-        check_jitter(scene, grid, self.jitter)
-
-    def mirrored(self, window: Window, scene: Scene) -> Window:
-        """The windows, half of them mirrored along each axis; each rank draws for its windows."""
-        device = window.frames.device
-        for axis in self.mirror:
-            draws = rank_slice(lambda rows: torch.rand(rows, device=device), len(window.frames))
-            window = mirror_windows(window, scene, axis, draws < 0.5)
-        return window
-
-    def start(self, window: Window) -> Particles:
-        """The state that predictions start from, with Gaussian noise on its positions, different on each rank."""
-        initial = window.initial
-        if self.position_noise <= 0:
-            return initial
-        noise = self.position_noise * normal_like(initial.position)
-        return initial.with_motion(initial.position + noise, initial.velocity)
-
-    def jittered(self, emulator: Emulator) -> Emulator:
-        """The emulator with its grid at another place."""
-        return with_jitter(emulator, self.jitter)
+def noisy_start(window: Window, deviation: float) -> Particles:
+    """The first state with Gaussian noise on its positions, in domain lengths, different on each rank."""
+    initial = window.initial
+    if deviation <= 0:
+        return initial
+    return initial.with_motion(initial.position + deviation * normal_like(initial.position), initial.velocity)
 
 
 def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
@@ -122,8 +98,8 @@ def _room_to_move(scene: Scene, grid: Grid, cells: float) -> list[float]:
     rooms = []
     for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(scene.bounds, scene.domain, strict=True)):
         layer = min(low - outer_low, outer_high - high) / grid.spacing[axis]
-        within = layer * (1 - 1e-9)  # so that rounding moves no wall off the grid
-        rooms.append(cells if scene.periodic[axis] else min(cells, within))
+        # A little less, so that rounding moves no wall off the grid.
+        rooms.append(cells if scene.periodic[axis] else min(cells, layer * (1 - 1e-9)))
     return rooms
 
 

@@ -12,7 +12,6 @@ results.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -22,7 +21,6 @@ from torch.autograd.function import once_differentiable
 
 from nmpm._support.threads import map_ranges
 from nmpm.emulator import Bundle, Emulator, RolloutContext
-from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
 T = TypeVar("T")
@@ -37,40 +35,20 @@ def direct(emulator: Emulator, particles: Particles, context: RolloutContext) ->
     return bundle
 
 
-@dataclass(frozen=True)
-class Discount:
-    """Multiplies the gradients that come back through the state between two bundles.
+def discount_gradients(particles: Particles, factor: float) -> Particles:
+    """The same particles; gradients that come back through them are multiplied by a factor in [0, 1], 0 cuts them."""
+    if factor == 1:
+        return particles
 
-    Args:
-        factor: In [0, 1]: 1 changes nothing, 0 cuts gradients.
-
-    Raises:
-        ConfigError: if the factor is not in that range.
-    """
-
-    factor: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.factor <= 1:
-            raise ConfigError(f"model.gradient_discount = {self.factor} must be in [0, 1].")
-
-    def __call__(self, particles: Particles) -> Particles:
-        """The same values, whose gradients are multiplied by the factor."""
-        if self.factor == 1:
-            return particles
-        moved = particles.with_motion(self._discount(particles.position), self._discount(particles.velocity))
-        fields = {name: self._discount(values) for name, values in particles.fields.items()}
-        return moved.with_fields(fields) if fields else moved
-
-    def state_after(self, bundle: Bundle, start: Particles) -> Particles:
-        """The state that the next bundle starts from."""
-        return self(bundle.state_after(start))
-
-    def _discount(self, values: Tensor) -> Tensor:
-        if self.factor == 0:
+    def scale(values: Tensor) -> Tensor:
+        if factor == 0:
             return values.detach()
-        discounted: Tensor = _Scale.apply(values, self.factor)  # type: ignore[no-untyped-call]  # (torch's stubs)
-        return discounted
+        scaled: Tensor = _Scale.apply(values, factor)  # type: ignore[no-untyped-call]  # (torch's stubs)
+        return scaled
+
+    moved = particles.with_motion(scale(particles.position), scale(particles.velocity))
+    fields = {name: scale(values) for name, values in particles.fields.items()}
+    return moved.with_fields(fields) if fields else moved
 
 
 class _Scale(torch.autograd.Function):

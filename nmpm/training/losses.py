@@ -59,45 +59,25 @@ class TrainingError:
         return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
 
 
-@dataclass(frozen=True)
-class FieldError:
-    """The error of the fields that evolve, such as a temperature, in units of their spread in the training data.
+def field_error(
+    predicted: Mapping[str, Tensor], window: Window, spread: Mapping[str, Tensor], frames: int, power: float = 1.0
+) -> Tensor:
+    """The error () of evolving fields in units of their spread: a mean over particles, summed over fields.
 
     Args:
-        weight: Beside the position error in cells²; 0 for none.
-        power: As for position errors, see `TrainingError`.
+        predicted: (B, K m, N) by name, m frames to a bundle. Fields that the window lacks are left out.
+        window: The truth.
+        spread: () of each field in the training data.
+        frames: m.
+        power: As of `TrainingError`.
     """
-
-    weight: float = 1.0
-    power: float = 1.0
-
-    def __call__(
-        self, predicted: Mapping[str, Tensor], window: Window, spread: Mapping[str, Tensor], frames: int
-    ) -> Tensor | float:
-        """The weighted error (), a mean over particles, summed over fields; 0 without fields.
-
-        Args:
-            predicted: (B, K m, N) by name, m frames to a bundle. Those that the window lacks are left out.
-            window: The truth.
-            spread: () of each field.
-            frames: m.
-        """
-        if not self.weight:
-            return 0.0
-        total: Tensor | float = 0.0
-        for name, values in predicted.items():
-            if name in window.fields:
-                target = window.field_target(name)[:, : values.shape[1]]
-                errors = field_errors((values - target) / spread[name], window.mask, frames)
-                total = total + tempered_error(errors, window.mask, self.power)
-        return self.weight * total
-
-
-def field_errors(difference: Tensor, mask: Tensor, frames: int) -> Tensor:
-    """Mean squared difference (B, T, N) of each of B windows and of each bundle of `frames` frames, (B, T / frames)."""
-    squared = difference.square() * mask.unsqueeze(1)
-    bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
-    return bundles.mean(-1) / mask.sum(1, keepdim=True)
+    total = torch.zeros((), device=window.mask.device)
+    for name, values in predicted.items():
+        if name in window.fields:
+            target = window.field_target(name)[:, : values.shape[1]]
+            errors = _bundle_means(((values - target) / spread[name]).square(), window.mask, frames)
+            total = total + tempered_error(errors, window.mask, power)
+    return total
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:
@@ -125,8 +105,12 @@ def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid,
 
         errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
         return errors
-    squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1) * mask.unsqueeze(1)
-    bundles: Tensor = squared.sum(-1).unflatten(1, (-1, frames))
+    return _bundle_means(grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1), mask, frames)
+
+
+def _bundle_means(values: Tensor, mask: Tensor, frames: int) -> Tensor:
+    """Means over the particles of each window and over `frames` frames: (B, T / frames) of (B, T, N) values."""
+    bundles: Tensor = (values * mask.unsqueeze(1)).sum(-1).unflatten(1, (-1, frames))
     return bundles.mean(-1) / mask.sum(1, keepdim=True)
 
 

@@ -19,7 +19,7 @@ from nmpm._support.collectives import global_mean
 from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import Emulator, EmulatorRecipe, Rollout
+from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import compile_network
@@ -27,14 +27,14 @@ from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
 from nmpm.metrics import RolloutMetric
-from nmpm.particles import Window
+from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training import checkpoints, preflight
-from nmpm.training.augmentation import Augmentation
-from nmpm.training.backpropagation import Discount, direct, mean_over_parts
+from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, noisy_start, with_jitter
+from nmpm.training.backpropagation import direct, discount_gradients, mean_over_parts
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.evaluation import EvaluatedModule
-from nmpm.training.losses import FieldError, TrainingError
+from nmpm.training.losses import TrainingError, field_error
 from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 
 CALIBRATION_BATCHES = 4
@@ -93,13 +93,16 @@ class EmulatorModule(EvaluatedModule):
         if not 0 <= unroll_growth <= 1:
             raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
         self.unroll, self.unroll_growth = unroll, unroll_growth
-        self.discount = Discount(gradient_discount)
+        if not 0 <= gradient_discount <= 1:
+            raise ConfigError(f"model.gradient_discount = {gradient_discount} must be in [0, 1].")
+        self.gradient_discount = gradient_discount
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         self.error = TrainingError(density_weight, error_power)
-        self.field_error = FieldError(field_weight, error_power)
-        self.augmentation = Augmentation(tuple(mirror), jitter, position_noise)
-        self.augmentation.check(emulator.scene, emulator.grid)
+        self.field_weight = field_weight
+        self.mirror, self.jitter, self.position_noise = tuple(mirror), jitter, position_noise
+        check_mirrors(emulator.scene, emulator.grid, self.mirror)
+        check_jitter(emulator.scene, emulator.grid, jitter)
         self.recompute, self.compiled = recompute, compile
         self.seed = seed
         arguments = emulator.recipe.to_dict() | {
@@ -229,13 +232,12 @@ class EmulatorModule(EvaluatedModule):
         Over several batches (`accumulate_grad_batches`) Lightning takes the plain mean, so that a particle weighs a
         little more in a batch with fewer particles.
         """
-        batch = self.augmentation.mirrored(batch, self.emulator.scene)
-        particles, emulator = self.augmentation.start(batch), self.augmentation.jittered(self.emulator)
+        batch = mirror_half(batch, self.emulator.scene, self.mirror)
+        particles, emulator = noisy_start(batch, self.position_noise), with_jitter(self.emulator, self.jitter)
         count, call = self.bundles(self._progress()), recomputed if self.recompute else direct
 
         def mean_error(rows: slice) -> Tensor:
-            start = particles.scenes(rows)
-            bundles = unroll_with_gradients(emulator, start, count, call, self.discount.state_after)
+            bundles = unroll_with_gradients(emulator, particles.scenes(rows), count, call, self._discounted_state)
             predicted = Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles])
             return self._error(predicted, batch.scenes(rows))
 
@@ -248,13 +250,19 @@ class EmulatorModule(EvaluatedModule):
         self.log("train/loss", logged)
         return loss
 
+    def _discounted_state(self, bundle: Bundle, start: Particles) -> Particles:
+        return discount_gradients(bundle.state_after(start), self.gradient_discount)
+
     def _error(self, predicted: Rollout, batch: Window) -> Tensor:
         """The error of K m predicted frames, in float32 whatever autocast says."""
         emulator = self.emulator
         with torch.autocast(predicted.position.device.type, enabled=False):
             error = self.error(predicted.position, batch, emulator.scene, emulator.grid, emulator.frames)
+            if not (predicted.fields and self.field_weight):
+                return error
             spread = emulator.field_scales.spread
-            return error + self.field_error(predicted.fields, batch, spread, emulator.frames)
+            of_fields = field_error(predicted.fields, batch, spread, emulator.frames, self.error.power)
+            return error + self.field_weight * of_fields
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimizer, and the schedule of its learning rate. A new emulator is calibrated first.

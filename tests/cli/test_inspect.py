@@ -42,22 +42,6 @@ def test_one_split_stands_for_its_dataset(dataset, capsys):
     assert "train     2 trajectories" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nowhere"], "nowhere"),
-        ([".", "--trajectories", "0"], "--trajectories 0"),
-        ([".", "--gravity", "down"], "--gravity down"),
-        ([".", "--out", "missing/look.png"], "the folder missing does not exist"),
-        ([".", "--out", "look.jpg"], "end the name in .png"),
-    ],
-)
-def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["inspect", *words]) == 1
-    assert said in capsys.readouterr().err
-
-
 def test_types_that_the_files_do_not_name_can_be_named(dataset, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     assert main(["inspect", str(dataset), "--types", "7=honey", "--no-picture"]) == 0

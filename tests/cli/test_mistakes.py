@@ -1,10 +1,14 @@
 """Mistakes get a message of one line that names what is wrong and how to mend it, most before torch is imported."""
 
 import dataclasses
+import errno
 import inspect
 import json
+import os
+import re
 import subprocess
 import sys
+import tempfile
 from importlib import import_module
 from pathlib import Path
 
@@ -70,25 +74,76 @@ def test_a_wrong_configuration(text, complaint, capsys):
     assert complaint in complain(["fit", "--config", "mine.yaml"], 2, capsys)
 
 
+LONG = "x" * 300
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
         (["fit", "--config", "gop.yaml"], "Did you mean goop.yaml"),
-        (["simulate", "waterramp", "--out", "a"], "Did you mean waterramps"),
-        (["compare", "goop", "--data", "gop"], "Did you mean goop"),
-        (["trade", "sandramp"], "Did you mean sandramps"),
         ([*GOOP, "--model.optimizer.lr", "-1"], "lr = -1.0 must be a positive number"),
         ([*GOOP, "--trainer.max_steps", "-1", "--trainer.max_time", "null"], "has no end"),
         ([*GOOP, "--checkpoint.dirpath", __file__], "it is a file"),
+        ([*GOOP, "--trainer.default_root_dir", LONG], "ame (is )?too long"),
         ([*GOOP, "--model.cells", "4"], "too small for a U-Net of depth 3"),
-        (["test", *GOOP[1:], "--ckpt_path", "best"], "To start a new run, call nmpm fit without"),
+        (
+            ["test", *GOOP[1:], "--ckpt_path", "best"],
+            "there is no .*best.ckpt; checkpoints there: none. To start a new",
+        ),
         (["validate", *GOOP[1:]], "--ckpt_path is missing, so the model would be an untrained one: give best or last"),
+        (["rollout", "goop", "--frames", "0"], "--frames 0: it must be at least 1."),
+        (["rollout", "goop", "--particles", "1000000"], "--particles 1000000: 1 blocks of"),
+        (["rollout", "goop", "--gravity", "down"], "--gravity down"),
+        (["rollout", "goop", "--gravity", "0,-5"], r"but the model knows only \[0.0, -9.81\]"),
+        (["rollout", "wbcsph", "--gravity", "0,-50"], "outside of the range that the model was calibrated"),
+        (["rollout", "goop", "--data", "nowhere.h5"], "--data nowhere.h5: there is no such file."),
+        (["rollout", "goop", "--data", "."], "--data .: it is a folder; name a file in it"),
+        (["rollout", "goop", "--out", "no/where.h5"], "--out no/where.h5: the folder no does not exist"),
+        (["rollout", "goop", "--out", "file/a.h5"], "--out file/a.h5: file is a file, not a folder."),
+        (["rollout", "goop", "--device", "cuda:77"], "has no device 'cuda:77'"),
+        (["rollout", "goop", "--device", "meta"], "--device meta: it is not one of"),
+        (["rollout", "goop", "--runtime", "fast"], "called 'fast'; there are auto, "),
+        (["rollout", "goop", "--runtime", "cuda-graph"], "needs a CUDA GPU; the model is on cpu."),
+        (["rollout", "gop"], r"Did you mean goop\?"),
+        (["rollout", "nothing.ckpt"], "nothing.ckpt: there is no such checkpoint"),
+        (["rollout", "."], "holds no model"),
+        (["simulate", "waterramp", "--out", "a"], "Did you mean waterramps"),
+        (["simulate", "goop", "--workers", "0"], "--workers 0"),
+        (["simulate", "goop", "--preview", "a.gif"], "--preview a.gif: pictures are PNG"),
+        (["simulate", "goop", "--out", "file"], "--out file: it is a file; name a folder."),
+        (["convert", ".", "file/new"], "is a file, not a folder"),
+        (["inspect", "nowhere"], "nowhere: there is no such file or folder."),
+        (["inspect", ".", "--trajectories", "0"], "--trajectories 0"),
+        (["render", "nowhere.h5"], "FILE nowhere.h5: there is no such file."),
+        (["export", "goop", "--out", "no/a.onnx"], "--out no/a.onnx: the folder no does not exist"),
+        (["stress", "goop", "--groups", "speed"], "--groups speed: the groups are long, settling, speeds"),
+        (["stress", "goop", "--preset", "nothing"], "no preset or file nothing"),
+        (["trade"], "name a dataset"),
+        (["trade", "sandramp"], "Did you mean sandramps"),
+        (["trade", "goop", "--config", "nothing.yaml"], "there is no such file"),
+        (["compare", "goop", "--data", "goop", "--wider", "1"], "--wider 1: it must be at least 2"),
+        (["compare", "goop", "--data", "nothing", "--wider", "2"], "nothing cannot be widened"),
+        (["zoo", "card", "../goop"], "holds no model '../goop'"),
+        (["zoo", "list", "--root", "nowhere"], "There is no zoo in nowhere"),
+        (["zoo", "add", "nowhere", "mine"], "not a finished run"),
+        (["zoo", "verify", "--data", "."], "--data is the folder of one model's data: give the model's NAME too"),
     ],
     ids=lambda value: "",
 )
-def test_a_mistake_is_found_before_data_are_simulated(words, complaint, folder, capsys):
-    assert complaint in complain(words, 1, capsys)
-    assert not list(folder.iterdir())
+def test_a_mistake_is_found_before_the_work(words, complaint, folder, capsys):
+    (folder / "file").touch()
+    assert re.search(complaint, complain(words, 1, capsys))
+    assert [path.name for path in folder.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("words", [["rollout", "goop", "--out", "a.h5"], ["simulate", "goop", "--out", "new"]])
+def test_a_read_only_folder_is_found_before_the_work(words, monkeypatch, capsys):
+    def fail(**_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
+    assert main(words) == 1
+    assert "is not writable (Read-only file system)" in capsys.readouterr().err
 
 
 def test_wrong_commands(capsys):

@@ -1,7 +1,3 @@
-import errno
-import os
-import re
-import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -66,56 +62,3 @@ def test_a_recording_is_predicted_to_its_end_and_stored_beside(asked, predicted,
     np.testing.assert_array_equal(shown.positions["truth"], recorded[: compared + 2])
     np.testing.assert_allclose(shown.positions["prediction"][:2], recorded[:2], atol=1e-7)
     assert Split(Path("out.h5")).frames(0) == predicted + 2
-
-
-LONG = "x" * 300
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["rollout", "goop", "--frames", "0"], "--frames 0: it must be at least 1."),
-        (["rollout", "goop", "--particles", "1000000"], "--particles 1000000: 1 blocks of"),
-        (["rollout", "goop", "--particles", "9999", "--blocks", "2"], "--blocks 2: 2 blocks of 5041 particles, 0.507"),
-        (["rollout", "goop", "--gravity", "down"], "--gravity down"),
-        (["rollout", "goop", "--gravity", "0,-5"], "but the model knows only [0.0, -9.81]"),
-        (["rollout", "wbcsph", "--gravity", "0,-50"], "outside of the range that the model was calibrated"),
-        (["rollout", "goop", "--data", "nowhere.h5"], "--data nowhere.h5: there is no such file."),
-        (["rollout", "goop", "--data", "."], "--data .: it is a folder; name a file in it"),
-        (["rollout", "goop", "--out", "no/where.h5"], "--out no/where.h5: the folder no does not exist"),
-        (["rollout", "goop", "--out", "file/a.h5"], "--out file/a.h5: file is a file, not a folder."),
-        (["rollout", "goop", "--out", LONG + ".h5"], "ame (is )?too long"),
-        (["rollout", "goop", "--device", "cuda:77"], "has no device 'cuda:77'"),
-        (["rollout", "goop", "--device", "meta"], "--device meta: it is not one of"),
-        (["rollout", "goop", "--runtime", "fast"], "called 'fast'; there are auto, "),
-        (["rollout", "goop", "--runtime", "cuda-graph"], "needs a CUDA GPU; the model is on cpu."),
-        (["rollout", "gop"], "Did you mean goop\\?"),
-        (["rollout", "nothing.ckpt"], "nothing.ckpt: there is no such checkpoint"),
-        (["rollout", "."], "holds no model"),
-        (["simulate", "goop", "--preview", "a.gif"], "--preview a.gif: pictures are PNG"),
-        (["simulate", "goop", "--out", "file"], "--out file: it is a file; name a folder."),
-        (["convert", ".", "file/new"], "is a file, not a folder"),
-        (["inspect", "nowhere"], "nowhere: there is no such file or folder."),
-        (["render", "nowhere.h5"], "FILE nowhere.h5: there is no such file."),
-        (["export", "goop", "--out", "no/a.onnx"], "--out no/a.onnx: the folder no does not exist"),
-        (["fit", "--config", "goop.yaml", "--trainer.default_root_dir", LONG], "ame (is )?too long"),
-    ],
-    ids=lambda value: value[-1][:20] if isinstance(value, list) else "",
-)
-def test_wrong_calls_get_one_line_before_the_work(words, message, folder, capsys):
-    (folder / "file").touch()
-    assert main(words) == 1
-    said = capsys.readouterr()
-    assert re.search(message.replace("[0.0, -9.81]", r"\[0.0, -9.81\]"), said.err)
-    assert said.err.count("\n") == 1
-    assert [path.name for path in folder.iterdir()] == ["file"]
-
-
-@pytest.mark.parametrize("words", [["rollout", "goop", "--out", "a.h5"], ["simulate", "goop", "--out", "new"]])
-def test_a_read_only_folder_is_found_before_the_work(words, monkeypatch, capsys):
-    def fail(**_):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
-    assert main(words) == 1
-    assert "is not writable (Read-only file system)" in capsys.readouterr().err

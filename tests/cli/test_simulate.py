@@ -73,24 +73,6 @@ def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):
         assert min(picture.size) > 200
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["treacle"], "no preset or file treacle"),
-        (["goop", "--workers", "0"], "--workers 0"),
-        (["goop", "--train", "-1"], "--train -1: it must be at least 0"),
-        (["goop", "--preview", "missing/look.png"], "the folder missing does not exist"),
-        (["goop", "--preview", "look.jpg"], "end the name in .png"),
-        (["goop", "--out", __file__], "test_simulate.py"),
-    ],
-)
-def test_wrong_calls_are_explained(words, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["simulate", *words]) == 1
-    assert said in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_an_interruption_says_how_to_go_on(tmp_path):
     """The trajectories that run are stopped: one of them would take minutes."""
     words = ["simulate", "goop", "--train", "2", "--valid", "0", "--test", "0", "--frames", "100000"]

@@ -29,20 +29,6 @@ def test_by_another_runtime(capsys):
     assert "5 passed, 0 failed." in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["stress", "goop", "--groups", "speed"], "--groups speed: the groups are long, settling, speeds"),
-        (["stress", "nothing"], "holds no model 'nothing'"),
-        (["stress", "nothing.ckpt"], "there is no such checkpoint"),
-        (["stress", "goop", "--preset", "nothing"], "no preset or file nothing"),
-    ],
-)
-def test_what_cannot_be_is_said(words, message, capsys):
-    assert main(words) == 1
-    assert message in capsys.readouterr().err
-
-
 def test_a_failing_line_is_an_exit_status(monkeypatch, capsys):
     from nmpm.cli import stress
     from nmpm.evaluation.stress import results

@@ -1,5 +1,3 @@
-import pytest
-
 from nmpm.cli import main
 from nmpm.cli.trade import _models_of
 from nmpm.evaluation.trade import shipped_sweep_text
@@ -10,24 +8,6 @@ from tests.evaluation.trade.made_up import SWEEP, tiny_emulator, tiny_scenes
 def test_the_shipped_sweep_is_printed(capsys):
     assert main(["trade", "--print_config"]) == 0
     assert capsys.readouterr().out == shipped_sweep_text("trade")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["trade"], "name a dataset"),
-        (["trade", "nothing", "--models"], "nothing is neither a folder nor an embedded dataset: dambreak2d"),
-        (["trade", "goop", "--scenes", "0"], "--scenes 0: it must be at least 1"),
-        (["trade", "goop", "--config", "nothing.yaml"], "there is no such file"),
-        (["compare", "goop", "--data", "goop", "--wider", "1"], "--wider 1: it must be at least 2"),
-        (["compare", "goop", "--data", "nothing", "--wider", "2"], "nothing cannot be widened"),
-        (["compare", "nothing", "--data", "goop"], "The zoo holds no model 'nothing'"),
-        (["compare", "goop", "--data", "goop", "--device", "abacus"], "--device abacus"),
-    ],
-)
-def test_mistakes_are_named(words, message, capsys):
-    assert main(words) == 1
-    assert message in capsys.readouterr().err
 
 
 def test_models_are_those_of_the_dataset_and_damaged_ones_are_left_out(tmp_path, monkeypatch, capsys):

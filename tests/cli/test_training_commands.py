@@ -30,6 +30,7 @@ TINY = [
     *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
     *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
 ]
+WATERDROP = ["--config", "waterdrop.yaml", *TINY]
 
 
 @pytest.fixture(scope="session")
@@ -86,7 +87,7 @@ def test_a_path_replaces_the_data_of_every_shipped_configuration(config, make_da
 
 def test_without_validations_the_last_weights_are_tested(make_dataset):
     data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
-    words = ["--config", "waterdrop.yaml", *TINY, *data, "--trainer.limit_val_batches", "0"]
+    words = [*WATERDROP, *data, "--trainer.limit_val_batches", "0"]
     words += ["--resume.every_n_train_steps", "2"]
     assert main(["fit", *words]) == 0
     ended = json.loads(Path("run/report.json").read_text())["test"]
@@ -96,7 +97,7 @@ def test_without_validations_the_last_weights_are_tested(make_dataset):
 
 def test_without_a_test_split_the_report_says_that_nothing_was_tested(make_dataset, capsys):
     folder = make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=())
-    words = ["--config", "waterdrop.yaml", *TINY, "--data.path", str(folder), "--trainer.default_root_dir", "run"]
+    words = [*WATERDROP, "--data.path", str(folder), "--trainer.default_root_dir", "run"]
     assert main(["fit", *words]) == 0
     assert f"Not tested: {folder} has no test.h5." in capsys.readouterr().out
     report = json.loads(Path("run/report.json").read_text())
@@ -128,15 +129,7 @@ def test_the_console_shows_the_run_and_the_users_warnings_alone(make_dataset):
     )
     averaging = {"class_path": "lightning.pytorch.callbacks.EMAWeightAveraging", "init_args": {"decay": 0.9}}
     Path("mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [averaging, {"class_path": "mine.Mine"}]}}))
-    words = [
-        "fit",
-        "--config",
-        "waterdrop.yaml",
-        "--config",
-        "mine.yaml",
-        *TINY,
-        *source("waterdrop.yaml", make_dataset),
-    ]
+    words = ["fit", *WATERDROP, "--config", "mine.yaml", *source("waterdrop.yaml", make_dataset)]
     shown = [*words, "--trainer.enable_progress_bar", "true", "--trainer.default_root_dir", "run"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([os.environ.get("PYTHONPATH", ""), "."])}
     run = subprocess.run(
@@ -160,7 +153,7 @@ def test_every_part_can_be_swapped_by_class_name(make_dataset):
         *("--trainer.logger", "lightning.pytorch.loggers.CSVLogger", "--trainer.logger.save_dir", "logs"),
     ]
     data = source("waterdrop.yaml", make_dataset)
-    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *swaps, "--trainer.default_root_dir", "run"]) == 0
+    assert main(["fit", *WATERDROP, *data, *swaps, "--trainer.default_root_dir", "run"]) == 0
     saved = EmulatorModule.load_from_checkpoint(next(Path().rglob("best.ckpt")), weights_only=True)
     assert type(saved.emulator.recipe.processor).__name__ == "FNO"
     assert saved.emulator.recipe.processor.modes == 4
@@ -183,14 +176,14 @@ def test_configured_callbacks_run(make_dataset):
     Counting.seen = 0
     one = {"class_path": f"{__name__}.Counting"}
     Path("mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [one, one]}}))
-    words = ["fit", "--config", "waterdrop.yaml", "--config", "mine.yaml", *TINY]
+    words = ["fit", *WATERDROP, "--config", "mine.yaml"]
     assert main([*words, *source("waterdrop.yaml", make_dataset)]) == 0
     assert Counting.seen == 4
 
 
 @pytest.mark.slow
 def test_soap_refuses_complex_weights_and_names_an_optimizer_that_takes_them(make_dataset, capsys):
-    words = ["fit", "--config", "waterdrop.yaml", *TINY, *source("waterdrop.yaml", make_dataset)]
+    words = ["fit", *WATERDROP, *source("waterdrop.yaml", make_dataset)]
     fno = ["--model.processor", "nmpm.processors.FNO", "--model.processor.modes", "4", "--model.processor.width", "4"]
     assert main([*words, *fno]) == 1
     assert "complex weights, such as FNO's: --model.optimizer torch.optim.Adam" in capsys.readouterr().err
@@ -199,17 +192,17 @@ def test_soap_refuses_complex_weights_and_names_an_optimizer_that_takes_them(mak
 
 def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dataset, tmp_path, capsys):
     data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
-    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]) == 0
-    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data]) == 1
+    assert main(["fit", *WATERDROP, *data, "--resume.every_n_train_steps", "1"]) == 0
+    assert main(["fit", *WATERDROP, *data]) == 1
     assert "nmpm fit --resume run" in capsys.readouterr().err
     changed = ["--model.processor.width", "8", "--ckpt_path", "last"]
     for command in ("fit", "test"):
-        assert main([command, "--config", "waterdrop.yaml", *TINY, *data, *changed]) == 1
+        assert main([command, *WATERDROP, *data, *changed]) == 1
         assert "The checkpoint has model.processor.width = 32, not 8." in capsys.readouterr().err
     more = ["--trainer.max_steps", "4", "--ckpt_path", "last", "--resume.every_n_train_steps", "1"]
-    assert main(["fit", "--config", "waterdrop.yaml", *TINY, *data, *more]) == 0
+    assert main(["fit", *WATERDROP, *data, *more]) == 0
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 4
-    checked = ["--config", "waterdrop.yaml", *TINY, *data, "--ckpt_path", "run/checkpoints/best.ckpt"]
+    checked = [*WATERDROP, *data, "--ckpt_path", "run/checkpoints/best.ckpt"]
     trained = json.loads(Path("run/report.json").read_text())["training"]
     best = torch.load("run/checkpoints/best.ckpt", weights_only=True)["callbacks"]["ReportWriter"]
     assert trained["seconds"] >= round(best["trained_seconds"], 1)
@@ -258,7 +251,7 @@ METRICS = '[{"class_path": "nmpm.metrics.MSE"}, {"class_path": "nmpm.metrics.Ear
 @pytest.mark.slow
 def test_configurations_are_laid_over_one_another_and_refer_to_other_values(make_dataset):
     Path("mine.yaml").write_text("trainer: {default_root_dir: 'run_${model.frames}_${data.batch_size}'}\n")
-    words = ["--config", "waterdrop.yaml", "--config", "mine.yaml", *TINY, *source("waterdrop.yaml", make_dataset)]
+    words = [*WATERDROP, "--config", "mine.yaml", *source("waterdrop.yaml", make_dataset)]
     assert main(["fit", *words, "--model.frames", "3", "--model.metrics", METRICS]) == 0
     report = json.loads(Path("run_3_2/report.json").read_text())
     assert report["test"]["emd"] > 0
@@ -274,16 +267,10 @@ def test_a_file_here_comes_before_the_shipped_one():
 
 def test_help_of_training_names_all_that_can_be_set(capsys):
     assert main(["fit", "--config", "goop.yaml", "--help"]) == 0
-    listed = {
-        group: re.findall(r"^  (\w+) +\S", part, flags=re.M) for group, part in help_sections(capsys.readouterr().out)
-    }
-    assert set(listed["model"]) == argument_names("model") - {"scene", "recipe"}
-    assert set(listed["data"]) == argument_names("data") - {"horizon"}
-
-
-def help_sections(text: str) -> list[tuple[str, str]]:
-    """Groups of options and their lines."""
-    return re.findall(r"^--(\w+)\.KEY:\n(.*?)\n\n", text, flags=re.M | re.S)
+    sections = dict(re.findall(r"^--(\w+)\.KEY:\n(.*?)\n\n", capsys.readouterr().out, flags=re.M | re.S))
+    listed = {group: set(re.findall(r"^  (\w+) +\S", part, flags=re.M)) for group, part in sections.items()}
+    assert listed["model"] == argument_names("model") - {"scene", "recipe"}
+    assert listed["data"] == argument_names("data") - {"horizon"}
 
 
 def test_help_all_lists_the_options_of_lightning_too(capsys):
@@ -294,7 +281,7 @@ def test_help_all_lists_the_options_of_lightning_too(capsys):
 
 def test_a_diverged_run_stops_with_the_reason_and_keeps_the_last_good_checkpoint(make_dataset, capsys):
     data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
-    words = ["fit", "--config", "waterdrop.yaml", *TINY, *data, "--resume.every_n_train_steps", "1"]
+    words = ["fit", *WATERDROP, *data, "--resume.every_n_train_steps", "1"]
     wild = ["--model.optimizer.lr", "1e30", "--trainer.max_steps", "50", "--model.schedule.warmup", "3"]
     assert main([*words, *wild, "--trainer.val_check_interval", "50", "--trainer.log_every_n_steps", "1"]) == 3
     said = capsys.readouterr().err

@@ -76,20 +76,3 @@ def test_all_are_verified_though_one_is_damaged(tmp_path, capsys):
     assert "2 figures are not confirmed" in said
     assert main(["zoo", "verify", "a", "--root", "other"]) == 1
     assert "SHA-256 differs" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["card", "gop"], "Did you mean goop?"),
-        (["card", "../goop"], "holds no model '../goop'"),
-        (["list", "--root", "nowhere"], "There is no zoo in nowhere"),
-        (["add", "nowhere", "mine"], "not a finished run"),
-        (["verify", "--data", "."], "--data is the folder of one model's data: give the model's NAME too"),
-    ],
-)
-def test_wrong_calls_get_one_line(words, message, capsys):
-    assert main(["zoo", *words]) == 1
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1

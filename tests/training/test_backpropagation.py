@@ -13,7 +13,7 @@ from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import FNO
 from nmpm.training import EmulatorModule
-from nmpm.training.backpropagation import Discount, direct, mean_over_parts, split_rows
+from nmpm.training.backpropagation import direct, discount_gradients, mean_over_parts, split_rows
 from nmpm.training.callbacks.threads import Threads
 from tests.trainings import TINY
 
@@ -76,18 +76,20 @@ def test_without_a_discount_gradients_are_those_of_plain_backpropagation_to_the_
 def test_predictions_do_not_depend_on_the_discount(step):
     module, batch = step()
 
-    def positions(call, discount: Discount) -> torch.Tensor:
-        bundles = unroll_with_gradients(module.emulator, batch.initial, BUNDLES, call, discount.state_after)
+    def positions(call, factor: float) -> torch.Tensor:
+        def state_after(bundle, start):
+            return discount_gradients(bundle.state_after(start), factor)
+
+        bundles = unroll_with_gradients(module.emulator, batch.initial, BUNDLES, call, state_after)
         return torch.cat([bundle.position for bundle in bundles], dim=1)
 
-    plain = positions(direct, Discount())
-    assert torch.equal(plain, positions(direct, Discount(0.5)))
-    assert torch.equal(plain, positions(recomputed, Discount(0.0)))
+    plain = positions(direct, 1.0)
+    assert torch.equal(plain, positions(direct, 0.5))
+    assert torch.equal(plain, positions(recomputed, 0.0))
     state = batch.initial.with_motion(batch.initial.position.clone().requires_grad_(), batch.initial.velocity)
-    assert not Discount(0.0)(state).position.requires_grad  # cut gradients are not computed at all
-    for factor in (-0.1, 1.1):
-        with pytest.raises(ConfigError, match=r"model\.gradient_discount = .* must be in \[0, 1\]"):
-            Discount(factor)
+    assert not discount_gradients(state, 0.0).position.requires_grad  # cut gradients are not computed at all
+    with pytest.raises(ConfigError, match=r"model\.gradient_discount = 1\.1 must be in \[0, 1\]"):
+        step(gradient_discount=1.1)
 
 
 def test_recomputed_gradients_are_the_same_to_the_bit_for_less_memory(step):

@@ -20,8 +20,8 @@ import yaml
 from lightning.pytorch import Callback
 
 from nmpm.cli import main
+from nmpm.cli.run_folder import RunFolder
 from nmpm.errors import ConfigError
-from nmpm.training.run_folder import RunFolder
 from tests.conftest import make_dataset
 
 FIT = [
@@ -264,7 +264,7 @@ def test_an_interruption_before_training_says_that_the_same_command_starts_again
 HOLD = """
 import sys, time
 from pathlib import Path
-from nmpm.training.run_folder import RunFolder
+from nmpm.cli.run_folder import RunFolder
 RunFolder(Path(sys.argv[1]), {}).lock()
 print("locked", flush=True)
 time.sleep(60)

@@ -82,6 +82,8 @@ def test_trainings_show_steps_loss_validation_error_and_time_and_evaluations_bat
     assert (training.total, training.done) == (4, 4)
     assert training.shown[0] == "training"
     assert any(text.startswith("validating, loss ") for text in training.shown)
-    assert re.fullmatch(r"training, loss \S+, validation error .+, ends by max_steps in 0:\d\d:\d\d", training.shown[-2])
+    assert re.fullmatch(
+        r"training, loss \S+, validation error .+, ends by max_steps in 0:\d\d:\d\d", training.shown[-2]
+    )
     assert testing.shown == ["testing", *[""] * testing.total, "closed"]
     assert training.shown[-1] == "closed"

@@ -31,6 +31,8 @@ QUIET = {"position_noise": 0.0, "grid_noise": 0.0, "mirror": (), "jitter": 0.0}
 BATCH = {"batch_size": 4, "buffer_size": 5, "passes": 1.0}  # with all trajectories, 84 windows, in memory
 HALF = BATCH | {"batch_size": 2}
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+PATIENCE = 270
+"""Seconds until a process that does not end fails its test, a little before pytest would end all of them."""
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +69,7 @@ def torchrun(*words: object) -> None:
         stderr=subprocess.DEVNULL,
     )
     try:
-        assert launcher.wait(timeout=280) == 0
+        assert launcher.wait(timeout=PATIENCE) == 0
     finally:
         launcher.terminate()  # it ends the processes that it started
 
@@ -175,10 +177,19 @@ COMMON = [
 def nmpm(command: str, *words: str, devices: int) -> None:
     spread = ["--trainer.devices", str(devices), "--trainer.strategy", "ddp" if devices > 1 else "auto"]
     called = [sys.executable, "-m", "nmpm", command, *COMMON, *words, *spread]
-    subprocess.run(called, check=True, env=ENVIRONMENT, stdout=subprocess.DEVNULL, timeout=240)
+    subprocess.run(called, check=True, env=ENVIRONMENT, stdout=subprocess.DEVNULL, timeout=PATIENCE)
+
+
+@pytest.fixture(scope="module")
+def compiled(folder, tmp_path_factory) -> None:
+    """The kernels of `COMMON`, compiled before processes that are waited for: on a busy machine it takes minutes."""
+    root = ["--trainer.default_root_dir", str(tmp_path_factory.mktemp("compiled"))]
+    few = ["--trainer.max_steps", "1", "--trainer.val_check_interval", "1"]
+    assert main(["fit", *COMMON, "--data.path", str(folder), *few, *root]) == 0
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("sizes", [((30, 9), (40, 7), (30, 8)), ((40, 9),)])  # the second rank may have none
 def test_two_processes_measure_what_one_measures(make_dataset, tmp_path, sizes):
     data = ["--data.path", str(make_dataset(train=sizes, valid=sizes, test=sizes))]
@@ -241,6 +252,7 @@ def test_all_processes_stop_where_the_loss_of_one_is_not_finite(folder, tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("end", ["SIGTERM to rank 0", "SIGKILL to rank 0", "SIGKILL to rank 1"])
 def test_an_ended_process_stops_the_others_and_the_run_goes_on_with_fewer(make_dataset, tmp_path, monkeypatch, end):
     monkeypatch.chdir(tmp_path)
@@ -254,7 +266,7 @@ def test_an_ended_process_stops_the_others_and_the_run_goes_on_with_fewer(make_d
         first = subprocess.Popen(
             called, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True
         )
-    last, deadline = Path("run/checkpoints/last.ckpt"), time.monotonic() + 120
+    last, deadline = Path("run/checkpoints/last.ckpt"), time.monotonic() + PATIENCE
     try:
         while not last.exists() and time.monotonic() < deadline:
             assert first.poll() is None, "it ended too soon"

@@ -7,6 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -44,33 +45,24 @@ class ReportWriter(Callback):
     (the first test trajectory beside its prediction).
     """
 
+    _KEPT = ("trained_seconds", "trained_steps", "trained_precision", "trained_hardware", "curve")  # in checkpoints
+
     def __init__(self) -> None:
-        self.trained_seconds = 0.0
-        self.trained_steps = 0
-        self.trained_precision = ""
-        self.trained_hardware = ""
+        self.trained_seconds, self.trained_steps = 0.0, 0
+        self.trained_precision = self.trained_hardware = ""
         self.curve: list[list[float]] = []  # seconds of training, steps, MSE and overall error of each validation
         self._since: float | None = None
         self._fitting = False
         self._first_rollout: tuple[Window, Tensor] | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "trained_seconds": self._elapsed(),
-            "trained_steps": self.trained_steps,
-            "trained_precision": self.trained_precision,
-            "trained_hardware": self.trained_hardware,
-            "curve": list(self.curve),
-        }
+        kept = {name: getattr(self, name) for name in self._KEPT}
+        return kept | {"trained_seconds": self._elapsed(), "curve": list(self.curve)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if not self._fitting:  # the test after a fit loads the best checkpoint, often older than the training's end
-            self.trained_seconds, self.trained_steps = state_dict["trained_seconds"], state_dict["trained_steps"]
-            self.trained_precision, self.trained_hardware = (
-                state_dict["trained_precision"],
-                state_dict["trained_hardware"],
-            )
-            self.curve = list(state_dict["curve"])
+            for name in self._KEPT:
+                setattr(self, name, copy(state_dict[name]))
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._fitting = True  # also where no step is left to take
@@ -135,12 +127,11 @@ class ReportWriter(Callback):
     ) -> dict[str, Any]:
         datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         errors = _logged(trainer, "test/")
-        remark = no_better_than_trivial(errors)
+        optional = {"test": errors, "remark": no_better_than_trivial(errors)}
         return {
             "dataset": datamodule.description,
             "weights": float32_digest(module.state_dict()),
-            **({"test": errors} if errors else {}),
-            **({"remark": remark} if remark else {}),
+            **{key: value for key, value in optional.items() if value},
             "per_trajectory": dict(per_trajectory),
             "training": {
                 "steps": self.trained_steps,
@@ -218,21 +209,16 @@ class PredictionWriter(BasePredictionWriter):
         self._predicted: dict[int, Trajectory] = {}
 
     def write_on_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        prediction: Any,
-        indices: Any,
-        batch: Window,
-        number: int,
+        self, trainer: Trainer, pl_module: LightningModule, prediction: Any, indices: Any, batch: Window, number: int,
         *_: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         scene: Scene = pl_module.emulator.scene  # type: ignore[union-attr,assignment]  # (an EmulatorModule)
-        source = f"{trainer.ckpt_path or 'the model'}"
-        fields = prediction.fields if isinstance(prediction, Rollout) else {}
-        positions = prediction.position if isinstance(prediction, Rollout) else prediction
-        for row, index in enumerate(self._split_indices(trainer.predict_dataloaders, number, len(positions))):
-            self._predicted[index] = predicted_trajectory(scene, batch.initial, positions, source, row, fields)
+        source = str(trainer.ckpt_path or "the model")
+        rollout = prediction if isinstance(prediction, Rollout) else Rollout(prediction, {})
+        for row, index in enumerate(self._split_indices(trainer.predict_dataloaders, number, len(rollout.position))):
+            self._predicted[index] = predicted_trajectory(
+                scene, batch.initial, rollout.position, source, row, rollout.fields
+            )
 
     def _split_indices(self, loader: object, batch: int, count: int) -> Sequence[int]:
         """Where the trajectories of a batch belong in the file."""
@@ -243,11 +229,10 @@ class PredictionWriter(BasePredictionWriter):
         return range(first, first + world * count, world)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        predicted = {
-            index: trajectory for rank in gather_to_rank0(self._predicted) for index, trajectory in rank.items()
-        }
+        by_rank = gather_to_rank0(self._predicted)
         if trainer.is_global_zero:
             path = Path(trainer.default_root_dir) / "predictions.h5"
+            predicted = dict(pair for rank in by_rank for pair in rank.items())
             write_split(path, [predicted[index] for index in sorted(predicted)])
             sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
         self._predicted = {}

@@ -6,11 +6,19 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from filelock import lock_descriptor
 
 from nmpm._support.atomic import temporary_files
 from nmpm.errors import ConfigError
+
+CONFIG = "config.yaml"
+"""The file of a run's folder that holds its configuration."""
+CHECKPOINTS = "checkpoints"
+"""The folder of a run's checkpoints, unless its configuration names another."""
+SAVERS = {"best": "checkpoint", "last": "resume"}
+"""Sections of a configuration that save checkpoints, by the names that `--ckpt_path` takes for them."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +32,16 @@ class RunFolder:
 
     root: Path
     checkpoints: Mapping[str, Path]
+
+    @classmethod
+    def of(cls, root: Path, config: Mapping[str, Any]) -> RunFolder:
+        """The folder of a run with this configuration."""
+        checkpoints = {}
+        for name, saver in SAVERS.items():
+            section = config.get(saver) or {}
+            folder = Path(section.get("dirpath") or root / CHECKPOINTS)
+            checkpoints[name] = folder / f"{section.get('filename') or name}.ckpt"
+        return cls(root, checkpoints)
 
     def lock(self) -> int:
         """Keep other processes from training in this folder until the descriptor that is returned is closed.
@@ -74,19 +92,18 @@ class RunFolder:
                 " --trainer.default_root_dir."
             )
 
-    def checkpoint(self, given: str) -> Path:
-        """The file that a `--ckpt_path` means.
+    def checkpoint(self, *names: str) -> Path:
+        """The file of the first of the checkpoints, "best" or "last", that exists.
 
         Raises:
-            ConfigError: if it is "last" or "best", and there is none.
+            ConfigError: if there is none.
         """
-        if given not in self.checkpoints:
-            return Path(given)
-        path = self.checkpoints[given]
-        if not path.is_file():
-            others = ", ".join(str(file) for file in sorted(path.parent.glob("*.ckpt"))) or "none"
-            raise ConfigError(
-                f"--ckpt_path {given}: there is no {path}; checkpoints there: {others}. To start a new run, call"
-                " nmpm fit without the option."
-            )
-        return path
+        paths = [self.checkpoints[name] for name in names]
+        for path in paths:
+            if path.is_file():
+                return path
+        others = ", ".join(path.name for path in sorted(paths[0].parent.glob("[!.]*.ckpt"))) or "none"
+        raise ConfigError(
+            f"{self.root}: there is no {' or '.join(map(str, paths))}; checkpoints there: {others}. To start a new run,"
+            " call nmpm fit with --config alone."
+        )
