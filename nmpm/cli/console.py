@@ -93,12 +93,7 @@ class BriefParser(LightningArgumentParser):
 
 
 def explain(message: str, names: Iterable[str]) -> str:
-    """A message of jsonargparse in one line, with the nearest known name where one is unknown.
-
-    Args:
-        message: May have many lines.
-        names: Options of the parser, such as "model.cells".
-    """
+    """A message of jsonargparse in one line, with the nearest of `names`, the parser's, where one is unknown."""
     if match := re.match(r"unrecognized arguments: --([\w.]+)", message):
         return f"there is no option --{match[1]}{_hint(match[1], names, '--')}"
     if match := re.match(r"Subcommand '\w+' does not accept option '([\w.]+)'", message):

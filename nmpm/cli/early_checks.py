@@ -50,10 +50,7 @@ class Option(NamedTuple):
 def read_options(words: Sequence[str]) -> list[Option]:
     """The options that words are: `--key value`, `--key=value`, `--flag`, or words on their own.
 
-    A --config is one with the path of the file that it means.
-
-    Raises:
-        ConfigError: if there is no such configuration file.
+    The value of --config becomes the path of the file that it means; ConfigError if there is none.
     """
     options: list[Option] = []
     rest = list(words)
@@ -73,8 +70,7 @@ def check_options(options: Sequence[Option]) -> None:
 
     Raises:
         UsageError: for a misspelt name, or a configuration that is not YAML.
-        ConfigError: if dataset or checkpoint do not exist.
-        DataError: if there is no such embedded dataset.
+        ConfigError, DataError: if dataset or checkpoint do not exist.
     """
     configs = [read_config(Path(value)) for name, value in options if name == "--config" and value]
     for group in SIGNATURES:
@@ -89,11 +85,7 @@ def check_options(options: Sequence[Option]) -> None:
 
 
 def read_config(path: Path) -> Mapping[str, Any]:
-    """Read a configuration file; an empty mapping where it holds something else.
-
-    Raises:
-        UsageError: if it is not YAML.
-    """
+    """Read a configuration file; an empty mapping where it holds something else, UsageError if it is not YAML."""
     try:
         return read_yaml(path)
     except DataError as error:

@@ -1,39 +1,47 @@
-"""LightningCLI with the data's scene flowing into the model, and a run's files in one folder."""
+"""LightningCLI with the data's scene flowing into the model, a run's files in one folder, and interruptions."""
 
 from __future__ import annotations
 
 import operator
+import os
+import shlex
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from jsonargparse.typing import PositiveInt
 from lightning.fabric.plugins.io import TorchCheckpointIO
-from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateMonitor, ModelCheckpoint, ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
+from lightning.pytorch.utilities import rank_zero_only
 
-from nmpm._support.atomic import atomic_write
-from nmpm._support.devices import find_device
+from nmpm._support.collectives import describe_ended_rank, is_lost_connection
+from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.console import BriefParser, explain, is_of_other_packages
 from nmpm.cli.early_checks import UsageError
 from nmpm.cli.options import check_folder
-from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS, RunFolder
+from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
+from nmpm.training.budget import check_endless_batches
 from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.forecast import Forecast
 from nmpm.training.callbacks.outputs import PredictionWriter, ReportWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.savers import BestCheckpoint, LastCheckpoint
 from nmpm.training.callbacks.threads import Threads
-from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
+from nmpm.training.checkpoints import AtomicCheckpointIO, check_same_recipe, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.preflight import OVERALL, fitting_precision
+from nmpm.training.preflight import OVERALL, check_disk, fitting_precision
+from nmpm.zoo.registry import load_model
+
+T = TypeVar("T")
 
 # Two savers, as ModelCheckpoint's `save_last` leaves the last checkpoint as it was whenever the best does not change.
 SAVER_DEFAULTS: dict[str, tuple[type[ModelCheckpoint], dict[str, Any]]] = {
@@ -47,16 +55,14 @@ THREADS = (
 START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
-class ConfiguredCLI(LightningCLI):
-    """Makes data, model and trainer of a configuration; links what the model needs from the data and vice versa.
+class EmulatorCLI(LightningCLI):
+    """Runs fit, validate, test or predict as a configuration says; a fit ends with a test.
 
-    Args:
-        command: fit, validate, test or predict.
-        options: Of LightningCLI.
+    The descriptor of the run folder's lock is appended to `locks`; the `note` is printed at the start.
     """
 
-    def __init__(self, command: str, **options: Any) -> None:
-        self.command = command
+    def __init__(self, command: str, note: str, locks: list[int], **options: Any) -> None:
+        self.command, self.note, self.locks, self.parent = command, note, locks, os.getppid()
         self.bfloat16_replaced = False
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
@@ -100,14 +106,10 @@ class ConfiguredCLI(LightningCLI):
     # Data, model and trainer
 
     def before_instantiate_classes(self) -> None:
-        """Check and complete the configuration; checkpoints are read as tensors and plain data.
-
-        Raises:
-            ConfigError: if an untrained model would be evaluated, or an option cannot be.
-        """
+        """Check and complete the configuration."""
         config = self.config[self.subcommand]
         trainer, optimizer = config["trainer"], config["model"].get("optimizer")
-        config["weights_only"] = True
+        config["weights_only"] = True  # checkpoints are read as tensors and plain data
         trainer["default_root_dir"] = trainer["default_root_dir"] or "runs/default"
         check_folder("--trainer.default_root_dir", Path(trainer["default_root_dir"]))
         if self.subcommand != "fit" and not config["ckpt_path"]:
@@ -135,11 +137,7 @@ class ConfiguredCLI(LightningCLI):
             check_learning_rate((optimizer.get("init_args") or {}).get("lr"))
 
     def instantiate_classes(self) -> None:
-        """Make data, model and trainer.
-
-        Raises:
-            ConfigError: saying what Lightning, or a package for loggers and the like, does not take.
-        """
+        """Make data, model and trainer; ConfigError says what Lightning, or a package of loggers, does not take."""
         try:
             super().instantiate_classes()
         except Exception as error:  # (other packages document none)
@@ -186,20 +184,111 @@ class ConfiguredCLI(LightningCLI):
             return None
         return self.run_folder.checkpoint(stated) if stated in SAVERS else Path(stated)
 
+    # Runs
 
-class RunConfig(SaveConfigCallback):
-    """Writes a training's configuration into the run's folder, such that `nmpm test RUN` works from anywhere."""
-
-    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: ARG002
-        if stage != "fit":
+    def before_fit(self) -> None:
+        """Check, before data are simulated, that the training can run, and lock the run's folder."""
+        config = self.config_init[self.subcommand]
+        check_endless_batches(self.trainer)
+        for logger in self.trainer.loggers:
+            check_folder("The logger's save_dir", Path(logger.save_dir or "."))
+        check_disk(self.trainer, self.model)
+        resumed = self._load_checkpoint()
+        if resumed is not None:
+            self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated
+        elif config.get("start_from"):
+            emulator = self.model.emulator
+            initial = load_model(str(config["start_from"])).emulator.over(emulator.scene)
+            check_same_recipe(initial.recipe.to_dict(), emulator.recipe)
+            emulator.load_state_dict(initial.state_dict())
+        if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
-        config, root = self.config.clone(), Path(self.config["trainer"]["default_root_dir"])
-        config["ckpt_path"] = None
-        config.pop("start_from", None)  # unknown to other commands, and of the start alone
-        for saver in SAVERS.values():
-            folder = Path(config[saver]["dirpath"])
-            config[saver]["dirpath"] = None if folder == root / CHECKPOINTS else str(folder.absolute())
-        if config["data"]["path"]:
-            config["data"]["path"] = str(Path(config["data"]["path"]).absolute())
-        with atomic_write(root / CONFIG) as part:
-            part.write_text(self.parser.dump(config, skip_none=False), encoding="utf-8")
+        self.locks.append(self.run_folder.lock())
+        self.run_folder.remove_unfinished()
+        if resumed is None or not self.run_folder.holds(Path(config["ckpt_path"])):
+            self.run_folder.check_new()
+        self._print_start(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
+
+    def before_validate(self) -> None:
+        self._load_checkpoint()
+        if not rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
+            self._print_start()
+
+    before_test = before_predict = before_validate
+
+    def _print_start(self, more: str = "") -> None:
+        device, emulator = self.trainer.strategy.root_device, self.model.emulator
+        hardware = self.threads.describe(self.trainer) if device.type == "cpu" else device_name(device)
+        weights = sum(parameter.numel() for parameter in emulator.parameters())
+        precision = "bfloat16 is emulated on this processor; training in float32.\n" if self.bfloat16_replaced else ""
+        sys.stdout.write(
+            f"{self.note}Data: {self.datamodule.description}. Model: {type(emulator.recipe.processor).__name__},"
+            f" {weights:,} parameters, on {hardware}.\n{precision}{more}"
+        )
+        sys.stdout.flush()
+
+    def fit(self, **options: Any) -> None:
+        """Train, then test the best weights; an interruption, or the end of another rank, says how to go on."""
+        try:
+            self.trainer.fit(**options)
+            self._test_best_weights()
+        except SystemExit as ended:
+            if not isinstance(ended.__context__, KeyboardInterrupt):
+                raise
+            if self.trainer.is_global_zero:
+                raise KeyboardInterrupt(self._how_to_go_on()) from None
+            raise SystemExit(130) from None
+        except RuntimeError as error:
+            if not is_lost_connection(error):
+                raise
+            raise self._lost_rank_error() from None
+
+    def _lost_rank_error(self) -> BaseException:
+        """Names the rank that has ended, on one of those that are left: rank 0, or rank 1 where rank 0 has."""
+        if self.trainer.is_global_zero:
+            ended = describe_ended_rank(getattr(self.trainer.strategy.launcher, "procs", []))
+        elif self.trainer.global_rank == 1 and os.getppid() != self.parent:
+            ended = f"rank 0 (process {self.parent}) has ended"
+        else:
+            return SystemExit(1)
+        return NmpmError(f"{ended}: {self._how_to_go_on()}")
+
+    def _how_to_go_on(self) -> str:
+        if not self.run_folder.checkpoints["last"].is_file():
+            return "interrupted before the first step. The same command starts again; simulated trajectories are kept."
+        step = self._saver(LastCheckpoint).saved_step
+        stopped = f"stopped at step {step}" if step else "interrupted"
+        return f"{stopped}. Go on with: {shlex.join(['nmpm', 'fit', '--resume', str(self.run_folder.root)])}"
+
+    def _test_best_weights(self) -> None:
+        """Validate the last weights if no validation has, then test the best ones; without validations, the last."""
+        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)
+        callbacks[:] = [one for one in callbacks if not isinstance(one, BatchSizeFinder)]  # (it would act here, too)
+        best = self._saver(BestCheckpoint)
+        if best.monitor and self.trainer.limit_val_batches and best.scored_step < self.trainer.global_step:
+            self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
+            best.score(self.trainer)
+        # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
+        path = Path(best.best_model_path or self.run_folder.checkpoints["last"])
+        if path.is_file():
+            self.model.load_state_dict(read_checkpoint(path)["state_dict"])
+        untested = "" if self.trainer.limit_test_batches else "--trainer.limit_test_batches is 0."
+        if not self.datamodule.has_test:
+            untested = f"{self.datamodule.data_source.folder} has no test.h5."
+        if untested:
+            self.report.report_untested(self.trainer, self.model, untested)
+        else:
+            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+
+    def _saver(self, kind: type[T]) -> T:
+        return next(callback for callback in self.trainer.checkpoint_callbacks if isinstance(callback, kind))
+
+    def _load_checkpoint(self) -> dict[str, Any] | None:
+        """The checkpoint that --ckpt_path names, whose parts are the model's; None without the option."""
+        path = self.checkpoint_path()
+        if path is None:
+            return None
+        content = read_checkpoint(path)
+        self.model.on_load_checkpoint(content)
+        self.config_init[self.subcommand]["ckpt_path"] = str(path)
+        return content

@@ -34,14 +34,7 @@ ROOT, CHECKPOINT = "--trainer.default_root_dir", "--ckpt_path"
 
 
 def run(words: list[str]) -> int:
-    """Run a training command, e.g. ["fit", "--config", "goop.yaml"] or ["test", "runs/goop"].
-
-    Returns:
-        The exit status: 2 for an option or key that cannot be.
-
-    Raises:
-        ConfigError: if a file or run that is named does not exist.
-    """
+    """Run a training command, e.g. ["fit", "--config", "goop.yaml"], and return the exit status."""
     command = words[0]
     if "--help" in words or "-h" in words:
         sys.stdout.write(training_help(command, COMMANDS[command][1]))
@@ -59,15 +52,10 @@ def run(words: list[str]) -> int:
 
 
 def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], str]:
-    """Replace the folder of a run by the options that it stands for.
-
-    Args:
-        command: Such as test.
-        options: Such as those of "runs/goop", or of "--resume runs/goop --trainer.max_steps 9000".
+    """Replace "runs/goop", or "--resume runs/goop" of fit, by the run's configuration, folder and checkpoint.
 
     Returns:
-        The options with the run's configuration, folder and checkpoint, and a line that names what other options
-        change; the options as they are, and no line, where they name no run.
+        The options, and a line that says what those beside the run change of it; empty where there is no run.
 
     Raises:
         UsageError: if `--resume` lacks the folder, or `nmpm fit` gets one without `--resume`.
@@ -202,12 +190,7 @@ TRAINER = {
 
 
 def training_help(command: str, summary: str) -> str:
-    """The help of a training command.
-
-    Args:
-        command: fit, validate, test or predict.
-        summary: What it does, in one sentence.
-    """
+    """The help of a training command, with a sentence that says what it does."""
     sections = {group: "\n".join(_entries(dict(_described(group)))) for group in SIGNATURES}
     shared = {"options": "\n".join(_entries(OPTIONS)), "trainer": "\n".join(_entries(TRAINER))}
     run = "--resume RUN" if command == "fit" else "RUN"

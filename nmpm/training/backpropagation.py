@@ -106,6 +106,8 @@ def mean_over_parts(
         weights: Those that require gradients get them.
         threads: How many threads work at most.
     """
+    if len(rows) == 1:
+        return error(rows[0])
     shares = [mask[part].sum() / mask.sum() for part in rows]
     trained = [weight for weight in weights if weight.requires_grad]
     mean: Tensor = _MeanOverParts.apply(error, shares, rows, threads, *trained)  # type: ignore[no-untyped-call]  # (torch's stubs)

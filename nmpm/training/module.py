@@ -223,8 +223,7 @@ class EmulatorModule(EvaluatedModule):
         finished batches: Lightning's `total_batch_idx` also counts one that was interrupted, which is repeated.
         """
         finished = self.trainer.fit_loop.epoch_loop.batch_progress.total.processed  # type: ignore[attr-defined]  # (of batches)
-        entropy = (self.seed, 0, finished)
-        torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+        torch.manual_seed(int(np.random.SeedSequence((self.seed, 0, finished)).generate_state(1)[0]))
 
     def training_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
         """This rank's part of the mean error over the particles of all ranks, which is logged.
@@ -242,10 +241,7 @@ class EmulatorModule(EvaluatedModule):
             return self._error(predicted, batch.scenes(rows))
 
         rows = self.rows(batch)
-        if len(rows) == 1:
-            error = mean_error(rows[0])
-        else:
-            error = mean_over_parts(mean_error, batch.mask, rows, self.parameters(), self.threads or len(rows))
+        error = mean_over_parts(mean_error, batch.mask, rows, self.parameters(), self.threads or len(rows))
         loss, logged = global_mean(error, batch.mask.sum())
         self.log("train/loss", logged)
         return loss
@@ -297,5 +293,4 @@ class EmulatorModule(EvaluatedModule):
         """Share of the training that is over, by steps or by the clock; 1 where the number of bundles is constant."""
         if not self.unroll_growth:
             return 1.0
-        step = self.global_step
-        return max(step / total_steps(self.trainer), self._clock.share(self.trainer, step))
+        return max(self.global_step / total_steps(self.trainer), self._clock.share(self.trainer, self.global_step))

@@ -10,14 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from lightning.pytorch import Callback
 from PIL import Image
 
 from nmpm._support.devices import computes_bfloat16
 from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
 from nmpm.cli.early_checks import argument_names
-from nmpm.cli.run_training import EmulatorCLI
+from nmpm.cli.emulator_cli import EmulatorCLI
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
@@ -161,24 +160,6 @@ def test_every_part_can_be_swapped_by_class_name(make_dataset):
     assert type(saved.emulator.decoder).__name__ == "Flip"
     assert list(Path("logs").rglob("metrics.csv"))
     assert not list(Path().rglob("events.out.tfevents.*"))
-
-
-class Counting(Callback):
-    """Counts the batches of all trainings."""
-
-    seen = 0
-
-    def on_train_batch_end(self, *_):
-        Counting.seen += 1
-
-
-def test_configured_callbacks_run(make_dataset):
-    Counting.seen = 0
-    one = {"class_path": f"{__name__}.Counting"}
-    Path("mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [one, one]}}))
-    words = ["fit", *WATERDROP, "--config", "mine.yaml"]
-    assert main([*words, *source("waterdrop.yaml", make_dataset)]) == 0
-    assert Counting.seen == 4
 
 
 @pytest.mark.slow

@@ -126,8 +126,14 @@ class ReportWriter(Callback):
         self, trainer: Trainer, module: EmulatorModule, per_trajectory: Mapping[str, list[dict[str, float]]]
     ) -> dict[str, Any]:
         datamodule = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
-        errors = _logged(trainer, "test/")
-        optional = {"test": errors, "remark": no_better_than_trivial(errors)}
+        errors, source = _logged(trainer, "test/"), getattr(datamodule, "data_source", None)
+        simulation = source.metadata.extra.get("simulation") if source else None
+        optional = {
+            "test": errors,
+            "remark": no_better_than_trivial(errors),
+            "simulation": simulation if isinstance(simulation, dict) else None,
+            "particles": self._first_rollout and int(self._first_rollout[0].mask[0].sum()),
+        }
         return {
             "dataset": datamodule.description,
             "weights": float32_digest(module.state_dict()),
@@ -143,17 +149,8 @@ class ReportWriter(Callback):
                 "parameters": sum(parameter.numel() for parameter in module.emulator.parameters()),
             },
             "curve": self.curve,
-            **_simulation(datamodule),
-            **({} if self._first_rollout is None else {"particles": int(self._first_rollout[0].mask[0].sum())}),
             "versions": {"nmpm": __version__, "torch": torch.__version__, "python": platform.python_version()},
         }
-
-
-def _simulation(datamodule: Any) -> dict[str, Any]:
-    """How the data were simulated, as far as their metadata say: preset, trajectories per split, seed, revision."""
-    source = getattr(datamodule, "data_source", None)
-    stated = source.metadata.extra.get("simulation") if source is not None else None
-    return {"simulation": stated} if isinstance(stated, dict) else {}
 
 
 def _tested_indices(trainer: Trainer) -> list[int]:
