@@ -52,11 +52,7 @@ def check_end(trainer: Trainer) -> None:
 
 
 def check_endless_batches(trainer: Trainer) -> None:
-    """Make sure, before any data are loaded, that a training on endless batches takes a step and ends.
-
-    Raises:
-        ConfigError: if it does not, or if a share of the batches is asked for.
-    """
+    """Raise ConfigError, before any data are loaded, if a training on endless batches takes no step or has no end."""
     limit = trainer.limit_train_batches
     for name, value in (
         *(("max_steps", trainer.max_steps), ("max_epochs", trainer.max_epochs), ("limit_train_batches", limit)),

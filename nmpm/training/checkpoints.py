@@ -75,8 +75,7 @@ def load_module(path: Path) -> EmulatorModule:
     """Load the module of a checkpoint onto the CPU.
 
     Raises:
-        DataError: if the file cannot be read, or is not a checkpoint of an emulator.
-        ConfigError: if a newer nmpm wrote it, or it names an unknown part.
+        DataError, ConfigError: if the file is not a checkpoint of an emulator, or of a newer version.
     """
     from nmpm.training.module import EmulatorModule  # (which imports this module)
 
@@ -118,11 +117,7 @@ def check_same_scene(model: Scene, data: Scene) -> None:
 
 
 def check_same_recipe(hyper_parameters: Mapping[str, Any], recipe: EmulatorRecipe) -> None:
-    """Make sure that a checkpoint's weights suit the recipe of the model that is to load them.
-
-    Raises:
-        ConfigError: naming the parts that differ with both values, or if the stored recipe cannot be read.
-    """
+    """Raise ConfigError, naming the parts that differ, if a checkpoint's weights do not suit a model's recipe."""
     names = {field.name for field in dataclasses.fields(EmulatorRecipe)}
     recipe_values = {name: value for name, value in hyper_parameters.items() if name in names}
     stored = EmulatorRecipe.from_dict({"format": FORMAT, **recipe_values})
@@ -147,12 +142,7 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], recipe: EmulatorRecip
 
 
 def adopt_arguments(checkpoint: Mapping[str, Any], current: Mapping[str, Any], optimizer: Optimizer) -> list[str]:
-    """Let a training go on from a checkpoint with other arguments, those of its optimizer among them.
-
-    Args:
-        checkpoint: Changed in place; the optimizer's state is kept.
-        current: The hyperparameters to go on with.
-        optimizer: With the arguments to go on with.
+    """Change a checkpoint, in place, to go on with the current hyperparameters and the optimizer's arguments.
 
     Returns:
         What has changed, such as "model.optimizer.lr = 0.001 (was 0.003)".
@@ -176,10 +166,7 @@ def adopt_arguments(checkpoint: Mapping[str, Any], current: Mapping[str, Any], o
 
 
 def _adopt_optimizer_arguments(checkpoint: Mapping[str, Any], optimizer: Optimizer) -> list[str]:
-    """Replace the optimizer's arguments in a checkpoint; the learning rate keeps its place in the schedule.
-
-    Without it, the arguments of a resumed training would silently be the checkpoint's, whatever the user gives.
-    """
+    """Replace the optimizer's arguments in a checkpoint; the learning rate keeps its place in the schedule."""
     states, schedules = checkpoint.get("optimizer_states") or [], checkpoint.get("lr_schedulers") or []
     if not states:
         return []

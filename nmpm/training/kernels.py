@@ -90,19 +90,19 @@ class Counts(torch.autograd.Function):
         """The gradient with respect to the positions."""
         cells, material, mask = ctx.saved_tensors
         grid: Grid = ctx.grid
-        place, pull = np.zeros(cells.shape, np.float32), as_array(slope)
+        gradient, pull = np.zeros(cells.shape, np.float32), as_array(slope)
         none, kinds = np.empty((cells.shape[2], 0), np.float32), material_rows(material, slope.shape[-1])
 
         def follow(b: int) -> None:
             kind, real, here = kinds[b], as_array(mask[b]), as_array(cells[b])
             for frame in range(len(here)):
                 scatter_adjoint(
-                    none, kind, real, here[frame], grid.shape, grid.periodic, _NONE, pull[b, frame], place[b, frame],
+                    none, kind, real, here[frame], grid.shape, grid.periodic, _NONE, pull[b, frame], gradient[b, frame],
                     none,
                 )  # fmt: skip
 
         for_each(follow, len(cells), torch.get_num_threads())
-        return torch.from_numpy(place), None, None, None, None
+        return torch.from_numpy(gradient), None, None, None, None
 
 
 @jit_sum

@@ -192,11 +192,7 @@ class EmulatorModule(EvaluatedModule):
             checkpoint["nmpm_optimizer"] = class_path(type(self.trainer.optimizers[0]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Compare the checkpoint with this model; a training goes on with this model's arguments.
-
-        Raises:
-            ConfigError: if a newer version wrote it, a part differs, or a callback of the trainer cannot go on.
-        """
+        """Compare the checkpoint with this model; a training goes on with this model's arguments."""
         check_format(checkpoint.get("nmpm_format"), "The checkpoint")
         checkpoints.check_same_recipe(checkpoint["hyper_parameters"], self.emulator.recipe)
         trainer = self._trainer
@@ -261,10 +257,7 @@ class EmulatorModule(EvaluatedModule):
             return error + self.field_weight * of_fields
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """The optimizer, and the schedule of its learning rate. A new emulator is calibrated first.
-
-        Here and not in `on_fit_start`, as Lightning's finders take their steps before that.
-        """
+        """The optimizer and its schedule. A new emulator is calibrated first, as finders step before `on_fit_start`."""
         if self._steps_before:
             raise ConfigError(
                 f"This Trainer has taken {self._steps_before} steps already, and counts on from there: make a new"

@@ -22,11 +22,7 @@ def adam(parameters: Iterable[Tensor]) -> Optimizer:
 
 
 def build_optimizer(make: OptimizerCallable, parameters: Iterable[Tensor]) -> Optimizer:
-    """The optimizer of some parameters.
-
-    Raises:
-        ConfigError: if an argument is not allowed, such as a negative learning rate.
-    """
+    """The optimizer of some parameters; ConfigError for an argument such as a negative learning rate."""
     try:
         optimizer = make(parameters)
     except NmpmError:

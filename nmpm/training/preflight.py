@@ -158,8 +158,7 @@ def check_evaluations(trainer: Trainer, module: EmulatorModule, data: Trajectory
     """Compute the metrics on a trajectory of each split, and look for the errors that callbacks monitor.
 
     Raises:
-        ConfigError: if a metric does not take the data, a share of a split's batches is none, or the error that a
-            callback monitors is never logged. Lightning would find out in the first validation, or after the training.
+        ConfigError: where Lightning would fail in the first validation, or after the training.
     """
     if trainer.enable_validation:
         _check_share("limit_val_batches", trainer.limit_val_batches, len(data.val_dataloader()))
@@ -194,11 +193,7 @@ def _check_monitors(trainer: Trainer, module: EmulatorModule, errors: set[str]) 
 
 
 def _try_metrics(errors: Comparison, recordings: SplitRecordings, frames: int | None = None) -> Sequence[str]:
-    """Names of the errors of a motionless rollout of the longest trajectory, the smallest of such.
-
-    Raises:
-        ConfigError: if a metric does not take it.
-    """
+    """Names of the errors of a motionless rollout of the longest trajectory; ConfigError if a metric fails on it."""
     split = recordings.split
     index = min(range(len(split)), key=lambda number: (-split.frames(number), split.particles(number)))
     window = collate([recordings[index]], recordings.scene, frames)

@@ -32,8 +32,8 @@ def test_one_screen_and_a_picture(dataset, tmp_path, capsys):
 def test_json_is_all_there_is_on_standard_output(dataset, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["inspect", str(dataset), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["splits"]["train"]["particles"] == [40, 50]
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["splits"]["train"]["particles"] == [40, 50]
     assert not list(tmp_path.glob("*.png"))
 
 

@@ -217,9 +217,9 @@ def test_a_run_goes_on_validates_tests_predicts_and_becomes_a_zoo_entry(make_dat
     from nmpm.zoo.publish import NOTICED, round_network
 
     assert model.card["weights"] == "float16"
-    found, limit = model.rollout(state, 20), NOTICED * max(trained.grid.spacing)
-    assert torch.equal(found, rollout(round_network(trained), state, 20))
-    torch.testing.assert_close(found, rollout(trained, state, 20), atol=limit, rtol=0)
+    predicted, limit = model.rollout(state, 20), NOTICED * max(trained.grid.spacing)
+    assert torch.equal(predicted, rollout(round_network(trained), state, 20))
+    torch.testing.assert_close(predicted, rollout(trained, state, 20), atol=limit, rtol=0)
     assert {p.name for p in (tmp_path / "zoo/drop/tiny").iterdir()} == {
         *("card.yaml", "config.yaml", "model.safetensors", "README.md", "rollout.png", "errors.csv", "chart.png"),
         *("scenes.csv", "training.csv"),
