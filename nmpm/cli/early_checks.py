@@ -55,10 +55,16 @@ def read_options(words: Sequence[str]) -> list[Option]:
     options: list[Option] = []
     rest = list(words)
     while rest:
-        name, mark, value = rest.pop(0).partition("=")
-        option = Option(name, value if mark else None)
-        if not mark and name.startswith("-") and rest and not re.match(r"--?[a-zA-Z]", rest[0]):
+        word = rest.pop(0)
+        name, mark, value = word.partition("=")
+        if not word.startswith("-"):
+            option = Option(word)
+        elif mark:
+            option = Option(name, value)
+        elif rest and not re.match(r"--?[a-zA-Z]", rest[0]):
             option = Option(name, rest.pop(0))
+        else:
+            option = Option(name)
         if option.name in ("--config", "-c") and option.value:
             option = Option("--config", str(find_config(option.value)))
         options.append(option)
