@@ -78,22 +78,36 @@ class Progress(ProgressBar):
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._open("predicting", sum(trainer.num_predict_batches))
 
-    def _count_batch(self, *_: Any) -> None:
-        if self._advance is not None:
-            self._advance()
+    def on_test_batch_end(self, *_: Any) -> None:
+        self._count_batch()
 
-    on_test_batch_end = on_predict_batch_end = _count_batch
+    def on_predict_batch_end(self, *_: Any) -> None:
+        self._count_batch()
 
-    def _close(self, *_: Any) -> None:
-        self._open_bar.close()
-        self._advance = None
+    def on_train_end(self, *_: Any) -> None:
+        self._close()
 
-    on_train_end = on_test_end = on_predict_end = on_exception = _close
+    def on_test_end(self, *_: Any) -> None:
+        self._close()
+
+    def on_predict_end(self, *_: Any) -> None:
+        self._close()
+
+    def on_exception(self, *_: Any) -> None:
+        self._close()
 
     def _open(self, what: str, total: float, done: int = 0) -> None:
         if self._enabled:
             bar = progress_bar(what, int(total) if math.isfinite(total) else None, done)
             self._advance = self._open_bar.enter_context(bar)
+
+    def _count_batch(self) -> None:
+        if self._advance is not None:
+            self._advance()
+
+    def _close(self) -> None:
+        self._open_bar.close()
+        self._advance = None
 
     def _show(self, trainer: Trainer, doing: str) -> None:
         if self._advance is None:
