@@ -49,13 +49,13 @@ def split_call(emulator: Emulator, particles: Particles, context: RolloutContext
     start = call.rasterise(particles)
     normalised = call.normalise(start)
     output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
-    path = call.path(start, output, None)
+    path = call.path(start, output)
     return {
         CALL: lambda: emulator(particles, context),
         NETWORK: lambda: emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision),
         "p2g": lambda: call.rasterise(particles),
         "normalise": lambda: call.normalise(start),
-        "path and constraints": lambda: call.path(start, output, None),
+        "path and constraints": lambda: call.path(start, output),
         "velocity, density cap, to length": lambda: call.finish(start, path.copy()),
     }
 

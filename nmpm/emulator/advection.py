@@ -7,15 +7,14 @@ the bounds' rule "error", once per bundle.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from nmpm.decoders import Decoder
 from nmpm.emulator.bundle import BundleStart
 from nmpm.emulator.constraints import (
     BOUNDS,
-    Constraints,
     affordable,
     affordable_share,
     at_rest,
@@ -26,11 +25,11 @@ from nmpm.emulator.constraints import (
 from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.crowding import Crowding
 from nmpm.emulator.support import Support
-from nmpm.grid import Grid
-from nmpm.scene import Scene
-from nmpm.transfer import Transfer
 from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
+
+if TYPE_CHECKING:
+    from nmpm.emulator.model import Emulator
 
 
 @dataclass(frozen=True)
@@ -52,77 +51,54 @@ class MovingParticles:
 
 @dataclass(frozen=True)
 class Advection:
-    """Moves the particles of one family of scenes over one grid.
+    """Moves an emulator's particles by what its network predicts."""
 
-    Args:
-        scene: Gives periodic axes, materials, and whether there can be obstacles.
-        grid: Where the predicted velocities live.
-        transfer: Interpolates them at the particles.
-        decoder: Makes velocities of them.
-        constraints: What paths must obey.
-        bounds: (2, D), the lowest and highest positions.
-        walls: (1, C_solid, *S), the share of each cell that is wall.
-    """
-
-    scene: Scene
-    grid: Grid
-    transfer: Transfer
-    decoder: Decoder
-    constraints: Constraints
-    bounds: Tensor
-    walls: Tensor
+    emulator: Emulator
 
     def free_path(self, start: BundleStart) -> Tensor:
-        """(B, m, N, D) positions by the network's velocities alone, within the bounds.
-
-        Raises:
-            DataError: as `constrained_path`.
-        """
+        """(B, m, N, D) positions by the network's velocities alone, within the bounds; raises as `constrained_path`."""
         return self._check_bounds(start, self._free_path(self._take_off(start)))
 
     def constrained_path(self, start: BundleStart, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
 
-        Args:
-            start: Particles and grids.
-            solid: (B, C_solid, *S), the share of each cell that is wall or obstacle.
-            budget: (B,) energy that no frame may exceed; None for no such limit.
-
-        Raises:
-            DataError: if a particle leaves the bounds by more than a cell, and their rule is "error".
+        Solid and budget are those of the `RolloutContext`. Raises DataError if a particle leaves the bounds by more
+        than a cell, and their rule is "error".
         """
         moving = self._take_off(start)
         path = self._free_path(moving) if budget is None else self._within_energy(moving, budget)
-        if self.constraints.solids and self.scene.obstacles:
-            contact = Contact(obstacle_share(solid, self.walls), self.grid)
+        if self.emulator.constraints.solids and self.emulator.scene.obstacles:
+            contact = Contact(obstacle_share(solid, self.emulator.walls), self.emulator.grid)
             path = self._confine(contact.hold(start.cells, path, start.mask))
-        if self.constraints.rest_speed:
+        if self.emulator.constraints.rest_speed:
             path = self._bring_to_rest(start, path, solid)
         return self._check_bounds(start, path)
 
     def uncrowded_path(self, start: BundleStart, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """A path (B, m, N, D) of `constrained_path` with overfull cells at its end spread, evenly over its frames."""
-        volume = self.scene.particle_volume / self.grid.cell_volume
-        taken = solid if solid.shape[1] else self.walls.expand(1, 1, *self.grid.shape)
-        crowding = Crowding(self.constraints.density_cap, volume, 1 - taken, self.grid)
+        volume = self.emulator.scene.particle_volume / self.emulator.grid.cell_volume
+        taken = solid if solid.shape[1] else self.emulator.walls.expand(1, 1, *self.emulator.grid.shape)
+        crowding = Crowding(self.emulator.constraints.density_cap, volume, 1 - taken, self.emulator.grid)
         shift = crowding.shift(path[:, -1], start.mask.unsqueeze(-1))
         if shift is None:
             return path
         frames = path.shape[1]
         ramp = torch.arange(1, frames + 1, device=path.device, dtype=path.dtype).view(-1, 1, 1) / frames
         spread = self._confine(path + ramp * shift.unsqueeze(1))
-        if self.constraints.solids and self.scene.obstacles:
-            depth = linear_g2p(obstacle_share(solid, self.walls).to(path.dtype), spread.flatten(1, 2), self.grid)
+        if self.emulator.constraints.solids and self.emulator.scene.obstacles:
+            depth = linear_g2p(
+                obstacle_share(solid, self.emulator.walls).to(path.dtype), spread.flatten(1, 2), self.emulator.grid
+            )
             blocked = (depth > SURFACE).unflatten(1, path.shape[1:3]).any(1, keepdim=True)
             spread = torch.where(blocked, path, spread)
         return spread if budget is None else self._afford_spread(start, path, spread, budget)
 
     def gather(self, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
         """Each particle's own material's values: fields (B, materials * V, *S) at cells (B, N, D) → (B, N, V)."""
-        gathered = self.transfer.g2p(fields, cells, self.grid)
-        if len(self.scene.materials) == 1:
+        gathered = self.emulator.transfer.g2p(fields, cells, self.emulator.grid)
+        if len(self.emulator.scene.materials) == 1:
             return gathered
-        by_material = gathered.unflatten(-1, (len(self.scene.materials), -1))
+        by_material = gathered.unflatten(-1, (len(self.emulator.scene.materials), -1))
         index = material[..., None, None].expand(-1, -1, 1, by_material.shape[-1])
         values: Tensor = by_material.gather(2, index).squeeze(2)
         return values
@@ -131,8 +107,8 @@ class Advection:
         """The velocities that particles keep, and their shares of their scene's mass."""
         fields = start.fields
         smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
-        carried = self.decoder.carried_velocity(start.velocity, smoothed)
-        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
+        carried = self.emulator.decoder.carried_velocity(start.velocity, smoothed)
+        share = mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
         return MovingParticles(start, carried, fields, share)
 
     def _free_path(self, moving: MovingParticles) -> Tensor:
@@ -147,7 +123,7 @@ class Advection:
 
     def _advance(self, moving: MovingParticles, field: Tensor, cells: Tensor, velocity: Tensor, frame: int) -> Tensor:
         """(B, N, D) positions after a frame, from cells (B, N, D) and the velocity (B, N, D) of the frame before."""
-        known = self.decoder.known_velocity(moving.carried, velocity, moving.start.gravity, frame)
+        known = self.emulator.decoder.known_velocity(moving.carried, velocity, moving.start.gravity, frame)
         return self._confine(cells + (known + self.gather(field, cells, moving.start.material)))
 
     def _within_energy(self, moving: MovingParticles, budget: Tensor) -> Tensor:
@@ -167,7 +143,7 @@ class Advection:
     def _energies(self, cells: Tensor, gravity: Tensor, share: Tensor, path: Tensor) -> Tensor:
         """(B, m) energies of the frames of a path (B, m, N, D) from cells (B, N, D), with shares (B, N, 1) of mass."""
         steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
-        path, steps, gravity = self.grid.isotropic_units(path, steps, gravity)
+        path, steps, gravity = self.emulator.grid.isotropic_units(path, steps, gravity)
         return energy(path, steps, gravity, share)
 
     def _limit_energy(self, moving: MovingParticles, budget: Tensor, begun: Tensor) -> Tensor:
@@ -180,7 +156,7 @@ class Advection:
             cells = path[-1]
             proposed = self._advance(moving, field, cells, velocity, frame)
             step = proposed - cells
-            units, steps, last, gravity = self.grid.isotropic_units(cells, step, before, moving.start.gravity)
+            units, steps, last, gravity = self.emulator.grid.isotropic_units(cells, step, before, moving.start.gravity)
             factor = affordable(units, steps, last, gravity, moving.share, budget)
             arrived = torch.where(factor < 1, self._confine(cells + factor * step), proposed)
             velocity = before = arrived - cells
@@ -189,11 +165,11 @@ class Advection:
 
     def _bring_to_rest(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
         """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
-        still = at_rest(start.cells, path, self.constraints.rest_speed, start.gravity)
+        still = at_rest(start.cells, path, self.emulator.constraints.rest_speed, start.gravity)
         if is_eager_cpu(still) and not bool(still.any()):
             return path
-        obstacle = obstacle_share(solid, self.walls) if self.scene.obstacles else None
-        support = Support(start.filled, obstacle, self.scene, self.grid)
+        obstacle = obstacle_share(solid, self.emulator.walls) if self.emulator.scene.obstacles else None
+        support = Support(start.filled, obstacle, self.emulator.scene, self.emulator.grid)
         held = support.holds(start.cells, start.gravity)[:, None, :, None]
         fallen = self._confine(support.fall(start.cells, start.gravity, path.shape[1]))
         return torch.where(still[:, None, :, None], torch.where(held, start.cells.unsqueeze(1), fallen), path)
@@ -211,26 +187,26 @@ class Advection:
 
     def _spread_energies(self, start: BundleStart, path: Tensor, spread: Tensor) -> Tensor:
         """(B, m + 1) energies of the frames of a spread path, and of its end with the velocity of the path's end."""
-        share = mass_shares(self.scene, start.material, start.mask, start.cells.dtype)
+        share = mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
         before = path[:, -2] if path.shape[1] > 1 else start.cells
-        cells, step, gravity = self.grid.isotropic_units(spread[:, -1], path[:, -1] - before, start.gravity)
+        cells, step, gravity = self.emulator.grid.isotropic_units(spread[:, -1], path[:, -1] - before, start.gravity)
         end = energy(cells, step, gravity, share)
         return torch.cat([self._energies(start.cells, start.gravity, share, spread), end.unsqueeze(1)], dim=1)
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""
-        rule, (low, high) = BOUNDS[self.constraints.bounds], self.bounds.unbind(0)
-        if all(self.scene.periodic):
+        rule, (low, high) = BOUNDS[self.emulator.constraints.bounds], self.emulator.bounds.unbind(0)
+        if all(self.emulator.scene.periodic):
             return cells
-        if not any(self.scene.periodic):
+        if not any(self.emulator.scene.periodic):
             return rule(cells, low, high)
         columns = [
             column if wraps else rule(column, low[axis], high[axis])
-            for axis, (column, wraps) in enumerate(zip(cells.unbind(-1), self.scene.periodic, strict=True))
+            for axis, (column, wraps) in enumerate(zip(cells.unbind(-1), self.emulator.scene.periodic, strict=True))
         ]
         return torch.stack(columns, dim=-1)
 
     def _check_bounds(self, start: BundleStart, path: Tensor) -> Tensor:
-        if self.constraints.bounds == "error":
-            check_within_bounds(path, start.mask, self.bounds, self.scene.periodic)
+        if self.emulator.constraints.bounds == "error":
+            check_within_bounds(path, start.mask, self.emulator.bounds, self.emulator.scene.periodic)
         return path

@@ -34,13 +34,8 @@ def sample_bodies(scenes: Sequence[Sequence[Body]], scene: Scene, grid: Grid) ->
 
     Where bodies overlap, their union is solid. What is outside of the domain is left out.
 
-    Args:
-        scenes: The bodies of each of B scenes.
-        scene: Gives the particles' volume, of which shares are.
-        grid: What the model rasterises onto.
-
     Returns:
-        (K, D) points in domain length, of all scenes together; (B, K) shares of a particle's volume, differentiable
+        (K, D) points in domain length, of all B scenes together; (B, K) shares of a particle's volume, differentiable
         with respect to the bodies' parameters. Both float64, on the CPU.
 
     Raises:

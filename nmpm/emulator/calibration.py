@@ -55,11 +55,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     the windows gets the other materials' scales. Where several processes train together, all of them call this, each
     with windows of its own, and get the statistics of all.
 
-    Raises:
-        ValueError: if there is no window or one is too short.
-
-    Warns:
-        UserWarning: naming the materials without particles in the windows.
+    Raises ValueError if there is no window or one is too short; warns of materials without particles in the windows.
     """
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
@@ -67,7 +63,8 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     calibrate_fields(emulator.field_scales, windows)
     inputs = _combine(all_gather(_inputs(emulator, windows)))
     materials = list(zip(*all_gather(_unknowns(emulator, windows)), strict=True))
-    absent = _absent_materials(materials[: len(emulator.scene.materials)])
+    empty = [not any(part.particles for part in parts) for parts in materials[: len(emulator.scene.materials)]]
+    absent = [] if all(empty) else [index for index, is_empty in enumerate(empty) if is_empty]
     if absent:
         warnings.warn(
             f"The windows that the model is calibrated on have no particles of"
@@ -94,8 +91,7 @@ def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
     Cells that are half solid or less than half full do not count. Windows are of training data, drawn from whole
     trajectories, as crowding grows while material settles.
 
-    Raises:
-        ValueError: if no cell is half full.
+    Raises ValueError if no cell is half full.
     """
     fractions = []
     for window in (window.to(emulator.device) for window in windows):
@@ -146,20 +142,13 @@ def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
     unknown = [[_unknown_velocity(emulator, window) for window in windows]]
     if emulator.scene.evolving:
         unknown.append([true_rates(emulator.field_scales, window, emulator.frames) for window in windows])
-    return [_mean_square(parts, index, windows) for parts in unknown for index in range(len(emulator.scene.materials))]
-
-
-def _mean_square(parts: Sequence[Tensor], index: int, windows: Sequence[Window]) -> _Unknowns:
-    """Of values (B, m, N, V) in each window, over the particles of a material."""
-    of_material = [window.mask & (window.material == index) for window in windows]
-    values = torch.cat([part.transpose(1, 2)[real] for part, real in zip(parts, of_material, strict=True)])
-    return _Unknowns(len(values), _shareable(values.square().mean(0)))
-
-
-def _absent_materials(materials: Sequence[Sequence[_Unknowns]]) -> list[int]:
-    """Indices of the materials without particles; none where no material has any."""
-    absent = [index for index, parts in enumerate(materials) if not any(part.particles for part in parts)]
-    return absent if len(absent) < len(materials) else []
+    result = []
+    for parts in unknown:  # (B, m, N, V) in each window
+        for index in range(len(emulator.scene.materials)):
+            of_material = [window.mask & (window.material == index) for window in windows]
+            values = torch.cat([part.transpose(1, 2)[real] for part, real in zip(parts, of_material, strict=True)])
+            result.append(_Unknowns(len(values), _shareable(values.square().mean(0))))
+    return result
 
 
 def _borrowed(values: Tensor, scene: Scene, absent: Sequence[int]) -> Tensor:

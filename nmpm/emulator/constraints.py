@@ -57,8 +57,7 @@ def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, periodic: Se
 
     Axes that wrap have none. One value is read back.
 
-    Raises:
-        DataError: naming scene, particle and frame of the first such position.
+    Raises DataError naming scene, particle and frame of the first such position.
     """
     low, high = bounds.unbind(0)
     walls = [axis for axis, wraps in enumerate(periodic) if not wraps]
@@ -89,8 +88,7 @@ class Constraints:
         density_cap: Volume fraction above which the particles of a cell spread into the room around it, after each
             bundle; 0 for no cap. `nmpm.emulator.calibration.density_cap` measures it in data.
 
-    Raises:
-        ConfigError: if the speed or the cap is negative or not finite, or the bounds' rule unknown.
+    Raises ConfigError if the speed or the cap is negative or not finite, or the bounds' rule unknown.
     """
 
     energy: bool = False
@@ -149,13 +147,8 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
     the budget is taken. In a scene that exceeds its budget s applies to the particles that gain energy in this frame;
     if that cannot suffice, to all. In other scenes all factors are exactly 1.
 
-    Args:
-        cells: (B, N, D) positions before the frame.
-        step: (B, N, D) proposed steps.
-        before: (B, N, D) steps of the frame before.
-        gravity: (B, 1, D).
-        share: (B, N, 1), each particle's share of its scene's mass.
-        budget: (B,) energy that is allowed.
+    Of positions before the frame, proposed steps and steps of the frame before (B, N, D), gravity (B, 1, D), shares of
+    the scene's mass (B, N, 1) and the energy (B,) that is allowed.
     """
     mass = share.squeeze(-1)
     work = step * gravity
@@ -216,11 +209,7 @@ def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tenso
 
     A particle in free fall is not at rest, however little it moves: at the top of its path it would be held in the air.
 
-    Args:
-        start: (B, N, D) where the bundle starts.
-        path: (B, m, N, D) its frames.
-        speed: In cells per frame.
-        gravity: (B, 1, D), what a frame adds to the velocity in free fall; zero where it is not known.
+    Of a bundle's start (B, N, D), its frames (B, m, N, D) and gravity (B, 1, D), zero where it is not known.
     """
     frames = path.shape[1]
     still: Tensor = (path[:, -1] - start).norm(dim=-1) < speed * frames

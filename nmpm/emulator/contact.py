@@ -61,10 +61,7 @@ class Contact:
     def hold(self, start: Tensor, path: Tensor, mask: Tensor | None = None) -> Tensor:
         """A path (B, m, N, D) that does not lead into an obstacle; one that starts in an obstacle leads out.
 
-        Args:
-            start: (B, N, D) in cells.
-            path: (B, m, N, D) as predicted; kept for particles that keep clear of obstacles.
-            mask: (B, N) bool, False for padding, whose path is returned as it is and changes no other; None for none.
+        From `start` (B, N, D) and the predicted path. Padding, False in `mask` (B, N), stays and changes no other path.
         """
         return self.hold_touching(start, path, mask) if is_eager_cpu(start) else self.hold_all(start, path, mask)
 

@@ -61,8 +61,7 @@ class FieldScales(nn.Module):
     def of_scene(self, particles: Particles) -> Tensor:
         """(B, G) the scenes' own numbers in units of their spread.
 
-        Raises:
-            DataError: if a state has one for each particle.
+        Raises DataError if a state has one for each particle.
         """
         for name in self.scene.parameters:
             if name in particles.fields and particles.fields[name].shape[1] != 1:
@@ -81,11 +80,8 @@ class FieldScales(nn.Module):
     def evolve(self, particles: Particles, places: Tensor, rates: Tensor, gather: Gather) -> Mapping[str, Tensor]:
         """The evolving fields in the frames of a bundle, (B, m, N) by name, from their values at its start.
 
-        Args:
-            particles: The state that the bundle starts from.
-            places: (B, m, N, D) positions in cells before each frame's step.
-            rates: (B, m, materials * E, *S), what the network predicts, in units of the fields' spread per frame.
-            gather: Interpolates them.
+        `gather` interpolates the predicted rates (B, m, materials * E, *S), in units of the fields' spread per frame,
+        at the places (B, m, N, D) in cells before each frame's step.
         """
         batch, count = particles.mask.shape
         steps = [gather(rate, cells) for rate, cells in zip(rates.unbind(1), places.unbind(1), strict=True)]

@@ -45,12 +45,9 @@ def _state_numbers(particles: Particles) -> list[_Numbers]:
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:
-    """Reject emulators with non-finite weights, and states that are non-finite or outside of the domain.
+    """Raise DataError for emulators with non-finite weights, and states that are non-finite or outside of the domain.
 
     All checks are read back from the device at once; details are computed only if one fails.
-
-    Raises:
-        DataError: naming the weight or statistic; or scene, particle and value.
     """
     real, materials = particles.mask, emulator.scene.materials
     numbers = _state_numbers(particles)

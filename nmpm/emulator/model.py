@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from nmpm._support.threads import ThreadChoice
 from nmpm.decoders import Decoder
-from nmpm.emulator.advection import Advection
 from nmpm.emulator.bundle import Bundle as Bundle
 from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
@@ -89,27 +88,22 @@ class Emulator(nn.Module):
 
     @property
     def scene(self) -> Scene:
-        """Materials, bounds, time step and gravity of the scenes."""
         return self.recipe.scene
 
     @property
     def frames(self) -> int:
-        """m, frames predicted by one call."""
         return self.recipe.frames
 
     @property
     def transfer(self) -> Transfer:
-        """How particles and grid see each other."""
         return self.recipe.transfer
 
     @property
     def decoder(self) -> Decoder:
-        """Meaning of the network's output."""
         return self.recipe.decoder
 
     @property
     def constraints(self) -> Constraints:
-        """Physical limits enforced in rollouts."""
         return self.recipe.constraints
 
     @property
@@ -121,11 +115,6 @@ class Emulator(nn.Module):
     def precision(self) -> torch.dtype:
         """Type in which transfers and advection are computed: float32, or float64 after `double()`."""
         return torch.promote_types(self.input_mean.dtype, torch.float32)
-
-    @property
-    def advection(self) -> Advection:
-        """The advection step of this emulator."""
-        return Advection(self.scene, self.grid, self.transfer, self.decoder, self.constraints, self.bounds, self.walls)
 
     @property
     def network_precision(self) -> torch.dtype:
@@ -142,8 +131,7 @@ class Emulator(nn.Module):
     def with_network(self, precision: torch.dtype) -> Emulator:
         """This emulator, or a copy with the network's weights converted.
 
-        Raises:
-            ConfigError: if the network has complex weights, as FNOs do, which have no such type.
+        Raises ConfigError if the network has complex weights, as FNOs do, which have no such type.
         """
         if precision == self.network_precision:
             return self
@@ -179,8 +167,7 @@ class Emulator(nn.Module):
     def with_grid_moved(self, shift: Sequence[float]) -> Emulator:
         """This emulator with its grid moved by `shift` (D,), in domain length; weights and statistics are shared.
 
-        Raises:
-            ConfigError: if the grid would no longer cover the scene's bounds.
+        Raises ConfigError if the grid would no longer cover the scene's bounds.
         """
         other = self._with_recipe(dataclasses.replace(self.recipe, scene=self.scene.with_domain_moved(shift)))
         bounds, walls = other.grid.bounds_in_cells(other.scene), wall_fraction(other.scene, other.grid)
@@ -192,11 +179,7 @@ class Emulator(nn.Module):
         return self.with_constraints(Constraints(solids=False))
 
     def over(self, scene: Scene) -> Emulator:
-        """A copy of weights and statistics for another scene, see `EmulatorRecipe.over`.
-
-        Raises:
-            ConfigError: if the emulator cannot take the scene.
-        """
+        """A copy of weights and statistics for another scene; raises as `EmulatorRecipe.over`."""
         return self.rebuilt(self.recipe.over(scene))
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:

@@ -53,15 +53,6 @@ class Incident:
         return f"{self.what} {self.value:.4g} (limit {self.limit:.4g}) in scene {self.scene} by frame {self.frame}"
 
 
-@dataclass(frozen=True)
-class _Reference:
-    """The first state's energy (B,), how far it is above the lowest possible (B,), and the mass shares (B, N, 1)."""
-
-    energy: Tensor
-    above_lowest: Tensor
-    share: Tensor
-
-
 @dataclass
 class Monitor:
     """Limits that a rollout is watched for, once per bundle; on other devices than a CPU read every 16 bundles.
@@ -93,7 +84,8 @@ class Monitor:
     _bundles: int = 0
     _judged: int = 0
     _padded: bool = False
-    _reference: _Reference | None = None
+    _reference: tuple[Tensor, Tensor, Tensor] | None = None
+    """The first state's energy (B,), how far it is above the lowest possible (B,), and the mass shares (B, N, 1)."""
     _unread: list[tuple[int, dict[str, Tensor]]] = field(default_factory=list)
 
     def start(self, emulator: Emulator, particles: Particles, frames: int | None = None) -> None:
@@ -109,14 +101,10 @@ class Monitor:
         share = mass_shares(emulator.scene, particles.material, particles.mask, particles.position.dtype)
         begun = energy(particles.position, particles.velocity, particles.gravity.unsqueeze(1), share)
         above = begun - lowest_potential(emulator.scene, particles.gravity)
-        self._reference = _Reference(begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share)
+        self._reference = begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
-        """Measure a bundle that the emulator predicted from a state.
-
-        Raises:
-            RolloutStoppedError: under the policy "stop", if a limit is passed.
-        """
+        """Measure a bundle that the emulator predicted from a state; raises RolloutStoppedError, see `Policy`."""
         self._frames = int(min(self._frames + bundle.position.shape[1], self._last_frame))
         self._bundles += 1
         if not particles.position.shape[1]:
@@ -148,9 +136,9 @@ class Monitor:
         measures = {_RESTING: (resting.sum(1) / particles.mask.sum(1).clamp(min=1)).to(bundle.velocity)}
         measures |= {"speed": moving.abs().amax((1, 2)) / min(emulator.grid.spacing)}
         if self._reference is not None:
-            last, fall = bundle.position[:, -1], particles.gravity.unsqueeze(1)
-            now = energy(last, bundle.velocity, fall, self._reference.share)
-            measures["energy"] = (now - self._reference.energy) / self._reference.above_lowest
+            begun, above_lowest, share = self._reference
+            now = energy(bundle.position[:, -1], bundle.velocity, particles.gravity.unsqueeze(1), share)
+            measures["energy"] = (now - begun) / above_lowest
         return measures
 
     def _crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> dict[str, Tensor]:

@@ -17,11 +17,7 @@ from nmpm.particles import Particles
 
 
 class Periods:
-    """The periods that a rollout's particles are away from the domain. Without periodic axes, nothing changes.
-
-    Args:
-        emulator: Predicts the rollout.
-    """
+    """The periods that a rollout's particles are away from the domain. Without periodic axes, nothing changes."""
 
     def __init__(self, emulator: Emulator) -> None:
         self._domain = emulator.scene.domain

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from nmpm._support.collectives import normal_like
+from nmpm.emulator.advection import Advection
 from nmpm.emulator.bundle import Bundle, BundleStart, RolloutContext
 from nmpm.emulator.fused.arrays import ArrayCache
 from nmpm.emulator.fused.parameters import KernelParameters
@@ -63,7 +64,7 @@ class TensorSteps(Steps):
             if emulator.scene.evolving:
                 rates = output[:, :, velocities:].to(emulator.precision) * emulator.output_scale[:, velocities:]
                 before = torch.cat([cells.unsqueeze(1), path[:, :-1]], dim=1)
-                gather = partial(emulator.advection.gather, material=particles.material)
+                gather = partial(Advection(emulator).gather, material=particles.material)
                 fields = emulator.field_scales.evolve(particles, before, rates, gather)
             step = path[:, -1] - (path[:, -2] if emulator.frames > 1 else cells)
             if emulator.constraints.density_cap and not emulator.training:
@@ -74,15 +75,7 @@ class TensorSteps(Steps):
             return Bundle(emulator.grid.to_length(path.to(precision)), last_velocity, fields)
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Particles in grid units, and the grid state.
-
-        Args:
-            particles: In domain length.
-            solid: (B, C_solid, *S).
-
-        Returns:
-            (B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) state.
-        """
+        """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in cells; grid state (B, C_in, *S)."""
         model = self.emulator
         cells, velocity, gravity = model.in_cells(particles)
         state = grid_state(
@@ -92,14 +85,14 @@ class TensorSteps(Steps):
 
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
         """(B, m, N, D) positions in cells, which obey the emulator's constraints."""
-        advection = self.emulator.advection
+        advection = Advection(self.emulator)
         if self.emulator.training:
             return advection.free_path(start)
         return advection.constrained_path(start, context.solid, context.budget)
 
     def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
         """The path (B, m, N, D) with its overfull cells spread, see `Advection.uncrowded_path`."""
-        return self.emulator.advection.uncrowded_path(start, path, context.solid, context.budget)
+        return Advection(self.emulator).uncrowded_path(start, path, context.solid, context.budget)
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:

@@ -37,8 +37,7 @@ class EmulatorRecipe:
         grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training only.
         constraints: Physical limits enforced in rollouts; only `bounds` also in training.
 
-    Raises:
-        ConfigError: if scene, grid, processor and constraints do not suit each other.
+    Raises ConfigError if scene, grid, processor and constraints do not suit each other.
     """
 
     scene: Scene
@@ -116,8 +115,7 @@ class EmulatorRecipe:
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
         """The recipe that `to_dict` described.
 
-        Raises:
-            ConfigError: if a newer nmpm wrote it, or a key is missing, unknown or wrong.
+        Raises ConfigError if a newer nmpm wrote it, or a key is missing, unknown or wrong.
         """
         values = dict(plain)
         check_format(values.pop("format", FORMAT), "This model")  # checkpoints state theirs elsewhere
@@ -129,8 +127,7 @@ class EmulatorRecipe:
 def check_format(version: object, what: str) -> None:
     """Make sure that this version can read a file's format.
 
-    Raises:
-        ConfigError: if the format is newer, or not a number.
+    Raises ConfigError if the format is newer, or not a number.
     """
     if not isinstance(version, int) or version > FORMAT:
         raise ConfigError(f"{what} has format {version}; this nmpm reads up to {FORMAT}: pip install --upgrade nmpm.")

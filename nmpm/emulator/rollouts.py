@@ -26,14 +26,8 @@ def unroll(
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
-    On a CPU, scenes whose state no longer changes are repeated without a call.
-
-    Args:
-        emulator: Predicts m frames a call.
-        particles: The state to start from.
-        bundles: Number of bundles.
-        monitor: Measures each bundle before it is yielded.
-        frames: Number of frames that are used, if not all: the monitor names none beyond.
+    On a CPU, scenes whose state no longer changes are repeated without a call. The monitor measures each bundle before
+    it is yielded, and names no frame beyond the number that is used, `frames`; all if that is left out.
     """
     if monitor is not None:
         monitor.start(emulator, particles, frames)
@@ -135,18 +129,14 @@ def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monit
 def stream_rollout(
     emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None
 ) -> Iterator[Rollout]:
-    """Predict `frames` frames of positions and evolving fields without gradients, yielding each bundle as it is made.
+    """Predict `frames` frames of positions and evolving fields without gradients, yielding up to m as they are made.
 
-    Yields:
-        Up to m frames; the last bundle is cut to the frames asked for.
+    Warns if the emulator is in training mode, in which constraints do not act.
 
     Raises:
         ConfigError: if `frames` is negative, or no whole number.
         DataError: if the state or a weight is not finite, or a particle is outside of the domain.
         RolloutStoppedError: if the monitor stops the rollout.
-
-    Warns:
-        UserWarning: if the emulator is in training mode, in which constraints do not act.
     """
     frames = check_whole("frames", frames, 0)
     warn_of_training_mode(emulator)
@@ -203,7 +193,7 @@ def recomputed(emulator: Emulator, particles: Particles, context: RolloutContext
 
 
 def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int) -> Tensor:
-    """Predict `frames` frames with gradients to the state: its positions, velocities, obstacles and gravity.
+    """Predict `frames` frames (B, frames, N, D) with gradients to the state: positions, velocities, obstacles, gravity.
 
     The trajectories of liquids are chaotic: over long rollouts gradients grow without bound and say less and less.
     Optimise over the shortest horizon that the purpose allows, clip gradients, or average them over several slightly
@@ -215,15 +205,7 @@ def differentiable_rollout(emulator: Emulator, particles: Particles, frames: int
         particles: The state to start from, see `Pretrained.state`, which keeps gradients of what it is given.
         frames: How many frames to predict, at least 1.
 
-    Returns:
-        (B, frames, N, D) positions in domain length.
-
-    Raises:
-        ConfigError: if `frames` is below 1, or no whole number.
-        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
-
-    Warns:
-        UserWarning: if the emulator is in training mode, in which constraints do not act.
+    Raises and warns as `stream_rollout`.
     """
     frames = check_whole("frames", frames, 1)
     warn_of_training_mode(emulator)

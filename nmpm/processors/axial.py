@@ -99,7 +99,6 @@ class AxialLayer(nn.Module):
         self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape."""
         *before, last = self.norms
         for norm, attention in zip(before, self.attentions, strict=True):
             hidden = hidden + attention(norm(hidden))
@@ -117,7 +116,6 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape."""
         rows = hidden.movedim((self.axis, 1), (-2, -1))
         query, key, value = self.project(rows).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0).transpose(-2, -3)
         angles = _angles(rows.shape[-2], query.shape[-1] // 2, self.wraps, full_precision(rows[:0]))

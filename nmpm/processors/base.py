@@ -62,18 +62,10 @@ class Processor(ABC):
 
     @abstractmethod
     def build(self, layout: GridLayout) -> GridProcessor:
-        """The network for a layout, freshly initialised from torch's random state.
-
-        Raises:
-            ConfigError: if the hyperparameters cannot make one.
-        """
+        """The network for a layout, of random weights; raises ConfigError if the hyperparameters cannot make one."""
 
     def check_grid(self, grid: Grid) -> None:  # noqa: B027 (a processor without demands need say nothing)
-        """Raise ConfigError for an unsuitable grid, suggesting one that fits. Any grid is accepted unless overridden.
-
-        Raises:
-            ConfigError: if the grid does not suit.
-        """
+        """Raise ConfigError for an unsuitable grid, suggesting one that fits. Unless overridden, any grid is."""
 
 
 def full_precision(grid: Tensor) -> Tensor:

@@ -29,13 +29,7 @@ _POINTWISE = {1: functional.conv1d, 2: functional.conv2d, 3: functional.conv3d}
 class Convolution(nn.Module):
     """A convolution that keeps the grid's size, or divides it by `stride` where its kernel is 2 * stride wide.
 
-    Args:
-        in_channels: C.
-        out_channels: C'.
-        kernel: Cells along each axis.
-        periodic: Whether each axis wraps.
-        stride: Cells from one output to the next.
-        groups: Channels are mixed within groups only; C for a convolution of each channel by itself.
+    Maps (B, C, *S) to (B, C', *S / stride); channels are mixed within `groups` only.
     """
 
     def __init__(
@@ -52,13 +46,12 @@ class Convolution(nn.Module):
         self.convolution = kind(in_channels, out_channels, kernel, stride, zeros, groups=groups)
 
     def forward(self, grid: Tensor) -> Tensor:
-        """Map (B, C, *S) to (B, C', *S / stride)."""
         shape = [cells // self.stride for cells in grid.shape[2:]]
         return crop(self.convolution(_extend(_wrap(grid, self.padding), shape, self.least, self.stride)), shape)
 
 
 class Upsampling(nn.Module):
-    """A transposed convolution, kernel 4, that doubles the grid's size."""
+    """A transposed convolution, kernel 4, that doubles the grid's size: (B, C, *S) → (B, C, *2S)."""
 
     def __init__(self, channels: int, periodic: Sequence[bool]) -> None:
         super().__init__()
@@ -72,7 +65,6 @@ class Upsampling(nn.Module):
         self.convolution = TRANSPOSED[len(periodic)](channels, channels, 4, 2, tuple(cropped))
 
     def forward(self, grid: Tensor) -> Tensor:
-        """Map (B, C, *S) to (B, C, *2S)."""
         shape = [2 * cells for cells in grid.shape[2:]]
         grid = _wrap(grid, self.padding)
         fine = self.convolution(_extend(grid, grid.shape[2:], self.least, 1))
@@ -127,15 +119,9 @@ def crop(fields: Tensor, shape: Sequence[int], first: int = 2) -> Tensor:
 
 
 def check_multiple(grid: Grid, multiple: int, what: str) -> None:
-    """Raise ConfigError for grids that a network which coarsens by `multiple` cannot take.
+    """Raise ConfigError for axes shorter than `multiple` cells, or periodic and no multiple of it.
 
-    Args:
-        grid: The grid.
-        multiple: Cells of the grid in one of the coarsest level.
-        what: The network, for the message, e.g. "a U-Net of depth 3".
-
-    Raises:
-        ConfigError: if an axis is shorter than that, or periodic and not a multiple of it.
+    `what` is the network that coarsens the grid so, for the message, e.g. "a U-Net of depth 3".
     """
     if min(grid.shape) < multiple:
         raise ConfigError(
@@ -151,18 +137,10 @@ def check_multiple(grid: Grid, multiple: int, what: str) -> None:
 
 
 def embed_patches(convolution: nn.Module, grid: Tensor, patch: int) -> Tensor:
-    """Apply a convolution of kernel and stride `patch`, as one product of matrices per patch.
+    """Apply a convolution of kernel and stride `patch`, as a product of matrices: (B, C, *S) → (B, C', *S / patch).
 
     As a strided convolution in bfloat16, oneDNN 3.12 (torch 2.13) returns wrong numbers for kernels of 4 cells and more
     and 8 to 24 channels, on CPUs with AMX.
-
-    Args:
-        convolution: From C to C' channels.
-        grid: (B, C, *S).
-        patch: Cells along each axis.
-
-    Returns:
-        (B, C', *S / patch).
     """
     weight, bias = convolution.get_parameter("weight"), convolution.get_parameter("bias")
     return _multiply(cells_to_channels(grid, patch), weight.flatten(1), bias)

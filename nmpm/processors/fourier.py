@@ -32,7 +32,7 @@ class _Fourier(Processor):
 
 @dataclass(frozen=True)
 class FNO(_Fourier):
-    """Recipe of a Fourier neural operator. It takes any grid, finer and coarser ones than it was trained on too.
+    """Recipe of a Fourier neural operator.
 
     Args:
         modes: Fourier modes kept along each axis.
@@ -47,29 +47,29 @@ class FNO(_Fourier):
     padding: float = 0.125
 
     def build(self, layout: GridLayout) -> GridProcessor:
+        return self._network(layout)
+
+    def _network(self, layout: GridLayout, **weights: Any) -> GridProcessor:
         if min(self.modes, self.width, self.layers) < 1 or not 0 <= self.padding < 1:
-            raise ConfigError(f"FNO needs modes, width and layers >= 1 and 0 <= padding < 1; got {self}.")
-        return FNONetwork(self, layout, {})
+            name = type(self).__name__
+            raise ConfigError(f"{name} needs modes, width and layers >= 1 and 0 <= padding < 1; got {self}.")
+        return FNONetwork(self, layout, weights)
 
 
 @dataclass(frozen=True)
 class TFNO(FNO):
-    """Recipe of a Fourier neural operator whose weights are Tucker factors: as many modes at a part of the parameters.
+    """Recipe of an `FNO` whose weights are Tucker factors: as many modes at a part of the parameters.
 
     Args:
-        modes: Fourier modes kept along each axis.
-        width: Hidden channels.
-        layers: Number of Fourier layers.
-        padding: Share of each wall axis by which the grid is extended, so that it need not be periodic.
-        rank: Parameters of the factors over those of the whole weights, about.
+        rank: Parameters of the factors over those of the whole weights, about; the others as of `FNO`.
     """
 
     rank: float = 0.1
 
     def build(self, layout: GridLayout) -> GridProcessor:
-        if min(self.modes, self.width, self.layers) < 1 or not 0 <= self.padding < 1 or not 0 < self.rank <= 1:
-            raise ConfigError(f"TFNO needs modes, width, layers >= 1, 0 <= padding < 1 and 0 < rank <= 1; got {self}.")
-        return FNONetwork(self, layout, {"factorization": "tucker", "rank": self.rank})
+        if not 0 < self.rank <= 1:
+            raise ConfigError(f"TFNO needs 0 < rank <= 1; got {self}.")
+        return self._network(layout, factorization="tucker", rank=self.rank)
 
 
 class FNONetwork(GridProcessor):
@@ -120,7 +120,7 @@ def _without_metadata(_module: nn.Module, state: dict[str, Any], _prefix: str, _
 
 @dataclass(frozen=True)
 class FFNO(_Fourier):
-    """Recipe of a factorised Fourier neural operator, whose weights grow with one axis only. It takes any grid.
+    """Recipe of a factorised Fourier neural operator, whose weights grow with one axis only.
 
     Args:
         modes: Fourier modes kept along each axis.
@@ -153,11 +153,8 @@ class FFNONetwork(GridProcessor):
         self.periodic = layout.periodic
         self.first = kind(layout.in_channels + layout.dim, recipe.width, 1)
         self.layers = nn.ModuleList(SpectralLayer(recipe, layout.dim) for _ in range(recipe.layers))
-        self.last = nn.Sequential(
-            kind(recipe.width, 2 * recipe.width, 1),
-            nn.SiLU(),
-            kind(2 * recipe.width, layout.frames * layout.out_channels, 1),
-        )
+        wide, outputs = 2 * recipe.width, layout.frames * layout.out_channels
+        self.last = nn.Sequential(kind(recipe.width, wide, 1), nn.SiLU(), kind(wide, outputs, 1))
 
     def forward(self, grid: Tensor) -> Tensor:
         shape = grid.shape[2:]
@@ -186,7 +183,6 @@ class SpectralLayer(nn.Module):
         self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape."""
         with torch.autocast(hidden.device.type, enabled=False):
             full = full_precision(hidden)
             mixed = torch.stack([self._along(full, axis) for axis in range(self.dim)]).sum(0)

@@ -25,10 +25,7 @@ class Patched(Processor):
 
     Args:
         processor: The recipe of the network on the coarse grid.
-        patch: Cells of a patch along each axis.
-
-    Raises:
-        ConfigError: if the processor is not known, or the patch smaller than a cell.
+        patch: Cells of a patch along each axis, at least 1.
     """
 
     processor: Processor = UNet(width=32, depth=2, perceptron=(32,))  # noqa: RUF009 (frozen)
@@ -52,12 +49,7 @@ class Patched(Processor):
 
 
 class PatchedNetwork(GridProcessor):
-    """Patches to channels, the network, channels back to patches.
-
-    Args:
-        patch: Cells of a patch along each axis.
-        network: Maps (B, C_in * patch ** D, *S / patch) to (B, m, C_out * patch ** D, *S / patch).
-    """
+    """Patches to channels, the network on (B, C_in * patch ** D, *S / patch), channels back to patches."""
 
     def __init__(self, patch: int, network: GridProcessor) -> None:
         super().__init__()

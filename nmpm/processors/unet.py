@@ -52,8 +52,7 @@ class UNetNetwork(GridProcessor):
     def __init__(self, recipe: UNet, layout: GridLayout) -> None:
         super().__init__()
         width, periodic = recipe.width, layout.periodic
-        self.alignment = 2**recipe.depth
-        reach = recipe.kernel // 2
+        self.alignment, reach = 2**recipe.depth, recipe.kernel // 2
         self.radius = ushape_radius(recipe.depth, level=reach, bottom=2 * reach, between=3)
         hidden = recipe.perceptron
         self.encoder = pointwise([layout.in_channels, *hidden, width], layout.dim)

@@ -21,9 +21,11 @@ from nmpm.grid import Grid
 from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution, check_multiple, crop, pad_to_multiple
 
+Modules = Iterable[nn.Module]
+
 
 class UShape(nn.Module):
-    """Levels of which each works on a grid half as fine as the one before.
+    """Levels of which each works on a grid half as fine as the one before; sides are multiples of the coarsest cell.
 
     Args:
         down: What each level does on the way down, the finest first.
@@ -32,19 +34,12 @@ class UShape(nn.Module):
         refine: Back from the next level's grid to each, likewise.
     """
 
-    def __init__(
-        self,
-        down: Iterable[nn.Module],
-        coarsen: Iterable[nn.Module],
-        up: Iterable[nn.Module],
-        refine: Iterable[nn.Module],
-    ) -> None:
+    def __init__(self, down: Modules, coarsen: Modules, up: Modules, refine: Modules) -> None:
         super().__init__()
         self.down, self.coarsen = nn.ModuleList(down), nn.ModuleList(coarsen)
         self.up, self.refine = nn.ModuleList(up), nn.ModuleList(refine)
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape; each side of S a multiple of 2 ** (levels - 1)."""
         hidden = self.down[0](hidden)
         skips: list[Tensor] = []
         for coarsen, level in zip(self.coarsen, list(self.down)[1:], strict=True):
@@ -66,10 +61,6 @@ def ushape_radius(depth: int, level: int, bottom: int, between: int) -> int:
     """
     coarsest = 1 << depth
     return (coarsest - 1) * (2 * level + between) + coarsest * bottom
-
-
-def _upsample_nearest() -> nn.Module:
-    return nn.Upsample(scale_factor=2.0, mode="nearest")
 
 
 @dataclass(frozen=True)
@@ -128,7 +119,7 @@ class UNetModernNetwork(GridProcessor):
             coarsen=[Convolution(fine, coarse, 4, periodic, stride=2) for fine, coarse in pairwise(widths)],
             up=map(level, widths[:-1]),
             refine=[
-                nn.Sequential(_upsample_nearest(), Convolution(coarse, fine, kernel, periodic))
+                nn.Sequential(nn.Upsample(scale_factor=2.0), Convolution(coarse, fine, kernel, periodic))
                 for fine, coarse in pairwise(widths)
             ],
         )
@@ -152,7 +143,6 @@ class ResidualBlock(nn.Module):
         self.norms = nn.ModuleList(nn.GroupNorm(groups, width) if groups else nn.Identity() for _ in range(2))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape."""
         change = hidden
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
             change = convolution(functional.silu(norm(change)))
@@ -205,7 +195,7 @@ class ConvNeXtNetwork(GridProcessor):
             down=[level() for _ in range(depth + 1)],
             coarsen=[Convolution(width, width, 4, periodic, stride=2) for _ in range(depth)],
             up=[level() for _ in range(depth)],
-            refine=[nn.Sequential(kind(width, width, 1), _upsample_nearest()) for _ in range(depth)],
+            refine=[nn.Sequential(kind(width, width, 1), nn.Upsample(scale_factor=2.0)) for _ in range(depth)],
         )
         self.last = kind(width, layout.frames * layout.out_channels, 1)
 
@@ -227,7 +217,6 @@ class ConvNeXtBlock(nn.Module):
         self.perceptron = nn.Sequential(kind(width, wide, 1), nn.SiLU(), kind(wide, width, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape."""
         change: Tensor = self.perceptron(self.norm(self.spatial(hidden)))
         return hidden + change
 
@@ -243,7 +232,6 @@ class ChannelNorm(nn.Module):
         self.scale = nn.Parameter(torch.ones(width, *(1,) * dim))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        """Map (B, C, *S) to the same shape."""
         # Squares of half precision overflow; the floor keeps empty cells at zero.
         inverse = (full_precision(hidden).square().mean(dim=1, keepdim=True) + 1e-6).rsqrt()
         return hidden * inverse.to(hidden.dtype) * self.scale

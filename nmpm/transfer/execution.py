@@ -63,11 +63,7 @@ def in_order(source: Tensor, index: Tensor, size: int) -> Tensor:
 
 
 def by_torch_scatter(source: Tensor, index: Tensor, size: int) -> Tensor:
-    """The sum of the package torch-scatter.
-
-    Raises:
-        ConfigError: if it is not installed, or made for another torch.
-    """
+    """The sum of the package torch-scatter; raises ConfigError if it is not installed, or made for another torch."""
     try:
         import torch_scatter
     except (ImportError, OSError) as error:
@@ -89,12 +85,9 @@ _kernels: ContextVar[bool] = ContextVar("nmpm_kernels", default=True)
 
 @contextmanager
 def scatter_backend(name: str) -> Iterator[None]:
-    """Choose the scatter-add backend of tensor operations within a `with` block; kernels have sums of their own.
+    """Choose the scatter-add backend of tensor operations within a `with` block; raises ConfigError for unknown names.
 
     Outside, it is "sorted" if torch is to be deterministic and the device's own sum is not, else "native".
-
-    Raises:
-        ConfigError: if there is none of that name.
     """
     if name not in BACKENDS:
         raise ConfigError(f"No transfer backend is called {name!r}; there are {', '.join(BACKENDS)}.")

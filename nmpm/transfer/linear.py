@@ -48,15 +48,12 @@ class Linear(Transfer):
     def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
         return linear_stencil(cells, grid)
 
-    def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
-        return linear_stencil(cells, grid)
-
     def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         return linear_g2p(field, cells, grid)
 
 
 @dataclass(frozen=True)
-class Nearest(Transfer):
+class Nearest(Linear):
     """The paper's pair: p2g averages the particles in each voxel, g2p is linear interpolation.
 
     p2g is piecewise constant in the positions, so no gradient flows through it to them; the pair is not adjoint.
@@ -68,6 +65,3 @@ class Nearest(Transfer):
 
     def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
         return linear_stencil(cells, grid)
-
-    def g2p(self, field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
-        return linear_g2p(field, cells, grid)

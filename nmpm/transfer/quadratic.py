@@ -62,9 +62,6 @@ class Quadratic(Transfer):
     def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
         return quadratic_stencil(cells, grid)
 
-    def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
-        return quadratic_stencil(cells, grid)
-
 
 @dataclass(frozen=True)
 class Affine(Quadratic):
@@ -73,9 +70,6 @@ class Affine(Quadratic):
     Args:
         damping: Added to the particles' variance about each node, in cells², so that a few particles in a row or close
             together do not fit steep slopes to their noise. With 0 linear fields are exact to rounding.
-
-    Raises:
-        ConfigError: if the damping is negative.
     """
 
     damping: float = 1e-3
@@ -93,8 +87,9 @@ class Affine(Quadratic):
         gradient = _own(slope, count, membership, stencil)
         at_nodes = velocity.unsqueeze(2) + torch.einsum("bnde,bnje->bnjd", gradient, offset)
         values = torch.einsum("bnm,bnjd->bnjmd", membership, at_nodes).flatten(-2)
-        momentum = _scattered(stencil, values, grid.size)
-        return _on_grid(momentum, grid), _on_grid(count, grid)
+        sums = (_scattered(stencil, values, grid.size), count)
+        momentum, number = (each.transpose(1, 2).reshape(len(each), -1, *grid.shape) for each in sums)
+        return momentum, number
 
     def _slopes(
         self, velocity: Tensor, membership: Tensor, stencil: Stencil, apart: Tensor, grid: Grid
@@ -119,10 +114,8 @@ class Affine(Quadratic):
         covariance = (product_sum / total).unflatten(-1, (dim, dim)) - flow.unsqueeze(-1) * mean.unsqueeze(-2)
         # Rounding must not make a variance singular where all particles are in one apart.
         floor = max(self.damping, 16 * torch.finfo(velocity.dtype).eps)
-        inverse = torch.linalg.inv_ex(variance + floor * torch.eye(dim, dtype=variance.dtype, device=variance.device))[
-            0
-        ]
-        return covariance @ inverse, count.squeeze(-1)
+        damped = variance + floor * torch.eye(dim, dtype=variance.dtype, device=variance.device)
+        return covariance @ torch.linalg.inv_ex(damped).inverse, count.squeeze(-1)
 
 
 def _own(slope: Tensor, count: Tensor, membership: Tensor, stencil: Stencil) -> Tensor:
@@ -145,7 +138,3 @@ def _scattered(stencil: Stencil, values: Tensor, size: int) -> Tensor:
     """Sum values (B, N, J, C) that differ from node to node, (B, size, C)."""
     one_each = Stencil(stencil.node.flatten(1).unsqueeze(-1), stencil.weight.flatten(1).unsqueeze(-1))
     return scatter(one_each, values.flatten(1, 2), size)
-
-
-def _on_grid(sums: Tensor, grid: Grid) -> Tensor:
-    return sums.transpose(1, 2).reshape(sums.shape[0], -1, *grid.shape)

@@ -31,15 +31,15 @@ class Stencil:
 
 
 class Transfer(ABC):
-    """A pair of kernels between particles and grid. Subclasses are stateless and give the two stencils."""
+    """A pair of kernels between particles and grid. Subclasses are stateless and give their stencils."""
 
     @abstractmethod
     def scatter_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
         """Nodes and weights for p2g of particles at `cells` (B, N, D)."""
 
-    @abstractmethod
     def gather_stencil(self, cells: Tensor, grid: Grid) -> Stencil:
-        """Nodes and weights for g2p at `cells` (B, N, D)."""
+        """Nodes and weights for g2p at `cells` (B, N, D); unless overridden, those of p2g."""
+        return self.scatter_stencil(cells, grid)
 
     def p2g(self, values: Tensor, cells: Tensor, grid: Grid) -> Tensor:
         """Sum particle values (B, N, C) at `cells` (B, N, D) onto the nodes, (B, C, *S)."""
@@ -55,16 +55,9 @@ class Transfer(ABC):
         return self.sums(velocity, membership, cells, grid)
 
     def sums(self, values: Tensor, membership: Tensor, cells: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-        """Sums of values over the particles of each material, and their numbers, on the nodes.
+        """Sums (B, M V, *S) of values (B, N, V) over each material's particles, and their numbers (B, M, *S).
 
-        Args:
-            values: (B, N, V).
-            membership: (B, N, M), one at a particle's material and zero elsewhere; all zero for padding.
-            cells: (B, N, D).
-            grid: The grid.
-
-        Returns:
-            (B, M V, *S) sums, all values of a material together, and (B, M, *S) numbers.
+        `membership` (B, N, M) is one at a particle's material and zero elsewhere; all zero for padding.
         """
         by_material = (membership.unsqueeze(-1) * values.unsqueeze(-2)).flatten(-2)
         sums = self.p2g(torch.cat([by_material, membership], dim=-1), cells, grid)
@@ -98,10 +91,8 @@ def gather(stencil: Stencil, field: Tensor) -> Tensor:
 def tensor_product(base: Tensor, weights: list[Tensor], grid: Grid) -> Stencil:
     """The stencil of K ** D nodes of a kernel that is a product over axes.
 
-    Args:
-        base: (B, N, D) int64, lowest node touched along each axis, before folding or wrapping.
-        weights: K tensors (B, N, D): the one-dimensional weights of nodes base, base + 1, … along each axis.
-        grid: Gives shape and which axes wrap.
+    Along each axis the K tensors of `weights` (B, N, D) are those of the nodes base, base + 1, … with `base` (B, N, D)
+    int64 not yet folded or wrapped.
     """
     batch, count, dim = base.shape
     node = base.new_zeros(batch, count, 1)

@@ -20,7 +20,7 @@ from nmpm._support.threads import for_each
 from nmpm.emulator.fused.arrays import as_array, as_copy, as_grid, check_materials, material_rows
 from nmpm.emulator.fused.parameters import Array, KernelParameters
 from nmpm.emulator.fused.path import find_path
-from nmpm.emulator.fused.state import StartArrays, output_arrays, rasterise
+from nmpm.emulator.fused.state import StartArrays, output_array, rasterise, unpack
 from nmpm.transfer.fused.gather import gather_adjoint
 from nmpm.transfer.fused.scatter import scatter_adjoint
 
@@ -52,19 +52,19 @@ class Rasterise(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients with respect to positions and velocities, from those with respect to cells, moved and state."""
-        own: KernelParameters = ctx.parameters
+        parameters: KernelParameters = ctx.parameters
         cells, moved, state, material, mask = ctx.saved_tensors
-        grad_cells, grad_moved, channels = as_copy(grads[0]), as_copy(grads[1]), own.volume_channels[1]
+        grad_cells, grad_moved, channels = as_copy(grads[0]), as_copy(grads[1]), parameters.volume_channels[1]
         grad_state = as_copy(grads[3][:, :channels].movedim(1, -1)).reshape(len(cells), -1, channels)
         rows = as_array(state.movedim(1, -1)).reshape(*grad_state.shape[:2], -1)
-        inputs = as_array(moved), material_rows(material, len(own.mass)), as_array(mask), as_array(cells)
-        volume = np.float32(own.particle_volume)
+        inputs = as_array(moved), material_rows(material, len(parameters.mass)), as_array(mask), as_array(cells)
+        volume = np.float32(parameters.particle_volume)
 
         def follow(b: int) -> None:
             speeds, kind, real, here = (values[b] for values in inputs)
             rasterise_back(
-                speeds, kind, real, here, own.grid, rows[b], volume, own.box, grad_state[b], grad_cells[b],
-                grad_moved[b],
+                speeds, kind, real, here, parameters.grid, rows[b], volume, parameters.box, grad_state[b],
+                grad_cells[b], grad_moved[b],
             )  # fmt: skip
 
         for_each(follow, len(cells), torch.get_num_threads())
@@ -94,24 +94,24 @@ class FreePath(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients with respect to cells, velocity, state and output."""
-        own: KernelParameters = ctx.parameters
+        parameters: KernelParameters = ctx.parameters
         *tensors, positions = ctx.saved_tensors
         output, scale = tensors[-2:]
-        (start, fields), path = _to_arrays(own, *tensors), as_array(positions)
+        (start, fields), path = _to_arrays(parameters, *tensors), as_array(positions)
         grad_cells, grad_velocity = np.zeros((2, *start.cells.shape), np.float32)
         grad_state, grad_fields = np.zeros_like(start.state), np.zeros_like(fields)
 
         def follow(b: int) -> None:
             cells, _, _, material, mask, state = start.scene(b)
             path_back(
-                cells, material, mask, own.grid, state, fields[b], own.decoder, own.bounds, path[b], as_copy(grad[b]),
-                grad_cells[b], grad_velocity[b], grad_state[b], grad_fields[b],
+                cells, material, mask, parameters.grid, state, fields[b], parameters.decoder, parameters.bounds,
+                path[b], as_copy(grad[b]), grad_cells[b], grad_velocity[b], grad_state[b], grad_fields[b],
             )  # fmt: skip
 
         for_each(follow, len(path), torch.get_num_threads())
-        to_output = torch.from_numpy(grad_fields).movedim(-1, 2).unflatten(3, own.shape)
+        to_output = torch.from_numpy(grad_fields).movedim(-1, 2).unflatten(3, parameters.shape)
         back = torch.from_numpy(grad_cells), torch.from_numpy(grad_velocity), None, None, None
-        return None, *back, as_grid(grad_state, own.shape), (to_output * scale).to(output.dtype), None
+        return None, *back, as_grid(grad_state, parameters.shape), (to_output * scale).to(output.dtype), None
 
 
 def _to_arrays(
@@ -122,7 +122,7 @@ def _to_arrays(
     rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
     kinds, pull = material_rows(material, len(parameters.mass)), as_array(gravity)[:, 0]
     fields = np.empty((*output.shape[:2], rows.shape[1], output.shape[2]), np.float32)
-    (predicted, unpack), factors = output_arrays(output), as_array(scale).reshape(-1)
+    predicted, factors = output_array(output), as_array(scale).reshape(-1)
     for_each(lambda b: unpack(predicted[b], factors, fields[b]), len(fields), torch.get_num_threads())
     return StartArrays(as_array(cells), as_array(velocity), pull, kinds, as_array(mask), rows), fields
 
@@ -134,14 +134,7 @@ def path_back(
 ) -> Any:  # fmt: skip
     """Add the gradients of what `find_path` starts from; a position stopped at a bound, or of padding, passes none.
 
-    Args:
-        cells, material, mask, grid, state, fields, bounds, path: As in `nmpm.emulator.fused`.
-        decoder: As in `KernelParameters`.
-        grad_path: (m, N, D); is overwritten.
-        grad_cells: (N, D), is added to.
-        grad_velocity: (N, D); holds zeros.
-        grad_state: (size, C), is added to.
-        grad_fields: (m, size, C), is added to.
+    `grad_path` is overwritten; `grad_velocity` must hold zeros; the others are added to.
     """
     carries = decoder[3] > ZERO
     for frame in range(len(path) - 1, -1, -1):
@@ -180,14 +173,8 @@ def rasterise_back(
 ) -> Any:  # fmt: skip
     """Turn gradients with respect to cells and velocities in cells into those in domain length, the state's added.
 
-    Args:
-        moved: (N, D) velocities in cells.
-        material, mask, cells, grid, state: As in `nmpm.emulator.fused`.
-        particle_volume: In cells.
-        box: (2, D) the grid's lower corner and the cells' widths, in domain length.
-        grad_state: (size, M D + M), with respect to the first channels of the state; is overwritten.
-        grad_cells: (N, D), is changed.
-        grad_moved: (N, D), is changed.
+    `moved` are the velocities (N, D) in cells, `grad_state` (size, M D + M) is of the state's first channels; all three
+    gradients are changed.
     """
     width = moved.shape[1]
     materials = grad_state.shape[1] // (width + 1)

@@ -22,7 +22,7 @@ from nmpm.emulator.fused.parameters import Array, KernelParameters
 from nmpm.emulator.fused.path import CHUNK, find_path
 from nmpm.emulator.fused.rest import bring_to_rest
 from nmpm.emulator.fused.solids import SolidCache, prepare_solids
-from nmpm.emulator.fused.state import StartArrays, normalise, output_arrays, rasterise
+from nmpm.emulator.fused.state import StartArrays, normalise, output_array, rasterise, unpack
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
@@ -40,13 +40,7 @@ def predict(emulator: Emulator, parameters: KernelParameters, particles: Particl
 
 
 class KernelCall:
-    """The parts of one call of an emulator.
-
-    Args:
-        emulator: In evaluation mode.
-        parameters: Of the emulator.
-        context: Of the rollout.
-    """
+    """The parts of one call of an emulator in evaluation mode."""
 
     def __init__(self, emulator: Emulator, parameters: KernelParameters, context: RolloutContext) -> None:
         self._emulator, self._parameters, self._context = emulator, parameters, context
@@ -54,12 +48,12 @@ class KernelCall:
 
     def rasterise(self, particles: Particles) -> StartArrays:
         """Particles in grid units, and the grid state."""
-        cached, own = self._cache.array, particles
-        single = len(self._parameters.mass) == 1
-        kinds = np.empty((len(own.position), 0), np.int64) if single else cached("material", own.material)
+        cached, single = self._cache.array, len(self._parameters.mass) == 1
+        kinds = np.empty((len(particles.position), 0), np.int64) if single else cached("material", particles.material)
         return rasterise(
-            self._parameters, as_array(own.position), as_array(own.velocity), cached("gravity", own.gravity), kinds,
-            cached("mask", own.mask), cached("solid", self._context.solid),
+            self._parameters, as_array(particles.position), as_array(particles.velocity),
+            cached("gravity", particles.gravity), kinds, cached("mask", particles.mask),
+            cached("solid", self._context.solid),
         )  # fmt: skip
 
     def normalise(self, start: StartArrays) -> Tensor:
@@ -72,34 +66,32 @@ class KernelCall:
     def path(self, start: StartArrays, output: Tensor) -> Array:
         """(B, m, N, D) positions in cells, as `Advection.constrained_path` of an output (B, m, C, *S).
 
-        Raises:
-            IndexError: if a particle's material is none of the scene's.
+        Raises IndexError if a particle's material is none of the scene's.
         """
-        own, (batch, count, dim), frames = self._parameters, start.cells.shape, output.shape[1]
-        check_materials(own, start.material)
+        parameters, (batch, count, dim), frames = self._parameters, start.cells.shape, output.shape[1]
+        check_materials(parameters, start.material)
         path = np.empty((batch, frames, count, dim), np.float32)  # asks for huge pages, which a fresh tensor does not
-        fields = np.empty((frames, own.size, output.shape[2]), np.float32)
-        predicted, unpack = output_arrays(output)
-        scale, threads = self._statistic("output_scale"), torch.get_num_threads()
+        fields = np.empty((frames, parameters.size, output.shape[2]), np.float32)
+        predicted, scale, threads = output_array(output), self._statistic("output_scale"), torch.get_num_threads()
         for b in range(batch):
             unpack(predicted[b], scale, fields)
             scene, solids = start.scene(b), self._solids[b]
-            find_path(scene, fields, own, self._budget(b), path[b], threads)
-            if own.obstacles and own.solids:
-                keep_clear(scene, own, solids, path[b], threads)
-            if own.rest_speed:
-                bring_to_rest(scene, own, solids.obstacle, path[b], threads)
+            find_path(scene, fields, parameters, self._budget(b), path[b], threads)
+            if parameters.obstacles and parameters.solids:
+                keep_clear(scene, parameters, solids, path[b], threads)
+            if parameters.rest_speed:
+                bring_to_rest(scene, parameters, solids.obstacle, path[b], threads)
         return path
 
     def finish(self, start: StartArrays, path: Array) -> Bundle:
         """The bundle of a path, whose memory is used for it: fresh memory would take longer than the conversion."""
-        own, threads = self._parameters, torch.get_num_threads()
-        velocity = (path[:, -1] - (path[:, -2] if path.shape[1] > 1 else start.cells)) * own.box[1]
+        parameters, threads = self._parameters, torch.get_num_threads()
+        velocity = (path[:, -1] - (path[:, -2] if path.shape[1] > 1 else start.cells)) * parameters.box[1]
         for b, frames in enumerate(path):
-            if own.density_cap:
+            if parameters.density_cap:
                 # Spreading is no motion of the material: the velocity is that of the path without it.
-                spread_crowds(start.scene(b), frames, own, self._solids[b], self._budget(b), threads)
-            map_ranges(partial(to_length, frames, own.box), split(frames.shape[1], CHUNK), threads)
+                spread_crowds(start.scene(b), frames, parameters, self._solids[b], self._budget(b), threads)
+            map_ranges(partial(to_length, frames, parameters.box), split(frames.shape[1], CHUNK), threads)
         return Bundle(torch.from_numpy(path), torch.from_numpy(velocity))
 
     def _statistic(self, name: str) -> Any:
@@ -119,8 +111,8 @@ class KernelCall:
 def to_length(path: Any, box: Any, low: Any, high: Any) -> Any:
     """Convert a path to domain length in place, by the (2, D) `box`."""
     for frame in range(len(path)):
-        own = path[frame, low:high]  # a slice, as Numba's check for negative indices is slow
-        for d in range(own.shape[1]):
+        here = path[frame, low:high]  # a slice, as Numba's check for negative indices is slow
+        for d in range(here.shape[1]):
             lowest, width = box[0, d], box[1, d]
-            for p in range(len(own)):
-                own[p, d] = own[p, d] * width + lowest
+            for p in range(len(here)):
+                here[p, d] = here[p, d] * width + lowest

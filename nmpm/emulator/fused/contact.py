@@ -127,7 +127,6 @@ def follow(
     """Find where particles first get too deep into an obstacle.
 
     Args:
-        cells, path, obstacle, grid: As in `nmpm.emulator.fused`.
         pieces: Into how many each frame is cut.
         rows: (n,) the particles.
         free: (n,), is filled: pieces before that.

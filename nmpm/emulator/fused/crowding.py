@@ -32,16 +32,7 @@ def spread_crowds(
     start: StartArrays, path: Array, parameters: KernelParameters, solids: SolidCache, budget: float | None,
     threads: int,
 ) -> None:  # fmt: skip
-    """Change the path of a scene so that its overfull cells spread, as far as its energy allows.
-
-    Args:
-        start: Where the path starts.
-        path: Is changed.
-        parameters: Of an emulator with a density cap.
-        solids: Of the scene.
-        budget: Energy that no frame may exceed; None for no such limit.
-        threads: How many work.
-    """
+    """Change the path of a scene so that its overfull cells spread, within the energy `budget` if there is one."""
     flow = _find_flow(start, path, parameters, solids.free, threads)
     if flow is None:
         return
@@ -72,10 +63,7 @@ def _find_flow(
 def _affordable_share(
     start: StartArrays, path: Array, spread: Array, parameters: KernelParameters, budget: float, threads: int
 ) -> float:
-    """The part of the way from the path to the spread one that no frame's energy forbids.
-
-    As `nmpm.emulator.constraints.affordable_share`.
-    """
+    """The part of the way to the spread path that no frame's energy forbids, see `constraints.affordable_share`."""
     mass = np.empty(len(start.cells), np.float32)
     fill_mass(start.material, start.mask, parameters.mass, mass)
 
@@ -185,13 +173,9 @@ def _add_difference(entering: Any, leaving: Any, left: Any) -> Any:
 def drift(
     flow: Any, path: Any, mask: Any, obstacle: Any, grid: Any, bounds: Any, spread: Any, low: Any, high: Any
 ) -> Any:
-    """Fill in the path with the displacement at its end spread evenly over its frames.
+    """Fill in `spread` (m, N, D), the path with the displacement by `flow` (size, D) at its end spread over its frames.
 
-    Args:
-        flow: (size, D), from `push`.
-        path, mask, grid, bounds, low, high: As in `nmpm.emulator.fused`; padding stays.
-        obstacle: Likewise; nobody is spread into it.
-        spread: (m, N, D), is filled.
+    Padding stays, and nobody is spread into the obstacle.
     """
     frames, dim = path.shape[0], path.shape[2]
     shift, only = np.empty((BLOCK, dim), np.float32), np.empty(0, np.int64)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -46,11 +44,14 @@ class KernelParameters:
         shape, wraps: Cells along each axis, and whether it is periodic.
         box: (2, D) the grid's lower corner and the cells' widths, in domain length.
         bounds, ratio: As in `nmpm.emulator.fused`.
-        p2g_nodes, g2p_nodes: Nodes along an axis of the kernels of p2g and g2p.
+        grid, p2g_grid, g2p_grid: Shape and periodic axes, with as many steps as the kernel has nodes along an axis.
+        size: Number of cells.
         particle_volume: In cells.
         mass: (M,) of a particle of each material.
-        solid: Whether the grid state has a solid channel.
-        constants: Whether gravity is among its channels.
+        channels: Number of channels of the grid state.
+        volume_channels: Its first one that is a volume fraction, and the one after the last.
+        solid: Whether it has a solid channel.
+        constants: Whether gravity is among them.
         decoder: Shares of the particle's own and of the grid's velocity in the one at the start, and of gravity; 1 if
             each frame's velocity is carried to the next.
         rest_speed: Cells per frame; 0 for none.
@@ -58,6 +59,9 @@ class KernelParameters:
         solids: Whether particles must keep clear of them.
         floors: (D, 2) int64, as `nmpm.emulator.support.floor_rows`.
         density_cap: Volume fraction above which cells are overfull; 0 for no cap.
+        trains: Whether trainings take the kernels with gradients, see `nmpm.emulator.fused.autograd`. Not in three
+            dimensions: beside them torch's strided 3-D convolutions in bfloat16 sometimes got weights' gradients of
+            unset memory (torch 2.13, CPU with AVX-512), which they do not beside tensor operations.
     """
 
     shape: tuple[int, ...]
@@ -65,10 +69,14 @@ class KernelParameters:
     box: Array
     bounds: Array
     ratio: Array
-    p2g_nodes: int
-    g2p_nodes: int
+    grid: tuple[Any, ...]
+    p2g_grid: tuple[Any, ...]
+    g2p_grid: tuple[Any, ...]
+    size: int
     particle_volume: float
     mass: Array
+    channels: int
+    volume_channels: tuple[int, int]
     solid: bool
     constants: bool
     decoder: tuple[np.float32, ...]
@@ -77,45 +85,7 @@ class KernelParameters:
     solids: bool
     floors: Array
     density_cap: float
-
-    @cached_property
-    def grid(self) -> tuple[Any, ...]:
-        """Shape and periodic axes."""
-        return self.shape, self.wraps
-
-    @cached_property
-    def p2g_grid(self) -> tuple[Any, ...]:
-        """Shape, periodic axes and steps of p2g."""
-        return self.shape, self.wraps, (0,) * self.p2g_nodes
-
-    @cached_property
-    def g2p_grid(self) -> tuple[Any, ...]:
-        """Shape, periodic axes and steps of g2p."""
-        return self.shape, self.wraps, (0,) * self.g2p_nodes
-
-    @cached_property
-    def size(self) -> int:
-        """Number of cells."""
-        return math.prod(self.shape)
-
-    @cached_property
-    def volume_channels(self) -> tuple[int, int]:
-        """The grid state's first channel that is a volume fraction, and the one after the last."""
-        return len(self.mass) * len(self.shape), len(self.mass) * (len(self.shape) + 1)
-
-    @cached_property
-    def channels(self) -> int:
-        """Number of channels of the grid state."""
-        return self.volume_channels[1] + self.solid + len(self.shape) * self.constants
-
-    @property
-    def trains(self) -> bool:
-        """Whether trainings take the kernels with gradients, see `nmpm.emulator.fused.autograd`.
-
-        Not in three dimensions: beside them torch's strided 3-D convolutions in bfloat16 sometimes got weights'
-        gradients of unset memory (torch 2.13, CPU with AVX-512), which they do not beside tensor operations.
-        """
-        return len(self.shape) == 2 and self.p2g_nodes == self.g2p_nodes == 2 and not self.bounds[2].any()
+    trains: bool
 
 
 def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
@@ -131,16 +101,21 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
     low, high = np.where(grid.periodic, -np.inf, low), np.where(grid.periodic, np.inf, high)
     ratio = spacing / spacing[0]
     is_square = np.all(np.abs(ratio - 1) < 1e-6)
+    volumes = len(scene.materials) * scene.dim, len(scene.materials) * (scene.dim + 1)
     return KernelParameters(
         shape=grid.shape,
         wraps=grid.periodic,
         box=np.array((grid.lower, grid.spacing), np.float32),
         bounds=np.array((low, high, np.full(scene.dim, constraints.bounds == "reflect")), np.float32),
         ratio=np.where(is_square, 1.0, ratio).astype(np.float32),
-        p2g_nodes=_P2G_NODES[transfer],
-        g2p_nodes=_G2P_NODES[transfer],
+        grid=(grid.shape, grid.periodic),
+        p2g_grid=(grid.shape, grid.periodic, (0,) * _P2G_NODES[transfer]),
+        g2p_grid=(grid.shape, grid.periodic, (0,) * _G2P_NODES[transfer]),
+        size=grid.size,
         particle_volume=scene.particle_volume / grid.cell_volume,
         mass=np.array(scene.densities or (1.0,) * len(scene.materials), np.float32),
+        channels=volumes[1] + scene.walled + scene.dim * scene.gravity_varies,
+        volume_channels=volumes,
         solid=scene.walled,
         constants=scene.gravity_varies,
         decoder=tuple(map(np.float32, _DECODERS[decoder](recipe.decoder))),
@@ -149,4 +124,5 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
         solids=constraints.solids,
         floors=np.array(floor_rows(scene, grid), np.int64),
         density_cap=constraints.density_cap,
+        trains=scene.dim == 2 and transfer is Linear and constraints.bounds == "stop",
     )

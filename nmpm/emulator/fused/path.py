@@ -34,24 +34,16 @@ ZERO, HALF = np.float32(0), np.float32(0.5)
 def find_path(
     start: StartArrays, fields: Array, parameters: KernelParameters, budget: float | None, path: Array, threads: int
 ) -> None:
-    """Fill in the path of a scene within the bounds.
-
-    Args:
-        start: The scene's particles and grid state.
-        fields: What the network predicts.
-        parameters: Of the emulator.
-        budget: Energy that no frame may exceed; None for no such limit.
-        path: Is filled.
-        threads: How many work.
-    """
-    own, ranges = parameters, split(len(start.cells), CHUNK)
+    """Fill in the path of a scene within the bounds, and within the energy `budget` if there is one."""
+    grid, decoder, bounds, ratio = parameters.g2p_grid, parameters.decoder, parameters.bounds, parameters.ratio
+    ranges = split(len(start.cells), CHUNK)
     mass = np.empty(0 if budget is None else len(start.cells), np.float32)
     if budget is not None:
-        fill_mass(start.material, start.mask, own.mass, mass)
+        fill_mass(start.material, start.mask, parameters.mass, mass)
     carried = np.empty_like(start.cells)
     move = partial(
-        free_path, start.cells, start.velocity, start.material, start.gravity, mass, own.g2p_grid, start.state, fields,
-        own.decoder, own.bounds, own.ratio, carried, path,
+        free_path, start.cells, start.velocity, start.material, start.gravity, mass, grid, start.state, fields,
+        decoder, bounds, ratio, carried, path,
     )  # fmt: skip
     energies = map_ranges(move, ranges, threads)
     if budget is None or not energies:
@@ -60,13 +52,13 @@ def find_path(
     exceeds = (frame for frame, energy in enumerate(sum(energies[1:], energies[0]).tolist()) if energy > limit)
     for frame in range(next(exceeds, len(path)), len(path)):
         propose = partial(
-            propose_frame, start.cells, start.velocity, start.material, start.gravity, mass, own.g2p_grid, fields,
-            own.decoder, own.bounds, own.ratio, carried, path, frame,
+            propose_frame, start.cells, start.velocity, start.material, start.gravity, mass, grid, fields,
+            decoder, bounds, ratio, carried, path, frame,
         )  # fmt: skip
         factor, only_gainers = _affordable(sum(map_ranges(propose, ranges, threads)).tolist(), budget)
         if factor < 1:
             shorten = partial(
-                shorten_frame, start.cells, start.velocity, start.gravity, own.bounds, own.ratio, path, frame,
+                shorten_frame, start.cells, start.velocity, start.gravity, bounds, ratio, path, frame,
                 np.float32(factor), only_gainers,
             )  # fmt: skip
             map_ranges(shorten, ranges, threads)
@@ -100,8 +92,8 @@ def fill_mass(material: Any, mask: Any, particle_mass: Any, mass: Any) -> Any:
     """Fill in each particle's share of the scene's mass, from the mass (M,) of a particle of each material."""
     total = 0.0
     for p in range(len(mask)):
-        own = particle_mass[material[p]] if len(particle_mass) > 1 else np.float32(1)
-        mass[p] = own if mask[p] else ZERO
+        each = particle_mass[material[p]] if len(particle_mass) > 1 else np.float32(1)
+        mass[p] = each if mask[p] else ZERO
         total += mass[p]
     scale = np.float32(1 / total) if total > 0 else ZERO
     for p in range(len(mask)):

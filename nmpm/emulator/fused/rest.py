@@ -37,16 +37,9 @@ def bring_to_rest(start: StartArrays, parameters: KernelParameters, obstacle: Ar
 
 @jit
 def find_support(state: Any, channels: Any, obstacle: Any, gravity: Any, grid: Any, floors: Any, held: Any) -> Any:
-    """Fill in whether the material in each cell is held up.
+    """Fill in `held` (size,) bool: whether the material in each cell is held up.
 
-    Args:
-        state: The grid state.
-        channels: Its first channel that is a volume fraction, and the one after the last.
-        obstacle: As in `nmpm.emulator.fused`, like `gravity` and `grid`.
-        gravity: (D,).
-        grid: Shape and periodic axes.
-        floors: (D, 2), as `nmpm.emulator.support.floor_rows`.
-        held: (size,) bool, is filled.
+    `channels` are the state's volume fractions, from and to; `floors` (D, 2) from `nmpm.emulator.support.floor_rows`.
     """
     shape, wraps = grid
     axis, largest = 0, ZERO

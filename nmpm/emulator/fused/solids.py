@@ -53,13 +53,7 @@ class SolidCache:
 
 
 def prepare_solids(parameters: KernelParameters, solid: Tensor, walls: Tensor) -> tuple[SolidCache, ...]:
-    """The solids of each scene.
-
-    Args:
-        parameters: Of the emulator.
-        solid: (B, C_solid, *S) share of each cell that is wall or obstacle.
-        walls: (*S), of which wall.
-    """
+    """The solids of each scene, from the shares of each cell that are solid (B, C_solid, *S) and wall (*S)."""
     return tuple(_prepare_scene(parameters, scene, walls) for scene in solid)
 
 
@@ -70,13 +64,11 @@ def _prepare_scene(parameters: KernelParameters, solid: Tensor, walls: Tensor) -
         clearance = np.empty_like(obstacle)
         fill_clearance(obstacle, parameters.grid, clearance)
     room = 1 - as_array(solid if len(solid) else walls).reshape(-1)
-    return SolidCache(obstacle, clearance, _free_volume(parameters, room) if parameters.density_cap else None)
-
-
-def _free_volume(parameters: KernelParameters, room: Array) -> FreeVolume:
+    if not parameters.density_cap:
+        return SolidCache(obstacle, clearance, None)
     faces, inverse = np.empty((len(parameters.shape), len(room)), np.float32), np.empty_like(room)
     fill_conductances(room, parameters.shape, parameters.wraps, parameters.ratio, faces, inverse)
-    return FreeVolume(room, faces, inverse)
+    return SolidCache(obstacle, clearance, FreeVolume(room, faces, inverse))
 
 
 @jit

@@ -38,16 +38,9 @@ def rasterise(
     parameters: KernelParameters, position: Array, velocity: Array, gravity: Array, material: Array, mask: Array,
     solid: Array,
 ) -> StartArrays:  # fmt: skip
-    """Particles in grid units and the grid state, as `nmpm.emulator.rasterise.grid_state`.
+    """Particles in grid units and the grid state, as `nmpm.emulator.rasterise.grid_state`; arrays as in `Particles`.
 
-    Args:
-        parameters: Of the emulator.
-        position: (B, N, D) in domain length.
-        velocity: (B, N, D) in domain length per frame.
-        gravity: (B, D) in domain length per frame squared.
-        material: (B, N) or (B, 0).
-        mask: (B, N).
-        solid: (B, C_solid, *S).
+    `material` is (B, 0) where there is only one; `solid` is (B, C_solid, *S).
     """
     cells, moved = np.empty((2, *position.shape), np.float32)
     pull, size = gravity / parameters.box[1], parameters.size
@@ -95,15 +88,10 @@ def to_cells(position: Any, velocity: Any, box: Any, cells: Any, moved: Any) -> 
 
 @jit
 def fill_state(sums: Any, width: Any, particle_volume: Any, solid: Any, constants: Any, state: Any) -> Any:
-    """Fill in the channels of a grid state.
+    """Fill in the channels of a grid state: mean values, shares of volume, the solid, the constants.
 
-    Args:
-        sums: (size, M V + M): sums of V values of each material, then numbers of particles.
-        width: V.
-        particle_volume: In cells.
-        solid: (size,) share of each cell that is solid; empty where there is no such channel.
-        constants: (K,) values that are the same everywhere.
-        state: (size, M V + M + ...): mean values, shares of volume, the solid, the constants.
+    From `sums` (size, M V + M) of V = `width` values of each material, then numbers of particles; `solid` (size,),
+    empty where there is no such channel; and `constants` (K,), which are the same everywhere.
     """
     materials = sums.shape[1] // (width + 1)
     for node in range(len(sums)):
@@ -133,16 +121,13 @@ def normalise(state: Any, low: Any, high: Any, mean: Any, deviation: Any, out: A
             out[node, c] = (value - middle) / width
 
 
-def output_arrays(output: Tensor) -> tuple[Any, Any]:
-    """A network's output (B, m, C, *S) as an array (B, m, C, size), and the kernel that unpacks it, of any strides."""
-    values = output.detach().flatten(3)
-    if output.dtype == torch.bfloat16:  # which Numpy lacks: as bits
-        return values.view(torch.uint16).numpy(), unpack_bfloat16
-    return values.float().numpy(), unpack_float32
+def output_array(output: Tensor) -> Any:
+    """A network's output (B, m, C, *S) as an array (B, m, C, size) of float32 and any strides, for `unpack`."""
+    return output.detach().flatten(3).float().numpy()
 
 
 @jit
-def unpack_float32(output: Any, scale: Any, fields: Any) -> Any:
+def unpack(output: Any, scale: Any, fields: Any) -> Any:
     """Fill in the fields, whose channels lie next to each other, from an output (m, C, size) and its scale (m C,)."""
     channels = fields.shape[2]
     for begin in range(0, fields.shape[1], _BLOCK):
@@ -153,21 +138,3 @@ def unpack_float32(output: Any, scale: Any, fields: Any) -> Any:
                 factor = scale[frame * channels + c]
                 for node in range(len(these)):
                     field[node, c] = these[node] * factor
-
-
-@jit
-def unpack_bfloat16(output: Any, scale: Any, fields: Any) -> Any:
-    """As `unpack_float32`, from the bits of bfloat16 numbers, uint16: the upper half of those of float32."""
-    channels = fields.shape[2]
-    bits = np.empty(_BLOCK, np.uint32)
-    values = bits.view(np.float32)
-    for begin in range(0, fields.shape[1], _BLOCK):
-        end = min(begin + _BLOCK, fields.shape[1])
-        for frame in range(len(fields)):
-            for c in range(channels):
-                these, field = output[frame, c, begin:end], fields[frame, begin:end]
-                factor = scale[frame * channels + c]
-                for node in range(len(these)):
-                    bits[node] = np.uint32(these[node]) << np.uint32(16)
-                for node in range(len(these)):
-                    field[node, c] = values[node] * factor

@@ -28,11 +28,7 @@ _COLUMNS = 16
 
 @dataclass(frozen=True)
 class TritonSteps(TensorSteps):
-    """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.Triton` takes. States are contiguous.
-
-    Args:
-        parameters: Of the emulator.
-    """
+    """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.Triton` takes. States are contiguous."""
 
     parameters: KernelParameters
 
@@ -118,24 +114,24 @@ class TritonSteps(TensorSteps):
         (batch, frames, tiles, _), count = sums.shape, path.shape[2]
         free = torch.empty_like(weight, dtype=torch.int32)
         way, lengths = path.new_empty(batch, 2, count, 2), path.new_empty(batch, tiles)
-        known: dict[str, Any] = {"SURFACE": SURFACE, "BLOCK": _BLOCK, "STEPS": _power(tiles * frames)} | self._axes
-        constraints.touch[tiles, batch](path, weight, share, sums, free, way, lengths, frames, count, tiles, **known)
+        options: dict[str, Any] = {"SURFACE": SURFACE, "BLOCK": _BLOCK, "STEPS": _power(tiles * frames)} | self._axes
+        constraints.touch[tiles, batch](path, weight, share, sums, free, way, lengths, frames, count, tiles, **options)
         constraints.hold[tiles, batch](
-            path, share, sums, free, way, lengths, frames, count, tiles, *self._limits, **known, TILES=_power(tiles)
+            path, share, sums, free, way, lengths, frames, count, tiles, *self._limits, **options, TILES=_power(tiles)
         )
 
     def _rest(self, start: BundleStart, path: Tensor, share: Tensor) -> None:
         own, longest, batch = self.parameters, max(self.parameters.shape), len(path)
         held = start.mask.new_empty(batch, own.size, dtype=torch.int8)
         (left, right), (down, up) = own.floors.tolist()
-        known: dict[str, Any] = {"OBSTACLES": own.obstacles, "SURFACE": SURFACE} | self._axes
+        options: dict[str, Any] = {"OBSTACLES": own.obstacles, "SURFACE": SURFACE} | self._axes
         grid.support[triton.cdiv(longest, _COLUMNS), batch](
-            start.filled.contiguous(), share, start.gravity, held, **known, LEFT=left, RIGHT=right, DOWN=down, UP=up,
+            start.filled.contiguous(), share, start.gravity, held, **options, LEFT=left, RIGHT=right, DOWN=down, UP=up,
             REACH=REACH, ENOUGH=ENOUGH, ROWS=_power(longest), COLUMNS=_COLUMNS,
         )  # fmt: skip
         motion.rest[_programs(start.cells)](
-            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, own.rest_speed, **known,
-            FREE_FALL=FREE_FALL_SHARE, DROP=MAX_DROP, BLOCK=_BLOCK,
+            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, own.rest_speed,
+            **options, FREE_FALL=FREE_FALL_SHARE, DROP=MAX_DROP, BLOCK=_BLOCK,
         )  # fmt: skip
 
     def _flow(self, path: Tensor, weight: Tensor, solid: Tensor) -> Tensor:

@@ -34,21 +34,13 @@ RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType(
 
 
 def find_runtime(name: str) -> Runtime:
-    """A runtime of `RUNTIMES`, without any program compiled yet.
-
-    Raises:
-        ConfigError: if there is none of that name.
-    """
+    """A runtime of `RUNTIMES`, without any program compiled yet; raises ConfigError if there is none of that name."""
     check_runtime(name, list(RUNTIMES))
     return RUNTIMES[name]()
 
 
 def check_runtime(name: str, names: Sequence[str]) -> None:
-    """Check the name of a runtime.
-
-    Raises:
-        ConfigError: if it is not one of these names, which are listed.
-    """
+    """Check the name of a runtime; raises ConfigError if it is not one of these names, which are listed."""
     if name not in names:
         raise ConfigError(
             f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(names)}."

@@ -128,11 +128,7 @@ class Recorded:
 
 
 def record(function: Callable[[], T], device: torch.device) -> tuple[Callable[[], None], T]:
-    """Record the kernels that a function launches on a GPU.
-
-    Returns:
-        Launches them again, on the same memory; the function's result, whose tensors each launch overwrites.
-    """
+    """A launch of the kernels that a function runs on a GPU, and its result, whose tensors each launch overwrites."""
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.device(device), torch.no_grad():
         aside = torch.cuda.Stream()

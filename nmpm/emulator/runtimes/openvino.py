@@ -64,13 +64,7 @@ class OpenVINO(Runtime):
 
 
 class _Program:
-    """A compiled network for one shape.
-
-    Args:
-        request: OpenVINO's inference request; one call at a time.
-        tensor: OpenVINO's class of tensors.
-        shape: (B, *S, m, C_out), of its output.
-    """
+    """A compiled network for one shape of output (B, *S, m, C_out); its inference request takes one call at a time."""
 
     def __init__(self, request: Any, tensor: Any, shape: tuple[int, ...]) -> None:
         self._request, self._tensor, self._shape, self._lock = request, tensor, shape, Lock()
@@ -100,8 +94,7 @@ class _ChannelsLast(nn.Module):
 def _compile(network: GridProcessor, grid: Tensor, precision: torch.dtype, threads: int) -> _Program:
     """The network as a program.
 
-    Raises:
-        ConfigError: if OpenVINO is not installed, or lacks an operation of the network here.
+    Raises ConfigError if OpenVINO is not installed, or lacks an operation of the network here.
     """
     openvino = _import_openvino()
     options = {
@@ -140,11 +133,7 @@ def _core(openvino: Any) -> Any:
 
 
 def _import_openvino() -> Any:
-    """OpenVINO, without its telemetry.
-
-    Raises:
-        ConfigError: if it is not installed.
-    """
+    """OpenVINO, without its telemetry; raises ConfigError if it is not installed."""
     try:
         with _without_telemetry(), kept_signal_stack():
             import openvino

@@ -55,7 +55,6 @@ class _Compiled(Generic[P]):
 
 
 def _weights(network: nn.Module) -> list[_Weight]:
-    """Parameters and buffers of a module and its parts."""
     stores = (store for module in network.modules() for store in (module._parameters, module._buffers))
     return [
         _Weight(store, name, tensor, tensor.detach(), tensor.data_ptr(), tensor._version)

@@ -40,8 +40,7 @@ class Runtime(ABC):
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         """The network's output (B, m, C_out, *S), in a precision, for a normalised grid state (B, C_in, *S).
 
-        Raises:
-            ConfigError: if this runtime cannot run the network, or gradients are asked for that it does not have.
+        Raises ConfigError if this runtime cannot run the network, or gradients are asked for that it does not have.
         """
 
     def bundle(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
@@ -72,11 +71,7 @@ class Eager(Runtime):
 
 
 def refuse_gradients(runtime: Runtime, network: nn.Module, *inputs: Tensor) -> None:
-    """Make sure that a call is inference.
-
-    Raises:
-        ConfigError: if the network is in training mode, or gradients are enabled and an input or a weight requires one.
-    """
+    """Raise ConfigError for networks in training mode, or if gradients are on and an input or a weight requires one."""
     tracked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*inputs, *network.parameters()))
     if network.training or tracked:
         raise ConfigError(

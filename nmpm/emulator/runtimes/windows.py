@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
@@ -38,8 +39,7 @@ class Windows(Runtime):
         most_cells: Cells that the network computes at once at most, to bound its memory, unless windows would become
             narrower than three times its radius. None for no limit.
 
-    Raises:
-        ConfigError: if that is not positive.
+    Raises ConfigError if that is not positive.
     """
 
     name: ClassVar[str] = "windows"
@@ -98,11 +98,7 @@ class Windows(Runtime):
 
 
 class _Crops(Runtime):
-    """The network on the crops of one call.
-
-    Args:
-        crops, axes, most: As of `predict_on_crops`.
-    """
+    """The network on the crops of one call; arguments as of `predict_on_crops`."""
 
     name: ClassVar[str] = "windows"
     fixed_shapes: ClassVar[bool] = False
@@ -111,9 +107,7 @@ class _Crops(Runtime):
         self._crops, self._axes, self._most = crops, axes, most
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
-        def on_crop(inputs: Tensor) -> Tensor:
-            return Eager().fields(network, inputs, precision)
-
+        on_crop = partial(Eager().fields, network, precision=precision)
         return predict_on_crops(on_crop, grid, self._crops, self._axes, self._most)
 
 

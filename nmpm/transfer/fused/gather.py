@@ -19,17 +19,7 @@ index = np.uint64
 
 @jit
 def gather(field: Any, material: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
-    """Interpolate the velocity of each particle's own material.
-
-    Args:
-        field: (size, C) with the velocities of all materials first, D columns each.
-        material: (N,) int64; empty where there is only one.
-        cells: (N, D) positions.
-        shape: Nodes along each axis, a tuple.
-        wraps: Whether each is periodic, a tuple.
-        steps: A tuple as long as the kernel has nodes along an axis: 2 (linear) or 3 (quadratic).
-        out: (N, D), is filled.
-    """
+    """Fill in `out` (N, D), the interpolated velocity of each particle's own material; linear or quadratic."""
     if len(steps) == 3:
         _gather_stencil(field, material, cells, shape, wraps, steps, out)
     elif len(shape) == 2:
@@ -106,19 +96,7 @@ def gather_adjoint(
     field: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, grad_out: Any, grad_cells: Any,
     grad_field: Any,
 ) -> Any:  # fmt: skip
-    """Add the gradients of linear 2-D `gather` with respect to positions and field; arguments as there.
-
-    Args:
-        field: (size, C).
-        material: (N,).
-        mask: (N,) bool, False for padding, which gets and gives no gradient.
-        cells: (N, 2).
-        shape: Nodes along each axis.
-        wraps: Whether each is periodic.
-        grad_out: (N, 2) gradient with respect to the interpolated velocities.
-        grad_cells: (N, 2), is added to.
-        grad_field: (size, C), is added to.
-    """
+    """Add the gradients of linear 2-D `gather` with respect to positions and field, from that of what it fills in."""
     many, walls = len(material) > 0, not (wraps[0] or wraps[1])
     for p in range(len(cells)):
         if not mask[p]:

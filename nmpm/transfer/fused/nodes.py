@@ -76,14 +76,7 @@ def linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
 
 @jit
 def stencil(x: Any, count: Any, wraps: Any, steps: Any) -> Any:
-    """The nodes along an axis and their weights, three of each, unused ones with weight 0.
-
-    Args:
-        x: Position.
-        count: Nodes along the axis.
-        wraps: Whether it is periodic.
-        steps: A tuple of as many integers as the kernel has nodes: 1 (nearest), 2 (linear) or 3 (quadratic).
-    """
+    """The nodes along an axis and their weights, three of each, unused ones with weight 0."""
     inside = _interior(x, count, wraps)
     if len(steps) == 1:
         base, weights = _node_below(inside), (ONE, ZERO, ZERO)

@@ -12,17 +12,9 @@ from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil, weight_s
 
 @jit
 def scatter(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
-    """Add to each node its share of the particles.
+    """Add to `out` (size, M V + M) the values (N, V) of the particles of each material, then their numbers.
 
-    Args:
-        values: (N, V), e.g. velocities; V may be 0.
-        material: (N,) int64; empty where there is only one. Particles of an unknown one count nowhere.
-        mask: (N,) bool, False for padding, which is left out.
-        cells: (N, D) positions.
-        shape: Nodes along each axis, a tuple.
-        wraps: Whether each is periodic, a tuple.
-        steps: A tuple as long as the kernel has nodes along an axis: 1 (nearest), 2 (linear) or 3 (quadratic).
-        out: (size, M V + M), is added to: the values of each material, then the number of particles of each.
+    V may be 0. Particles of an unknown material count nowhere.
     """
     if len(steps) != 2:
         _scatter_stencil(values, material, mask, cells, shape, wraps, steps, out)
@@ -114,18 +106,8 @@ def scatter_adjoint(
 ) -> Any:  # fmt: skip
     """Add the gradients of linear 2-D `scatter` with respect to positions and values.
 
-    Args:
-        values: (N, V).
-        material: (N,).
-        mask: (N,) bool, False for padding, which gets no gradient.
-        cells: (N, 2).
-        shape: Nodes along each axis.
-        wraps: Whether each is periodic.
-        mean: (size, M V + ...), first the means of each material's values: their sums over the numbers.
-        grad_out: (size, M V + M): gradients with respect to the sums at fixed means of each material, then to its
-            numbers at fixed means.
-        grad_cells: (N, 2), is added to.
-        grad_values: (N, V), is added to.
+    `mean` (size, M V + ...) begins with the means of each material's values: their sums over the numbers. `grad_out`
+    (size, M V + M) has the gradients with respect to the sums, then to the numbers, each at fixed means.
     """
     materials = grad_out.shape[1] // (values.shape[1] + 1)
     for p in range(len(cells)):
