@@ -156,7 +156,10 @@ def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, sha
     fall = -_over_axes(work) * mass
     excess = (-_over_axes(cells * gravity) * mass).sum(1) - budget  # of the scene if nobody moved
     excess = excess.clamp(min=-_UNLIMITED)
-    gains = _gains(cells, step, before, work)
+    # Beyond the rounding of positions that steps come from, and without the large terms that cancel:
+    # v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
+    rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs()
+    gains = _over_axes((step - before) * (step + before) / 2 - work - rounding) > 0
     gaining = gains.to(step.dtype)
     square = torch.stack([(kinetic * gaining).sum(1), kinetic.sum(1)], dim=1)  # of those that gain; of all
     slope = torch.stack([(fall * gaining).sum(1), fall.sum(1)], dim=1)
@@ -180,13 +183,6 @@ def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
     room = (budget.unsqueeze(1) - before).clamp(min=0)
     possible = torch.where(rise > 0, room / torch.where(rise > 0, rise, 1.0), 0.0)
     return torch.where(exceeds, possible, 1.0).amin(1)
-
-
-def _gains(cells: Tensor, step: Tensor, before: Tensor, work: Tensor) -> Tensor:
-    """(B, N): whether a particle gains energy by a step, beyond the rounding of positions that steps come from."""
-    # Without the large terms that cancel: v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
-    rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs()
-    return _over_axes((step - before) * (step + before) / 2 - work - rounding) > 0
 
 
 def _over_axes(values: Tensor) -> Tensor:

@@ -15,21 +15,16 @@ from nmpm.transfer import Transfer
 
 
 def grid_state(
-    scene: Scene,
-    grid: Grid,
-    transfer: Transfer,
-    particles: Particles,
-    cells: Tensor,
-    velocity: Tensor,
-    solid: Tensor,
+    scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, cells: Tensor, velocity: Tensor, solid: Tensor,
     scales: FieldScales | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """The grid state in grid units, (B, C_in, *S).
 
     Particles are at `cells` (B, N, D) with `velocity` (B, N, D) in cells per frame, among `solid` (B, C_solid, *S).
     Scenes with fields need their scales.
     """
-    membership = _membership(particles, len(scene.materials))
+    index = torch.arange(len(scene.materials), device=particles.material.device)
+    membership = ((particles.material.unsqueeze(-1) == index) & particles.mask.unsqueeze(-1)).float()
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
     mean = momentum / _positive(count).repeat_interleave(scene.dim, dim=1)
     volume = count * (scene.particle_volume / grid.cell_volume)
@@ -87,12 +82,6 @@ def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
         share = (overlap / grid.spacing[axis]).clamp(0, 1)
         free = free.unsqueeze(-1) * share
     return (1 - free).float().to(torch.get_default_device())
-
-
-def _membership(particles: Particles, materials: int) -> Tensor:
-    """(B, N, materials): one at each real particle's material, zero elsewhere."""
-    index = torch.arange(materials, device=particles.material.device)
-    return ((particles.material.unsqueeze(-1) == index) & particles.mask.unsqueeze(-1)).float()
 
 
 def _positive(count: Tensor) -> Tensor:

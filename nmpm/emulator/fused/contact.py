@@ -203,10 +203,10 @@ def push_out(cells: Any, path: Any, obstacle: Any, grid: Any, bounds: Any, rows:
             for d in range(dim):
                 points[k, d] = cells[p, d] - inward[d] * np.float32(PIECE * k)
         depths(obstacle, points, grid, values)
-        best, found = 0, values[0] <= SURFACE
+        best, is_out = 0, values[0] <= SURFACE
         for k in range(1, _WAYS_OUT + 1):
-            if not found and (values[k] <= SURFACE or values[k] < values[best]):
-                best, found = k, values[k] <= SURFACE
+            if not is_out and (values[k] <= SURFACE or values[k] < values[best]):
+                best, is_out = k, values[k] <= SURFACE
         for frame in range(frames):
             for d in range(dim):
                 part = np.float32(frame + 1) / np.float32(frames)

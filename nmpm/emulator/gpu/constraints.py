@@ -153,11 +153,11 @@ def count_ends(path, weight, counts, count, frames, nx, ny, WX: tl.constexpr, WY
     row = (scene * (frames + 1) + frames) * count + p
     i0, i1, a = find_nodes(tl.load(path + 2 * row, mask=inside, other=0.0), nx, WX)
     j0, j1, b = find_nodes(tl.load(path + 2 * row + 1, mask=inside, other=0.0), ny, WY)
-    own = counts + scene * (nx * ny)
-    tl.atomic_add(own + i0 * ny + j0, (1 - a) * (1 - b), mask=active, sem="relaxed")
-    tl.atomic_add(own + i0 * ny + j1, (1 - a) * b, mask=active, sem="relaxed")
-    tl.atomic_add(own + i1 * ny + j0, a * (1 - b), mask=active, sem="relaxed")
-    tl.atomic_add(own + i1 * ny + j1, a * b, mask=active, sem="relaxed")
+    nodes = counts + scene * (nx * ny)
+    tl.atomic_add(nodes + i0 * ny + j0, (1 - a) * (1 - b), mask=active, sem="relaxed")
+    tl.atomic_add(nodes + i0 * ny + j1, (1 - a) * b, mask=active, sem="relaxed")
+    tl.atomic_add(nodes + i1 * ny + j0, a * (1 - b), mask=active, sem="relaxed")
+    tl.atomic_add(nodes + i1 * ny + j1, a * b, mask=active, sem="relaxed")
 
 
 @triton.jit
@@ -199,12 +199,12 @@ def relax(counts, taken, per_scene, before, after, particle, factor, nx, ny,
     change = counted * particle - (1 - tl.load(room + node, mask=active, other=1.0))
     pressure = tl.zeros((BLOCK,), tl.float32)
     if not FIRST:
-        own = before + scene * (nx * ny)
-        pressure = tl.load(own + node, mask=active, other=0.0)
-        change -= to_left * (pressure - tl.load(own + left, mask=active, other=0.0))
-        change -= to_right * (pressure - tl.load(own + right, mask=active, other=0.0))
-        change -= to_below * (pressure - tl.load(own + below, mask=active, other=0.0))
-        change -= to_above * (pressure - tl.load(own + above, mask=active, other=0.0))
+        pressures = before + scene * (nx * ny)
+        pressure = tl.load(pressures + node, mask=active, other=0.0)
+        change -= to_left * (pressure - tl.load(pressures + left, mask=active, other=0.0))
+        change -= to_right * (pressure - tl.load(pressures + right, mask=active, other=0.0))
+        change -= to_below * (pressure - tl.load(pressures + below, mask=active, other=0.0))
+        change -= to_above * (pressure - tl.load(pressures + above, mask=active, other=0.0))
     tl.store(after + scene * (nx * ny) + node, tl.maximum(pressure + inverse * change, 0.0), mask=active)
 
 
@@ -215,15 +215,15 @@ def find_flow(taken, per_scene, pressures, flow, factor, nx, ny, WX: tl.constexp
     scene = tl.program_id(1).to(tl.int64)
     node = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     active = node < nx * ny
-    room, own = taken + scene * per_scene, pressures + scene * (nx * ny)
+    room, driving = taken + scene * per_scene, pressures + scene * (nx * ny)
     left, right, below, above, to_left, to_right, to_below, to_above = _faces(
         room, node, active, factor, nx, ny, WX, WY
     )
-    pressure = tl.load(own + node, mask=active, other=0.0)
-    x = to_right * (pressure - tl.load(own + right, mask=active, other=0.0))
-    x += to_left * (tl.load(own + left, mask=active, other=0.0) - pressure)
-    y = to_above * (pressure - tl.load(own + above, mask=active, other=0.0))
-    y += to_below * (tl.load(own + below, mask=active, other=0.0) - pressure)
+    pressure = tl.load(driving + node, mask=active, other=0.0)
+    x = to_right * (pressure - tl.load(driving + right, mask=active, other=0.0))
+    x += to_left * (tl.load(driving + left, mask=active, other=0.0) - pressure)
+    y = to_above * (pressure - tl.load(driving + above, mask=active, other=0.0))
+    y += to_below * (tl.load(driving + below, mask=active, other=0.0) - pressure)
     target = flow + 2 * (scene * (nx * ny) + node)
     tl.store(target, x / 2, mask=active)
     tl.store(target + 1, y / 2, mask=active)
@@ -256,9 +256,9 @@ def spread(path, weight, gravity, share, flow, spreads, energies, frames, count,
     mass = tl.load(weight + scene * count + p, mask=active, other=0.0)
     pull_x, pull_y = tl.load(gravity + 2 * scene), tl.load(gravity + 2 * scene + 1)
     end_x, end_y = load(path, begin + frames * count, active)
-    own = flow + 2 * scene * (nx * ny)
-    shift_x = interpolate(own, end_x, end_y, 2 * ny, 2, active, nx, ny, WX, WY)
-    shift_y = interpolate(own + 1, end_x, end_y, 2 * ny, 2, active, nx, ny, WX, WY)
+    flows = flow + 2 * scene * (nx * ny)
+    shift_x = interpolate(flows, end_x, end_y, 2 * ny, 2, active, nx, ny, WX, WY)
+    shift_y = interpolate(flows + 1, end_x, end_y, 2 * ny, 2, active, nx, ny, WX, WY)
     shift_x = tl.where(mass > 0, tl.minimum(tl.maximum(shift_x, -SHIFT), SHIFT), 0.0)
     shift_y = tl.where(mass > 0, tl.minimum(tl.maximum(shift_y, -SHIFT), SHIFT), 0.0)
     blocked = p < 0
@@ -293,9 +293,9 @@ def land(path, spreads, energies, budget, frames, count, tiles, BLOCK: tl.conste
     tile, limit = tl.arange(0, TILES), tl.load(budget + scene)
     share = tl.full((), 1.0, tl.float32)
     for frame in range(frames + 1):
-        own = energies + ((scene * (frames + 1) + frame) * tiles + tile) * 2
-        before = tl.sum(tl.load(own, mask=tile < tiles, other=0.0), 0)
-        after = tl.sum(tl.load(own + 1, mask=tile < tiles, other=0.0), 0)
+        sums = energies + ((scene * (frames + 1) + frame) * tiles + tile) * 2
+        before = tl.sum(tl.load(sums, mask=tile < tiles, other=0.0), 0)
+        after = tl.sum(tl.load(sums + 1, mask=tile < tiles, other=0.0), 0)
         room, rise = tl.maximum(limit - before, 0.0), after - before
         possible = tl.where(rise > 0, room / tl.where(rise > 0, rise, 1.0), 0.0)
         share = tl.where(after > limit, tl.minimum(share, possible), share)

@@ -67,11 +67,11 @@ def scatter(cells, velocity, material, mask, sums, count, nx, ny, WX: tl.constex
         active = active & (kind >= 0) & (kind < MATERIALS)
     i0, i1, a = find_nodes(tl.load(cells + 2 * row, mask=inside, other=0.0), nx, WX)
     j0, j1, b = find_nodes(tl.load(cells + 2 * row + 1, mask=inside, other=0.0), ny, WY)
-    own = sums + scene * (nx * ny * 3 * MATERIALS)
-    _add(own, i0 * ny + j0, (1 - a) * (1 - b), u, v, kind, active, MATERIALS)
-    _add(own, i0 * ny + j1, (1 - a) * b, u, v, kind, active, MATERIALS)
-    _add(own, i1 * ny + j0, a * (1 - b), u, v, kind, active, MATERIALS)
-    _add(own, i1 * ny + j1, a * b, u, v, kind, active, MATERIALS)
+    nodes = sums + scene * (nx * ny * 3 * MATERIALS)
+    _add(nodes, i0 * ny + j0, (1 - a) * (1 - b), u, v, kind, active, MATERIALS)
+    _add(nodes, i0 * ny + j1, (1 - a) * b, u, v, kind, active, MATERIALS)
+    _add(nodes, i1 * ny + j0, a * (1 - b), u, v, kind, active, MATERIALS)
+    _add(nodes, i1 * ny + j1, a * b, u, v, kind, active, MATERIALS)
 
 
 @triton.jit
@@ -124,11 +124,11 @@ def support(filled, share, gravity, held, nx, ny, WX: tl.constexpr, WY: tl.const
     bound = tl.where((pull_x == 0) & (pull_y == 0), 0, tl.where(vertical, 1 - WY, 1 - WX))  # 0: all is held
     column = (tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS))[:, None]
     row = tl.arange(0, ROWS)[None, :]
-    own, solid = filled + scene * (nx * ny), share + scene * (nx * ny)
-    near, base = _bears(own, solid, column, row, lowest, up, floor, extent, across, stride, side, period,
+    full, solid = filled + scene * (nx * ny), share + scene * (nx * ny)
+    near, base = _bears(full, solid, column, row, lowest, up, floor, extent, across, stride, side, period,
                         OBSTACLES, ENOUGH, SURFACE)  # fmt: skip
     for distance in tl.static_range(1, REACH):
-        below, _ = _bears(own, solid, column, row - distance, lowest, up, floor, extent, across, stride, side, period,
+        below, _ = _bears(full, solid, column, row - distance, lowest, up, floor, extent, across, stride, side, period,
                           OBSTACLES, ENOUGH, SURFACE)  # fmt: skip
         near = near | below | (row < distance)
     gap = tl.associative_scan(tl.where(near, 0, (row + 1) * bound), 1, _larger)

@@ -123,8 +123,8 @@ def advance(
         older_x, older_y = load(path, begin + tl.maximum(frame - 2, 0) * count, active)
         step_x, step_y = x - before_x, y - before_y
         if LIMITED:
-            own = sums + (scene * frames + frame - 1) * tiles * SUMS
-            of_gainers, of_others = _affordable(own, tiles, tl.load(budget + scene), TILES)
+            proposed = sums + (scene * frames + frame - 1) * tiles * SUMS
+            of_gainers, of_others = _affordable(proposed, tiles, tl.load(budget + scene), TILES)
             fresh = tl.where(frame > 1, 0.0, 1.0)  # of the first step, older places are those before it
             last_u, last_v = before_x - older_x + fresh * u, before_y - older_y + fresh * v
             _, _, _, gains = _balance(before_x, before_y, step_x, step_y, last_u, last_v, pull_x, pull_y, ratio)
@@ -152,12 +152,12 @@ def advance(
         store(path, begin + (frame + 1) * count, next_x, next_y, active)
         if LIMITED:
             kinetic, fall, height, gains = _balance(x, y, next_x - x, next_y - y, u, v, pull_x, pull_y, ratio)
-            own = mine + frame * tiles * SUMS
-            tl.store(own, tl.sum(tl.where(real, share * height, 0.0), 0))
-            tl.store(own + 1, tl.sum(tl.where(real & gains, share * kinetic, 0.0), 0))
-            tl.store(own + 2, tl.sum(tl.where(real, share * kinetic, 0.0), 0))
-            tl.store(own + 3, tl.sum(tl.where(real & gains, share * fall, 0.0), 0))
-            tl.store(own + 4, tl.sum(tl.where(real, share * fall, 0.0), 0))
+            target = mine + frame * tiles * SUMS
+            tl.store(target, tl.sum(tl.where(real, share * height, 0.0), 0))
+            tl.store(target + 1, tl.sum(tl.where(real & gains, share * kinetic, 0.0), 0))
+            tl.store(target + 2, tl.sum(tl.where(real, share * kinetic, 0.0), 0))
+            tl.store(target + 3, tl.sum(tl.where(real & gains, share * fall, 0.0), 0))
+            tl.store(target + 4, tl.sum(tl.where(real, share * fall, 0.0), 0))
 
 
 @triton.jit

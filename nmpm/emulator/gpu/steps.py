@@ -33,42 +33,42 @@ class TritonSteps(TensorSteps):
     parameters: KernelParameters
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        own, materials = self.parameters, len(self.parameters.mass)
+        params, materials = self.parameters, len(self.parameters.mass)
         cells, velocity, gravity = (values.contiguous() for values in self.emulator.in_cells(particles))
-        sums = cells.new_zeros(len(cells), *own.shape, 3 * materials)
+        sums = cells.new_zeros(len(cells), *params.shape, 3 * materials)
         grid.scatter[_programs(cells)](
             cells, velocity, particles.material, particles.mask, sums, cells.shape[1], **self._axes,
             MATERIALS=materials, BLOCK=_BLOCK,
         )  # fmt: skip
         count = sums[..., 2 * materials :]
         mean = sums[..., : 2 * materials] / torch.where(count > 0, count, 1.0).repeat_interleave(2, dim=-1)
-        parts = [mean, count * own.particle_volume, solid.movedim(1, -1)]
-        if own.constants:
-            parts.append(gravity.unsqueeze(1).expand(-1, *own.shape, -1))
+        parts = [mean, count * params.particle_volume, solid.movedim(1, -1)]
+        if params.constants:
+            parts.append(gravity.unsqueeze(1).expand(-1, *params.shape, -1))
         return cells, velocity, gravity, torch.cat(parts, dim=-1).movedim(-1, 1)
 
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
-        own, (tiles, batch), frames = self.parameters, _programs(start.cells), start.output.shape[1]
+        params, (tiles, batch), frames = self.parameters, _programs(start.cells), start.output.shape[1]
         path = start.cells.new_empty(batch, frames + 1, start.cells.shape[1], 2)
         sums = path.new_empty(batch, frames, tiles, motion.SUMS.value)
         share, weight = self._share(context), self._weight(start)
         self._advance(start, weight, context.budget, path, sums)
-        if own.obstacles and own.solids:
+        if params.obstacles and params.solids:
             self._hold(path, weight, share, sums)
-        if own.rest_speed:
+        if params.rest_speed:
             self._rest(start, path, share)
         return path[:, 1:]
 
     def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
-        own, (tiles, batch), frames = self.parameters, _programs(start.cells), path.shape[1]
+        params, (tiles, batch), frames = self.parameters, _programs(start.cells), path.shape[1]
         weight, count = self._weight(start), path.shape[2]
         path = torch.cat([start.cells.unsqueeze(1), path], dim=1)
         flow = self._flow(path, weight, context.solid)
         spreads, energies = torch.empty_like(path), path.new_empty(batch, frames + 1, tiles, 2)
         constraints.spread[tiles, batch](
             path, weight, start.gravity, self._share(context), flow, spreads, energies, frames, count, tiles,
-            *self._limits, float(own.ratio[1]), **self._axes, CONTACT=own.obstacles and own.solids, SURFACE=SURFACE,
-            SHIFT=MAX_SHIFT, BLOCK=_BLOCK,
+            *self._limits, float(params.ratio[1]), **self._axes, CONTACT=params.obstacles and params.solids,
+            SURFACE=SURFACE, SHIFT=MAX_SHIFT, BLOCK=_BLOCK,
         )  # fmt: skip
         if context.budget is not None:
             constraints.land[tiles, batch](
@@ -98,15 +98,15 @@ class TritonSteps(TensorSteps):
         return obstacle_share(context.solid, walls).contiguous() if self.parameters.obstacles else walls
 
     def _advance(self, start: BundleStart, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor) -> None:
-        own, fields, (batch, frames, tiles, _) = self.parameters, start.fields, sums.shape
-        kept, of_grid, fall, keeps = map(float, own.decoder)
+        params, fields, (batch, frames, tiles, _) = self.parameters, start.fields, sums.shape
+        kept, of_grid, fall, keeps = map(float, params.decoder)
         state, carried = start.state.movedim(1, -1).contiguous(), torch.empty_like(start.cells)
         for frame in range(frames + 1):
             motion.advance[tiles, batch](
                 start.cells, start.velocity, start.material, weight, start.gravity, state, fields,
                 sums if budget is None else budget, carried, path, sums, frame, frames, path.shape[2], tiles,
-                own.channels, *self._limits, float(own.ratio[1]), *fields.stride(), **self._axes,
-                MATERIALS=len(own.mass), OWN=kept, GRID=of_grid, FALL=fall, KEEPS=keeps > 0,
+                params.channels, *self._limits, float(params.ratio[1]), *fields.stride(), **self._axes,
+                MATERIALS=len(params.mass), OWN=kept, GRID=of_grid, FALL=fall, KEEPS=keeps > 0,
                 LIMITED=budget is not None, FIRST=frame == 0, LAST=frame == frames, BLOCK=_BLOCK, TILES=_power(tiles),
             )  # fmt: skip
 
@@ -121,36 +121,36 @@ class TritonSteps(TensorSteps):
         )
 
     def _rest(self, start: BundleStart, path: Tensor, share: Tensor) -> None:
-        own, longest, batch = self.parameters, max(self.parameters.shape), len(path)
-        held = start.mask.new_empty(batch, own.size, dtype=torch.int8)
-        (left, right), (down, up) = own.floors.tolist()
-        options: dict[str, Any] = {"OBSTACLES": own.obstacles, "SURFACE": SURFACE} | self._axes
+        params, longest, batch = self.parameters, max(self.parameters.shape), len(path)
+        held = start.mask.new_empty(batch, params.size, dtype=torch.int8)
+        (left, right), (down, up) = params.floors.tolist()
+        options: dict[str, Any] = {"OBSTACLES": params.obstacles, "SURFACE": SURFACE} | self._axes
         grid.support[triton.cdiv(longest, _COLUMNS), batch](
             start.filled.contiguous(), share, start.gravity, held, **options, LEFT=left, RIGHT=right, DOWN=down, UP=up,
             REACH=REACH, ENOUGH=ENOUGH, ROWS=_power(longest), COLUMNS=_COLUMNS,
         )  # fmt: skip
         motion.rest[_programs(start.cells)](
-            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, own.rest_speed,
+            path, start.gravity, share, held, path.shape[1] - 1, path.shape[2], *self._limits, params.rest_speed,
             **options, FREE_FALL=FREE_FALL_SHARE, DROP=MAX_DROP, BLOCK=_BLOCK,
         )  # fmt: skip
 
     def _flow(self, path: Tensor, weight: Tensor, solid: Tensor) -> Tensor:
         """(B, *S, 2) displacements at the nodes that spread overfull cells at the path's end."""
-        own, (batch, frames, count, _) = self.parameters, path.shape
-        taken, per_scene = (solid, own.size) if own.solid else (self.emulator.walls, 0)
-        counts = path.new_zeros(batch, *own.shape)
+        params, (batch, frames, count, _) = self.parameters, path.shape
+        taken, per_scene = (solid, params.size) if params.solid else (self.emulator.walls, 0)
+        counts = path.new_zeros(batch, *params.shape)
         constraints.count_ends[_programs(path[:, 0])](
             path, weight, counts, count, frames - 1, **self._axes, BLOCK=_BLOCK
         )
-        before, after, over_nodes = torch.empty_like(counts), torch.empty_like(counts), (_blocks(own.size), batch)
-        factor = 1 / float(own.ratio[1]) ** 2
+        before, after, over_nodes = torch.empty_like(counts), torch.empty_like(counts), (_blocks(params.size), batch)
+        factor = 1 / float(params.ratio[1]) ** 2
         for sweep in range(SWEEPS):
             before, after = after, before
             constraints.relax[over_nodes](
-                counts, taken, per_scene, before, after, own.particle_volume / own.density_cap, factor, **self._axes,
-                CLOSED=CLOSED, FIRST=sweep == 0, BLOCK=_BLOCK,
+                counts, taken, per_scene, before, after, params.particle_volume / params.density_cap, factor,
+                **self._axes, CLOSED=CLOSED, FIRST=sweep == 0, BLOCK=_BLOCK,
             )  # fmt: skip
-        flow = path.new_empty(batch, *own.shape, 2)
+        flow = path.new_empty(batch, *params.shape, 2)
         constraints.find_flow[over_nodes](taken, per_scene, after, flow, factor, **self._axes, BLOCK=_BLOCK)
         return flow
 
