@@ -68,8 +68,17 @@ def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namesp
     sys.stdout.write("\n".join(_lines(inspection)) + "\n")
     if arguments.no_picture:
         return
+    from nmpm.data.inspection.reading import open_dataset
+    from nmpm.viz import write_snapshots
+    from nmpm.viz.files import label_trajectory
+
+    path, title = arguments.path.resolve(), f"{arguments.path.name}, first trajectory"
     try:
-        _draw(source, inspection, arguments.out or Path(f"inspect-{arguments.path.resolve().stem}.png"))
+        data = open_dataset(source)
+        trajectory = next(iter(data.splits.values())).read(0)
+        pictured = label_trajectory(trajectory, "recorded", data.source.metadata, data.source.scene, title)
+        out = write_snapshots(pictured, arguments.out or Path(f"inspect-{path.stem}.png"))
+        sys.stdout.write(f"\nwrote {out}\n")
     except (NmpmError, OSError) as error:
         sys.stdout.write(f"\nno picture: {error}\n")
 
@@ -123,28 +132,27 @@ def _lines(inspection: Inspection) -> Iterator[str]:
             f"  {name:<6}{split.trajectories:>5} {trajectories}{read} of {_span(split.frames)} frames,"
             f" {_span(split.particles)} particles{static}"
         )
-    yield _label("materials", ", ".join(f"{name} ({_span(count)})" for name, count in inspection.materials.items()))
-    if inspection.fields:
-        yield _label("fields", ", ".join(f"{name} {shape}" for name, shape in inspection.fields.items()))
-    for index, (name, text) in enumerate(inspection.channels.items()):
-        label = _label("" if index else "channels", "")
-        yield from textwrap.wrap(f"{name} {text}", _WIDTH, initial_indent=label, subsequent_indent=" " * 14)
-    yield _label("varies", ", ".join(inspection.varies) or "nothing but the initial state")
-    yield _label("bounds", _box(inspection.stated_bounds) + " stated")
-    yield _label("", _box(inspection.observed) + " observed")
-    yield _label("domain", f"{_box(inspection.domain)} for a grid; {', '.join(inspection.boundary)}")
+    rows = {"materials": ", ".join(f"{name} ({_span(count)})" for name, count in inspection.materials.items())}
+    rows["fields"] = ", ".join(f"{name} {shape}" for name, shape in inspection.fields.items())
+    rows["channels"] = "\n".join(f"{name} {text}" for name, text in inspection.channels.items())
+    rows["varies"] = ", ".join(inspection.varies) or "nothing but the initial state"
+    rows["bounds"] = f"{_box(inspection.stated_bounds)} stated\n{_box(inspection.observed)} observed"
+    rows["domain"] = f"{_box(inspection.domain)} for a grid; {', '.join(inspection.boundary)}"
     measured = ", ".join(f"{value:.3g}" for value in inspection.first_acceleration)
     gravity = "not stated" if inspection.gravity is None else ", ".join(f"{value:g}" for value in inspection.gravity)
     gravity = "differs between trajectories" if "gravity" in inspection.varies else gravity
-    yield _label("gravity", f"{gravity}; median acceleration in the first frames: {measured}")
+    rows["gravity"] = f"{gravity}; median acceleration in the first frames: {measured}"
     share, each = 100 * inspection.occupied, 100 * inspection.occupied_each
-    yield _label("occupied", f"{share:.2g}% of the domain, one trajectory {each:.2g}%")
-    rest = "no trajectory comes to rest"
+    rows["occupied"] = f"{share:.2g}% of the domain, one trajectory {each:.2g}%"
+    rows["at rest"] = "no trajectory comes to rest"
     if inspection.rest is not None:
         middle, first, last = inspection.rest
         moving = f"; {inspection.restless} still move at their end" if inspection.restless else ""
-        rest = f"from frame {middle} on ({first}-{last}), {middle * inspection.dt:.3g} s{moving}"
-    yield _label("at rest", rest)
+        rows["at rest"] = f"from frame {middle} on ({first}-{last}), {middle * inspection.dt:.3g} s{moving}"
+    for label, text in rows.items():
+        for number, line in enumerate(text.splitlines()):
+            start = f"  {'' if number else label:<10}"
+            yield from textwrap.wrap(line, _WIDTH, initial_indent=start, subsequent_indent=" " * 14)
     yield ""
     yield "  grid          particles per    cells per frame"
     yield "                occupied cell    median    99.9%      max"
@@ -162,25 +170,9 @@ def _lines(inspection: Inspection) -> Iterator[str]:
             yield from textwrap.wrap(item, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def _label(label: str, text: str) -> str:
-    return f"  {label:<10}{text}"
-
-
 def _span(values: Range) -> str:
     return str(values[0]) if values[0] == values[1] else f"{values[0]}-{values[1]}"
 
 
 def _box(box: Iterable[tuple[float, float]]) -> str:
     return " x ".join(f"{low:.4g}…{high:.4g}" for low, high in box)
-
-
-def _draw(source: FolderSource, inspection: Inspection, path: Path) -> None:
-    from nmpm.data.inspection.reading import open_dataset
-    from nmpm.viz import write_snapshots
-    from nmpm.viz.files import label_trajectory
-
-    data = open_dataset(source)
-    metadata, scene, trajectory = data.source.metadata, data.source.scene, next(iter(data.splits.values())).read(0)
-    title = f"{Path(inspection.path).name}, first trajectory"
-    write_snapshots(label_trajectory(trajectory, "recorded", metadata, scene, title), path)
-    sys.stdout.write(f"\nwrote {path}\n")

@@ -230,15 +230,7 @@ def _write_metadata(request: SimulationRequest, folder: Path) -> None:
     first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
     for index in range(len(first)):
         statistics.add(first.read(index))
-    redrawn = _find_redrawn(request, folder)
-    simulation = request.to_dict() | ({"redrawn": redrawn} if redrawn else {})
-    extra = metadata.extra | statistics.result() | {_KEY: simulation}
-    write_metadata(folder, dataclasses.replace(metadata, extra=extra))
-
-
-def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[str, int]]:
-    """The trajectories whose first seeds were unstable, and how many were, by split and index."""
-    redrawn: dict[str, dict[str, int]] = {}
+    redrawn: dict[str, dict[str, int]] = {}  # how many seeds of a trajectory were unstable, where some were
     for split in request.splits:
         stored = Split(folder / f"{split}.h5")
         for index in range(len(stored)):
@@ -246,7 +238,9 @@ def _find_redrawn(request: SimulationRequest, folder: Path) -> dict[str, dict[st
             draw = next(draw for draw in range(DRAWS) if seed_of_draw(entropy, draw) == seed)
             if draw:
                 redrawn.setdefault(split, {})[str(index)] = draw
-    return redrawn
+    simulation = request.to_dict() | ({"redrawn": redrawn} if redrawn else {})
+    extra = metadata.extra | statistics.result() | {_KEY: simulation}
+    write_metadata(folder, dataclasses.replace(metadata, extra=extra))
 
 
 def preset_metadata(preset: Preset) -> Metadata:

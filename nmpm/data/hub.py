@@ -40,7 +40,11 @@ def hub_folder(name: str) -> Path:
     with lock_folder(unpacked.parent):
         if not unpacked.is_dir():
             _unpack(downloaded, archives, unpacked)
-    return _root(unpacked)
+    # In archives the splits may be one level deeper.
+    for candidate in (unpacked, *sorted(item for item in unpacked.iterdir() if item.is_dir())):
+        if any((candidate / split).is_dir() or (candidate / f"{split}.h5").is_file() for split in SPLITS):
+            return candidate
+    return unpacked
 
 
 def _parse_name(name: str) -> tuple[str, str]:
@@ -109,11 +113,3 @@ def _unpack_one(archive: Path, target: Path) -> None:
             unpacked_file.parent.mkdir(parents=True, exist_ok=True)
             with file.open(item) as packed, unpacked_file.open("wb") as out:
                 shutil.copyfileobj(packed, out)
-
-
-def _root(folder: Path) -> Path:
-    """The folder with the splits, which may be one level deeper in archives."""
-    for candidate in (folder, *sorted(item for item in folder.iterdir() if item.is_dir())):
-        if any((candidate / split).is_dir() or (candidate / f"{split}.h5").is_file() for split in SPLITS):
-            return candidate
-    return folder

@@ -54,7 +54,9 @@ def predicted_trajectory(
     start = torch.stack([state.position[index] - state.velocity[index], state.position[index]])
     obstacle = state.obstacle[index, state.obstacle_mask[index]].cpu().numpy()
     position = _with_obstacle(torch.cat([start, predicted[index]])[:, real], obstacle)
-    types = _type_ids(scene)
+    # DeepMind's ids; beyond 100 for materials that it does not have.
+    ids = {name: number for number, name in FAMILIES["deepmind"].types.items()}
+    types = {ids.get(name, 100 + number): name for number, name in enumerate(scene.materials)}
     moving = np.array(list(types), dtype=np.int64)[state.material[index, real].cpu().numpy()]
     attributes: dict[str, Any] = {
         "generator": f"nmpm {__version__}, predicted by {model}",
@@ -64,14 +66,14 @@ def predicted_trajectory(
     }
     if scene.gravity_varies:
         attributes["gravity"] = (state.gravity[index].double() / scene.dt**2).cpu().numpy()
-    ids = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
+    particle_type = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
     stored = {
         name: _field_frames(state.fields.get(name, values[:, 0])[index], values[index], real, len(obstacle))
         for name, values in (fields or {}).items()
     }
     if truth is not None:
         stored[TRUTH] = _with_obstacle(truth[index][:, real], obstacle)
-    return Trajectory(position, ids, attributes, stored)
+    return Trajectory(position, particle_type, attributes, stored)
 
 
 def _with_obstacle(moving: Tensor, obstacle: np.ndarray) -> np.ndarray:
@@ -84,9 +86,3 @@ def _field_frames(start: Tensor, predicted: Tensor, real: Tensor, obstacles: int
     """(T + 2, N + M) values of a scene: those of the start (N,) or (1,) twice, then (T, N) predicted ones."""
     frames = torch.cat([start.expand(2, predicted.shape[1]), predicted])[:, real].cpu().numpy()
     return np.pad(frames.astype(np.float32), ((0, 0), (0, obstacles)), constant_values=np.nan)
-
-
-def _type_ids(scene: Scene) -> dict[int, str]:
-    """DeepMind's id for each of the scene's materials, in order; beyond 100 for materials that it does not have."""
-    ids = {name: number for number, name in FAMILIES["deepmind"].types.items()}
-    return {ids.get(name, 100 + index): name for index, name in enumerate(scene.materials)}

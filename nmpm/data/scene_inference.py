@@ -46,7 +46,11 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
         raise DataError(
             f"{split.path}: positions have {split.dim} dimensions, {METADATA_FILE} has dim = {metadata.dim}."
         )
-    types = _types(split, metadata)
+    types: set[int] = set()
+    for index in range(len(split)):
+        particle_type = split.particle_type(index)
+        metadata.check_types(particle_type, split.where(index))
+        types.update(np.unique(particle_type).tolist())
     sample = split.sample(_SAMPLE_BYTES)
     moving, everything = Extent(metadata.dim), Extent(metadata.dim)
     for index in sample:
@@ -96,16 +100,6 @@ def _kinds_of_fields(split: Split, sample: range, metadata: Metadata) -> dict[st
     for index in sample if metadata.fields else ():
         add_fields(facts, split, index, metadata, metadata.fields)
     return {name: facts[name].kind for name in metadata.fields}
-
-
-def _types(split: Split, metadata: Metadata) -> frozenset[int]:
-    """All type ids that occur."""
-    types: set[int] = set()
-    for index in range(len(split)):
-        particle_type = split.particle_type(index)
-        metadata.check_types(particle_type, split.where(index))
-        types.update(np.unique(particle_type).tolist())
-    return frozenset(types)
 
 
 def _extents(

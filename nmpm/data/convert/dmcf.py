@@ -141,19 +141,15 @@ def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
     wall = _wall(first, fluid.shape[2], path)
     kinds = np.repeat([_FLUID, _WALL], [fluid.shape[1], len(wall)]).astype(np.int64)
     still = np.broadcast_to(wall, (len(fluid), *wall.shape))
-    try:
-        position = np.concatenate([fluid, still], axis=1).astype(np.float32)
-        return Trajectory(position, kinds, _attributes(first), _fields(frames))
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
-
-
-def _attributes(first: dict[str, Any]) -> dict[str, Any]:
     attributes: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}
     gravity = first.get("grav")
-    if isinstance(gravity, np.ndarray) and gravity.shape == (first["pos"].shape[1],):
+    if isinstance(gravity, np.ndarray) and gravity.shape == (fluid.shape[2],):
         attributes["gravity"] = gravity.astype(np.float64)
-    return attributes
+    try:
+        position = np.concatenate([fluid, still], axis=1).astype(np.float32)
+        return Trajectory(position, kinds, attributes, _fields(frames))
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -106,17 +106,16 @@ def _published(file: Path) -> _Published | None:
     return _PUBLISHED.get(file.resolve().parent.parent.name.lower())
 
 
-def _content(file: Path) -> dict[str, np.ndarray]:
-    with open_hdf5(file) as opened:
-        check_self_contained(opened, file)
-        return {name: _values(opened, name, file) for name in opened}
-
-
-def _values(file: Any, name: str, path: Path) -> np.ndarray:
-    if not isinstance(file[name], h5py.Dataset) or file[name].dtype.kind not in "biuf":
-        raise DataError(f"{path}: {name} must be an array of numbers.")
-    check_stored_size(file[name], f"{path}: {name}")
-    return np.asarray(file[name][()])
+def _content(path: Path) -> dict[str, np.ndarray]:
+    content: dict[str, np.ndarray] = {}
+    with open_hdf5(path) as file:
+        check_self_contained(file, path)
+        for name in file:
+            if not isinstance(file[name], h5py.Dataset) or file[name].dtype.kind not in "biuf":
+                raise DataError(f"{path}: {name} must be an array of numbers.")
+            check_stored_size(file[name], f"{path}: {name}")
+            content[name] = np.asarray(file[name][()])
+    return content
 
 
 def _trajectory(content: dict[str, np.ndarray], material: int | None, path: Path) -> Trajectory:

@@ -29,17 +29,13 @@ class RecordingProvider(Protocol):
     scene: Scene
 
     @property
-    def max_bytes(self) -> int:
-        """Size of the positions of the largest trajectory."""
+    def max_bytes(self) -> int: ...  # of the positions of the largest trajectory
 
-    def load(self, indices: Sequence[int]) -> list[Recording]:
-        """Reads or simulates several trajectories."""
+    def load(self, indices: Sequence[int]) -> list[Recording]: ...  # reads or simulates several trajectories
 
-    def require_frames(self, frames: int, purpose: str) -> None:
-        """Raises an error that names the first trajectory with fewer frames."""
+    def require_frames(self, frames: int, purpose: str) -> None: ...  # an error names the first that has fewer
 
-    def close(self) -> None:
-        """Stops unfinished work and waits for its threads; the provider can be used again afterwards."""
+    def close(self) -> None: ...  # stops unfinished work; the provider can be used again afterwards
 
 
 class MotionSampler:

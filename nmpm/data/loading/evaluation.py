@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 
@@ -47,9 +47,11 @@ class EvaluationLoader:
         """Use only the first `limit` trajectories from now on; all when None."""
         split = self.recordings.split
         order = sorted(range(len(split))[:limit], key=split.frames)[self._rank :: self._world]
-        groups = (list(group) for _, group in itertools.groupby(order, key=split.frames))
-        batches = (batch for group in groups for batch in _bucket(group, self._batch_size, split.particles))
-        self.batches: tuple[tuple[int, ...], ...] = tuple(batches) or ((),)
+        batches: list[tuple[int, ...]] = []
+        for _, equally_long in itertools.groupby(order, key=split.frames):
+            by_size, size = sorted(equally_long, key=split.particles), self._batch_size
+            batches += sorted(tuple(sorted(by_size[i : i + size])) for i in range(0, len(by_size), size))
+        self.batches = tuple(batches) or ((),)
 
     def __len__(self) -> int:
         return len(self.batches)
@@ -60,9 +62,3 @@ class EvaluationLoader:
     def _read(self, indices: Sequence[int]) -> Window:
         read = collate([self.recordings[index] for index in indices or (0,)], self.recordings.scene)
         return read.scenes(slice(len(indices)))
-
-
-def _bucket(group: Sequence[int], batch_size: int, particles: Callable[[int], int]) -> list[tuple[int, ...]]:
-    """Trajectories in batches of similar numbers of particles; in each, and by their first ones, in order."""
-    by_size = sorted(group, key=particles)
-    return sorted(tuple(sorted(by_size[first : first + batch_size])) for first in range(0, len(by_size), batch_size))

@@ -57,12 +57,19 @@ class RecordingReader:
         """
         types = trajectory.particle_type
         moving, static = self.check(trajectory, where)
-        self._check_static(trajectory, static, where)
+        mover = first_moving_particle(trajectory.position, static, self.scene.domain)
+        if mover is not None:
+            name = self.metadata.particle_types[int(types[mover])]
+            raise DataError(
+                f"{where}: particle {mover} is of the static type {types[mover]} ({name}) but moves. Obstacles must be"
+                " at rest; to predict it like a material, remove its type from static_types in the metadata."
+            )
+        gravity = trajectory_gravity(trajectory.attributes, self.scene, where) or (0.0,) * self.scene.dim
         return Recording(
             frames=torch.from_numpy(np.ascontiguousarray(trajectory.position[:, moving])),
             material=torch.from_numpy(self._materials(types[moving], where)),
             obstacle=torch.from_numpy(trajectory.position[0, static]),
-            gravity=self._gravity(trajectory, where),
+            gravity=(torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float(),
             fields=dict(self._fields(trajectory.fields, moving, where)),
         )
 
@@ -115,22 +122,6 @@ class RecordingReader:
                 )
             index[types == type_id] = self.scene.material_index(name)
         return index
-
-    def _check_static(self, trajectory: Trajectory, static: np.ndarray, where: str) -> None:
-        particle = first_moving_particle(trajectory.position, static, self.scene.domain)
-        if particle is not None:
-            type_id = int(trajectory.particle_type[particle])
-            raise DataError(
-                f"{where}: particle {particle} is of the static type {type_id}"
-                f" ({self.metadata.particle_types[type_id]}) but moves. Obstacles must be at rest; to predict it like a"
-                " material, remove its type from static_types in the metadata."
-            )
-
-    def _gravity(self, trajectory: Trajectory, where: str) -> Tensor:
-        gravity = trajectory_gravity(trajectory.attributes, self.scene, where)
-        if gravity is None:
-            return torch.zeros(self.scene.dim)
-        return (torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float()
 
 
 class SplitRecordings(Sequence[Recording]):
