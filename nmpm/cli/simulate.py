@@ -67,10 +67,8 @@ def run(words: list[str]) -> None:
     try:
         _simulate(options)
     except KeyboardInterrupt:
-        mend = (
-            "nothing was written" if options.preview else "the same command continues after the finished trajectories"
-        )
-        sys.stderr.write(f"nmpm simulate: interrupted; {mend}.\n")
+        kept = "nothing was written" if options.preview else "the same command continues after finished trajectories"
+        sys.stderr.write(f"nmpm simulate: interrupted; {kept}.\n")
         raise SystemExit(_INTERRUPTED) from None
 
 

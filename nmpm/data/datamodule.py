@@ -142,9 +142,6 @@ class TrajectoryDataModule(LightningDataModule):
             return
         if not self.batches_seen:
             self._history = None
-        self._check_splits()
-
-    def _check_splits(self) -> None:
         present = split_paths(self.data_source.folder)
         if "valid" not in present and self.trainer is not None and self.trainer.enable_validation:
             raise DataError(
@@ -255,12 +252,7 @@ class TrajectoryDataModule(LightningDataModule):
 
 
 class TrainingLoader:
-    """Iterates over the training batches, from the trainer's current batch on.
-
-    Args:
-        buffer: Makes the batches.
-        owner: Knows the trainer's current batch, rank and device.
-    """
+    """Iterates over the batches of a buffer, from the current batch of the owner's trainer on."""
 
     def __init__(self, buffer: TrajectoryBuffer, owner: TrajectoryDataModule) -> None:
         self.buffer, self.owner = buffer, owner

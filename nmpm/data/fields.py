@@ -25,18 +25,12 @@ _SAME = 1e-6
 
 @dataclass
 class FieldFacts:
-    """Values of a field in the trajectories seen so far.
+    """Values of a field in the trajectories seen so far, of moving particles."""
 
-    Args:
-        shape: Of the first one.
-        low, high: Smallest and largest value of moving particles.
-        evolves: Whether a value changes in time.
-    """
-
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # in the first one
     low: float = np.inf
     high: float = -np.inf
-    evolves: bool = False
+    evolves: bool = False  # whether a value changes in time
 
     @property
     def kind(self) -> Kind:

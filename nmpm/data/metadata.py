@@ -59,37 +59,21 @@ def find_family(name: str) -> Family:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Facts that all trajectories of a dataset share.
+    """Facts that all trajectories of a dataset share; lengths in domain length, times in seconds."""
 
-    Args:
-        bounds: Where particles may be, (lower, upper) per axis, in domain length.
-        dt: Time between stored frames, in seconds (LagrangeBench's `dt` times its `write_every`).
-        dim: Number of space dimensions.
-        sequence_length: Frames per trajectory as the dataset declares them.
-        particle_types: Name of each particle type id.
-        static_types: Ids of the types that do not move.
-        periodic: Whether each axis is periodic; none when left out.
-        domain: What a grid should cover, (lower, upper) per axis, or None.
-        gravity: Acceleration in length/s² per axis, or None where unknown.
-        particle_volume: Volume of a particle in length ** dim, or None where unknown.
-        densities: Mass density of materials in kg / length ** dim, by name; empty where unknown.
-        fields: Names of the fields that every trajectory has, which are inputs of models.
-        extra: Every other key of the file, unchanged.
-    """
-
-    bounds: tuple[Interval, ...]
-    dt: float
+    bounds: tuple[Interval, ...]  # where particles may be, (lower, upper) per axis
+    dt: float  # time between stored frames (LagrangeBench's `dt` times its `write_every`)
     dim: int
-    sequence_length: int
-    particle_types: dict[int, str]
-    static_types: frozenset[int] = frozenset()
-    periodic: tuple[bool, ...] = ()
-    domain: tuple[Interval, ...] | None = None
-    gravity: tuple[float, ...] | None = None
-    particle_volume: float | None = None
-    densities: dict[str, float] = field(default_factory=dict)
-    fields: tuple[str, ...] = ()
-    extra: dict[str, Any] = field(default_factory=dict)
+    sequence_length: int  # frames per trajectory as the dataset declares them
+    particle_types: dict[int, str]  # name of each type id
+    static_types: frozenset[int] = frozenset()  # ids of the types that do not move
+    periodic: tuple[bool, ...] = ()  # per axis; none is when left out
+    domain: tuple[Interval, ...] | None = None  # what a grid should cover, (lower, upper) per axis
+    gravity: tuple[float, ...] | None = None  # acceleration in length/s² per axis; None where unknown
+    particle_volume: float | None = None  # in length ** dim; None where unknown
+    densities: dict[str, float] = field(default_factory=dict)  # of materials, in kg / length ** dim, where known
+    fields: tuple[str, ...] = ()  # names of the fields that every trajectory has, which are inputs of models
+    extra: dict[str, Any] = field(default_factory=dict)  # every other key of the file, unchanged
 
     def __post_init__(self) -> None:
         if not self.periodic:

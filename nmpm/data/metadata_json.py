@@ -47,14 +47,9 @@ def parse_metadata(
     problems: list[str] | None = None,
     substitutes: Mapping[str, Any] | None = None,
 ) -> Metadata:
-    """As `read_metadata`, of a JSON object.
+    """As `read_metadata`, of the JSON object of a file.
 
-    Args:
-        plain: The object.
-        where: Its file, for error messages.
-        family: Meaning of the type ids where it does not state it.
-        problems: Collects what is wrong with it; when left out, the first problem is raised.
-        substitutes: Where problems are collected, values of the keys that are missing or wrong.
+    Where problems are collected instead of raised, `substitutes` are the values of keys that are missing or wrong.
     """
     check_plain(plain, where)
     keys = JsonKeys(where, plain, problems, substitutes)
@@ -154,13 +149,10 @@ REQUIRED: Any = object()
 
 
 class JsonKeys:
-    """The keys of a JSON object that are not taken yet.
+    """The keys of a JSON object in a file that are not taken yet.
 
-    Args:
-        where: The object's file.
-        plain: The object.
-        problems: Collects what is wrong; None raises it.
-        substitutes: Where problems are collected, values for keys that are missing or wrong; others take the default.
+    Where problems are collected instead of raised, keys that are missing or wrong have the value of `substitutes`, or
+    else their default.
     """
 
     def __init__(

@@ -48,20 +48,14 @@ T = TypeVar("T")
 class SimulationRequest:
     """Everything that determines a simulated dataset.
 
-    Args:
-        preset: The family of scenes.
-        counts: Trajectories in each of the splits train, valid and test; no file is written for 0.
-        seed: The seeds of all trajectories are derived from it.
-        redrawn: By split and index, the trajectories whose first seeds were unstable, and how many were. Known once
-            they are simulated.
-
     Raises:
         ConfigError: if a split is unknown or missing, all are empty, or a number is negative.
     """
 
-    preset: Preset
-    counts: Mapping[str, int]
-    seed: int = 0
+    preset: Preset  # the family of scenes
+    counts: Mapping[str, int]  # trajectories in each of the splits train, valid and test; no file is written for 0
+    seed: int = 0  # the seeds of all trajectories are derived from it
+    # By split and index, how many first seeds of a trajectory were unstable; known once it is simulated.
     redrawn: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -23,28 +23,18 @@ UNKNOWN_LENGTH = 0
 class Options:
     """Facts that a user states where the files are silent or wrong; None takes what the files state.
 
-    Args:
-        family: Meaning of the type ids: "deepmind", "lagrangebench", "jax-sph".
-        types: Names of type ids; they override those of the family and the files.
-        static: Type ids that do not move.
-        bounds: Where particles may be, (lower, upper) per axis, in domain length.
-        dt: Time between stored frames, in seconds.
-        gravity: Acceleration in length/s² per axis.
-        boundary: "wall" or "periodic" per axis.
-        fields: Names of the fields that are inputs of models.
-
     Raises:
         ConfigError: for another boundary, or a name that no field can have.
     """
 
-    family: str | None = None
-    types: Mapping[int, str] | None = None
-    static: frozenset[int] | None = None
-    bounds: Sequence[Interval] | None = None
-    dt: float | None = None
-    gravity: Sequence[float] | None = None
-    boundary: Sequence[Boundary] | None = None
-    fields: Sequence[str] | None = None
+    family: str | None = None  # meaning of the type ids: "deepmind", "lagrangebench", "jax-sph"
+    types: Mapping[int, str] | None = None  # names of type ids; they override those of the family and the files
+    static: frozenset[int] | None = None  # type ids that do not move
+    bounds: Sequence[Interval] | None = None  # where particles may be, (lower, upper) per axis, in domain length
+    dt: float | None = None  # time between stored frames, in seconds
+    gravity: Sequence[float] | None = None  # acceleration in length/s² per axis
+    boundary: Sequence[Boundary] | None = None  # "wall" or "periodic" per axis
+    fields: Sequence[str] | None = None  # names of the fields that are inputs of models
 
     def __post_init__(self) -> None:
         if self.boundary is not None and not set(self.boundary) <= {"wall", "periodic"}:

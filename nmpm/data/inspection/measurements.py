@@ -37,12 +37,7 @@ class GridFacts:
 
 
 class Measurements:
-    """Accumulates measurements; call `add` for each trajectory.
-
-    Args:
-        metadata: Of the dataset.
-        domain: Extent of the grids, (lower, upper) per axis.
-    """
+    """Accumulates measurements of a dataset's trajectories; `domain` is the extent of the grids."""
 
     def __init__(self, metadata: Metadata, domain: Sequence[Interval]) -> None:
         self.metadata = metadata

@@ -66,12 +66,7 @@ def open_dataset(source: FolderSource) -> OpenedDataset:
 
 
 def guess_family(ids: Iterable[int], plain: Mapping[str, Any]) -> str:
-    """The family of particle types that knows the most of the ids; LagrangeBench's where its metadata keys occur.
-
-    Args:
-        ids: Particle type ids that occur.
-        plain: The metadata's JSON object.
-    """
+    """The family that knows the most of the type ids; of equal ones LagrangeBench's where its metadata keys occur."""
     names = ["deepmind", "lagrangebench", "jax-sph"]
     if "periodic_boundary_conditions" in plain:
         names = names[1:] + names[:1]

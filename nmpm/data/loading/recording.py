@@ -24,29 +24,21 @@ from nmpm.scene import Scene
 
 @dataclass(frozen=True)
 class Recording:
-    """One trajectory of a known scene.
+    """One trajectory of a known scene; all values are finite."""
 
-    Args:
-        frames: (T, N, D) float32 positions of the moving particles, in domain length.
-        material: (N,) int64 index into `Scene.materials`.
-        obstacle: (M, D) float32 positions of the static particles.
-        gravity: (D,) float32 in length per frame squared, zero where unknown.
-        fields: By name, float32 (T, N), (1, N) if constant in time, or (1, 1) if it is the trajectory's; all finite.
-    """
-
-    frames: Tensor
-    material: Tensor
-    obstacle: Tensor
-    gravity: Tensor
-    fields: Mapping[str, Tensor] = field(default_factory=dict)
+    frames: Tensor  # (T, N, D) float32 positions of the moving particles, in domain length
+    material: Tensor  # (N,) int64 index into `Scene.materials`
+    obstacle: Tensor  # (M, D) float32 positions of the static particles
+    gravity: Tensor  # (D,) float32 in length per frame squared, zero where unknown
+    fields: Mapping[str, Tensor] = field(default_factory=dict)  # float32 (T, N), (1, N) if constant in time, or (1, 1)
 
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """Converts trajectories to recordings and validates them."""
+    """Converts trajectories of a scene to recordings and validates them; the metadata name the type ids."""
 
-    metadata: Metadata  # names the type ids
-    scene: Scene  # the trajectories' scene
+    metadata: Metadata
+    scene: Scene
 
     def recording(self, trajectory: Trajectory, where: str) -> Recording:
         """Converts a trajectory, with its fields as `read_fields` gives them; `where` names it in errors.

@@ -116,9 +116,8 @@ class SimulatedRecordings:
         with self._lock:
             if key in self._requests and self._requests[key].failed:
                 del self._requests[key]
-            first = not self._requests
             if key not in self._requests:
-                simulate = self._simulate_first if first else self._simulate
+                simulate = self._simulate if self._requests else self._simulate_first
                 self._requests[key] = Task(partial(simulate, key))
             while len(self._requests) > _CACHED_REQUESTS:
                 self._requests.popitem(last=False)

@@ -101,13 +101,18 @@ class WindowPlan:
 
     def locate(self, index: int, world: int) -> tuple[int, int]:
         """Index of the buffer that a batch is drawn from, and the number of its windows drawn before."""
-        stride, per_buffer = self._stride(world), self.batches_per_buffer(world)
-        since = index - self.start.batch
-        first_buffer = max(0, per_buffer - self.start.drawn // stride)
-        if since < first_buffer:
-            return self.start.buffer, self.start.drawn + since * stride
-        buffers, turn = divmod(since - first_buffer, per_buffer)
-        return self.start.buffer + 1 + buffers, turn * stride
+        buffer, drawn, batches = self._buffer_of(index, world)
+        return buffer, drawn + (index - batches.start) * self._stride(world)
+
+    def _buffer_of(self, index: int, world: int) -> tuple[int, int, range]:
+        """A batch's buffer, the number of its windows drawn before its first batch, and the indices of its batches."""
+        start, count = self.start, self.batches_per_buffer(world)
+        left = max(0, count - start.drawn // self._stride(world))
+        if index - start.batch < left:
+            return start.buffer, start.drawn, range(start.batch, start.batch + left)
+        buffers = (index - start.batch - left) // count
+        first = start.batch + left + buffers * count
+        return start.buffer + 1 + buffers, 0, range(first, first + count)
 
     def batch(self, index: int, rank: int, world: int) -> list[Drawn]:
         """The windows of a rank's batch before buckets are dealt, each as (trajectory index, first frame)."""
@@ -155,14 +160,9 @@ class WindowPlan:
 
     def bucket_of(self, index: int, world: int) -> range:
         """Indices of the batches whose windows are sorted together with those of a batch; all of one buffer."""
-        stride, since = self._stride(world), index - self.start.batch
-        left = max(0, self.batches_per_buffer(world) - self.start.drawn // stride)
-        first, count = self.start.batch, left
-        if since >= left:
-            count = self.batches_per_buffer(world)
-            first += left + (since - left) // count * count
-        low = first + (index - first) // self.bucket * self.bucket
-        return range(low, min(low + self.bucket, first + count))
+        _, _, batches = self._buffer_of(index, world)
+        low = batches.start + (index - batches.start) // self.bucket * self.bucket
+        return range(low, min(low + self.bucket, batches.stop))
 
     def deal(self, bucket: range, windows: Sequence[T], sizes: Sequence[int]) -> list[list[T]]:
         """The windows of a bucket's batches, in order and of all ranks together, dealt to these batches by size."""
