@@ -15,15 +15,8 @@ from nmpm.scene import Interval, Scene
 def thrown_blocks(scene: Scene, count: int = 1000, blocks: int = 1, speed: float = 1.0, seed: int = 0) -> Particles:
     """Square blocks (cubes) of particles on a lattice at the scene's own density, side by side along the first axis.
 
-    Args:
-        scene: Gives box, particle volume, materials (dealt to the blocks in turn) and gravity.
-        count: About how many particles in all.
-        blocks: How many blocks.
-        speed: Largest initial speed along each axis, in length per second.
-        seed: Of places and velocities.
-
-    Returns:
-        One scene (B = 1) without obstacles.
+    About `count` particles in all, of the scene's materials in turn, with random velocities up to `speed` in length per
+    second along each axis: one scene (B = 1) without obstacles.
 
     Raises:
         ValueError: if the blocks do not fit into the box.

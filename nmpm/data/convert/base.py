@@ -72,21 +72,13 @@ class Options:
 
 @dataclass(frozen=True)
 class ForeignDataset:
-    """An opened dataset of another format.
-
-    Args:
-        metadata: Facts that all trajectories share.
-        splits: For each of "train", "valid" and "test" that exists, a function that starts reading its trajectories.
-        notes: Sentences for the user, on assumptions and inconsistencies.
-        counts: Trajectories per split; None where only reading them all would tell.
-        assumed: Fields of the metadata that the files do not state.
-    """
+    """An opened dataset of another format."""
 
     metadata: Metadata
-    splits: Mapping[str, Callable[[], Iterator[Trajectory]]]
-    notes: tuple[str, ...] = ()
-    counts: Mapping[str, int | None] = field(default_factory=dict)
-    assumed: frozenset[str] = frozenset()
+    splits: Mapping[str, Callable[[], Iterator[Trajectory]]]  # of "train", "valid", "test": starts to read trajectories
+    notes: tuple[str, ...] = ()  # for the user, on assumptions and inconsistencies
+    counts: Mapping[str, int | None] = field(default_factory=dict)  # None where only reading all would tell
+    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
 
 
 class DatasetFormat(abc.ABC):
