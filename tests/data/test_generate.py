@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -212,6 +213,13 @@ class TestShards:
         processes = [start_shard(tmp_path, shard) for shard in ("1/2", "2/2")]
         assert 0 in [int(process.communicate(timeout=120)[0]) for process in processes]
         assert fingerprints(tmp_path) == fingerprints(made)
+
+    def test_parts_that_were_copied_together_are_merged(self, made, tmp_path):
+        for shard, name in (("1/2", "a"), ("2/2", "b")):
+            run_shard(tmp_path / name, shard)
+        shutil.copytree(tmp_path / "a" / ".parts", tmp_path / "b" / ".parts", dirs_exist_ok=True)
+        generate(TINY, tmp_path / "b", COUNTS, seed=5, workers=1)
+        assert fingerprints(tmp_path / "b") == fingerprints(made)
 
     def test_wrong_ones_and_those_of_other_datasets_are_refused(self, tmp_path):
         run_shard(tmp_path, "1/2", seed=1)

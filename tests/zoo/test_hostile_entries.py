@@ -3,6 +3,7 @@
 import copy
 import json
 import os
+import pickle
 import resource
 import struct
 
@@ -94,6 +95,7 @@ def weights(emulator, **changes) -> bytes:
     ("changes", "message"),
     [
         (b"", "model.safetensors is not a file of tensors"),
+        (pickle.dumps(print), "model.safetensors is not a file of tensors"),
         (struct.pack("<Q", 2**63) + b"{}", "model.safetensors is not a file of tensors"),
         (struct.pack("<Q", len(HEADER)) + HEADER, "model.safetensors is not a file of tensors"),
         ({"input_mean": None}, "lacks tensors input_mean"),
@@ -103,7 +105,7 @@ def weights(emulator, **changes) -> bytes:
         ({"calibrated": torch.zeros(())}, "calibrated is of torch.float32"),
         ({"input_mean": torch.full((4, 1, 1), float("inf"))}, "input_mean holds values that are not finite"),
     ],
-    ids=["empty", "length", "header", "missing", "unknown", "shape", "complex", "real", "infinite"],
+    ids=["empty", "pickle", "length", "header", "missing", "unknown", "shape", "complex", "real", "infinite"],
 )
 def test_weights_that_lie_or_are_of_other_models(root, small, write_entry, changes, message):
     write_entry(root / "small", small, changes if isinstance(changes, bytes) else weights(small, **changes))
