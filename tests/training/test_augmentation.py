@@ -1,27 +1,19 @@
 import pytest
 import torch
-from scenes import box, cloud
 
 from nmpm.data import catalog
-from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.particles import Window
-from nmpm.processors import UNet
 from nmpm.training import EmulatorModule
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_windows, with_jitter
-
-
-def window_of(scene, batch=3):
-    particles = cloud(scene, batch=batch, statics=4)
-    frames = particles.position[:, None] + torch.arange(4).view(1, -1, 1, 1) * particles.velocity[:, None]
-    rest = (particles.material, particles.mask, particles.obstacle, particles.obstacle_mask, particles.gravity)
-    return Window(frames, *rest)
+from tests.scenes import box, cloud, emulator_of, window_of
 
 
 def test_a_mirror_image_reflects_one_axis_of_the_chosen_windows_about_the_middle():
     scene = box(gravity=(1.0, -9.81), gravity_varies=True, obstacles=True)
-    window, chosen = window_of(scene), torch.tensor([True, False, True])
+    particles, chosen = cloud(scene, batch=3, statics=4), torch.tensor([True, False, True])
+    moved = torch.arange(4).view(1, -1, 1, 1) * particles.velocity[:, None]
+    window = window_of(particles, particles.position[:, None] + moved)
     image = mirror_windows(window, scene, 0, chosen)
     assert torch.allclose(image.frames[chosen][..., 0], 1.0 - window.frames[chosen][..., 0])
     assert torch.allclose(image.obstacle[chosen][..., 0], 1.0 - window.obstacle[chosen][..., 0])
@@ -62,8 +54,7 @@ def test_embedded_datasets_can_be_mirrored(name):
 
 
 def test_jitter_moves_the_grid_by_less_than_asked_and_keeps_the_weights():
-    torch.manual_seed(0)
-    emulator = EmulatorRecipe(box(), 16, 2, processor=UNet(width=4, depth=1, perceptron=(4,))).build()
+    emulator = emulator_of(box(), frames=2)
     assert with_jitter(emulator, 0.0) is emulator
     moves = []
     for _ in range(200):
@@ -85,8 +76,7 @@ def test_jitter_moves_the_grid_by_less_than_asked_and_keeps_the_weights():
     ],
 )
 def test_jitter_leaves_walls_on_the_grid(changes, limits):
-    torch.manual_seed(0)
-    emulator = EmulatorRecipe(box(**changes), 16, 1, processor=UNet(width=4, depth=1, perceptron=(4,))).build()
+    emulator = emulator_of(box(**changes), frames=2)
     moved = [with_jitter(emulator, 0.3).grid.lower for _ in range(300)]  # raises if a wall leaves it
     steps = (torch.tensor(moved) - torch.tensor(emulator.grid.lower)) / torch.tensor(emulator.grid.spacing)
     assert (steps.abs().amax(0) <= torch.tensor(limits) + 1e-3).all()

@@ -1,4 +1,4 @@
-"""Trainings on data with fields: losses, metrics, resuming, and other data than the model's."""
+"""Trainings on data with fields: metrics, resuming, and other data than the model's."""
 
 import h5py
 import numpy as np
@@ -7,11 +7,10 @@ import torch
 
 from nmpm.errors import ConfigError
 from nmpm.metrics import FieldMSE
-from nmpm.particles import Window
 from nmpm.training import EmulatorModule
 from nmpm.training.checkpoints import load_module
-from nmpm.training.losses import field_error
 from nmpm.zoo.pretrained import Pretrained
+from tests.scenes import box, cloud, window_of
 from tests.trainings import data_of, module_of, trainer_of
 
 
@@ -20,42 +19,26 @@ def heated(make_dataset):
     return make_dataset(fields=("temperature",))
 
 
-def window_of(target, mask):
-    batch, frames, count = target.shape
-    return Window(
-        torch.zeros(batch, frames, count, 2), torch.zeros(batch, count, dtype=torch.int64), mask,
-        torch.zeros(batch, 0, 2), torch.zeros(batch, 0, dtype=torch.bool), torch.zeros(batch, 2), {"heat": target},
-    )  # fmt: skip
-
-
-def test_the_loss_is_the_mean_square_in_units_of_the_spread():
-    target, mask = torch.zeros(2, 6, 3), torch.tensor([[True, True, True], [True, False, False]])
-    predicted = torch.full((2, 4, 3), 0.2)
-    predicted[1, :, 1:] = 1e6
-    fields, spread = {"heat": predicted, "other": predicted}, {"heat": torch.tensor(0.1)}
-    error = field_error(fields, window_of(target, mask), spread, frames=2, power=0.5)
-    assert float(error) == pytest.approx((4 + 1e-4) ** 0.5)
-
-
 def test_the_metric_is_a_mean_over_trajectories_beside_nothing_changing():
-    target = torch.arange(4.0).view(1, 4, 1).expand(1, 4, 3)
-    mask = torch.tensor([[True, True, False]])
+    target, state = torch.arange(4.0).view(1, 4, 1).expand(1, 4, 3), cloud(box(), count=3)
+    state.mask[:, 2] = False
+    window = window_of(state, state.position.unsqueeze(1).expand(-1, 4, -1, -1))
+    window.fields = {"heat": target}
     metric = FieldMSE(["heat"])
     for shift in (1.0, 3.0):
-        metric.update(window_of(target, mask), {"heat": target[:, 2:] + shift})
+        metric.update(window, {"heat": target[:, 2:] + shift})
     assert {name: float(value) for name, value in metric.compute().items()} == {
         "mse_heat": 5.0,
         "still/mse_heat": 2.5,
     }
     empty = FieldMSE([])
-    empty.update(window_of(target, mask), {})
+    empty.update(window, {})
     assert empty.compute() == {}
 
 
 def test_a_resumed_training_with_fields_ends_with_the_same_weights(heated, tmp_path):
     def made():
-        data = data_of(heated)
-        return module_of(data), data
+        return module_of(data_of(heated)), data_of(heated)
 
     whole, resumed = made(), made()
     assert whole[0].emulator.scene.evolving == ("temperature",)
