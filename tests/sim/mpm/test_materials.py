@@ -50,6 +50,19 @@ def test_is_stress_free_at_rest(material, dim):
     np.testing.assert_array_equal(stress, 0)
 
 
+@pytest.mark.parametrize("solid", [GOOP, SAND], ids=lambda m: m.name)
+def test_small_strains_below_yield_give_hookes_law_and_are_recovered(solid):
+    """Plane strain, ε = the gradient's symmetric part × 1e-4: (λ + μ) tr ε · I + 2 μ dev ε; rotation adds nothing."""
+    gradient = np.array([[-2.0, 0.7], [-0.3, -1.6]])
+    strain = 1e-4 * (gradient + gradient.T) / 2
+    spherical = np.trace(strain) / 2 * np.eye(2)
+    hooke = (2 * solid.bulk_modulus * spherical + 2 * solid.shear_modulus * (strain - spherical)).ravel()[[0, 1, 3]]
+    state, stress = respond(solid, gradient, dt=1e-5, substeps=10)
+    assert stress == pytest.approx(hooke, rel=2e-3)
+    _, stress = respond(solid, -gradient, state, dt=1e-5, substeps=6)
+    assert stress == pytest.approx(0.4 * hooke, rel=2e-3)
+
+
 @pytest.mark.parametrize("rate", [1.0, 10.0, 50.0])
 def test_steady_shear_has_the_stress_of_a_bingham_fluid(rate):
     _, stress = respond(GOOP, [[0, rate], [0, 0]], dt=1e-5, substeps=5000)

@@ -1,5 +1,7 @@
 """Substeps in two and three dimensions: free fall, conservation, walls, friction."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from columns import at_rest, lattice, run, tank
@@ -85,6 +87,24 @@ def test_momentum_and_angular_momentum_are_conserved_away_from_walls(dim, materi
     np.testing.assert_allclose(momenta()[1], angular, rtol=1e-8, atol=1e-10 * particles.mass.sum())
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_grid_receives_the_mass_and_momentum_of_the_particles(dim):
+    """Whatever their velocity gradients and stresses, and with gravity's impulse."""
+    rng, dt = np.random.default_rng(0), 1e-3
+    position = cloud((0.15,) * dim, (6, 8, 5)[:dim])
+    particles = state(position, rng.normal(size=position.shape))
+    particles.strain[:] = rng.uniform(0.9, 1.0, particles.strain.shape)
+    particles.gradient[:] = rng.normal(scale=20.0, size=particles.gradient.shape)
+    expected = momentum(particles) + particles.mass.sum() * dt * GRAVITY[:dim]
+    stepper = MpmStepper(grid(dim, GRAVITY[:dim]), dt)
+    stepper.step(particles)
+    mass, velocity = stepper._nodes[..., 0], stepper._nodes[..., 1:]
+    assert np.abs(particles.stress).max() > 100, "The test should strain the material."
+    assert mass.sum() == pytest.approx(len(position) * 1000.0 * (SIZE / 2) ** dim, rel=1e-12)
+    received = (mass[..., None] * velocity).reshape(-1, dim).sum(axis=0)
+    np.testing.assert_allclose(received, expected, rtol=1e-9, atol=1e-12 * particles.mass.sum())
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 10.0), st.floats(0.0, 1.0), st.sampled_from(list(Walls)))
 def test_nothing_leaves_the_box_whatever_its_walls(seed, speed, friction, walls):
@@ -134,6 +154,22 @@ def test_a_slab_that_fills_the_depth_moves_as_in_two_dimensions():
     # The end walls disturb the nearest cells of the slab a little: its kernel has no nodes beyond them to lean on.
     inner = box.position.reshape(len(flat), 16, 3)[:, 4:12, :2].mean(axis=1)
     assert np.abs(inner - flat - moved).max() < 0.02 * np.abs(moved).max()
+
+
+@pytest.mark.parametrize("walls", [Walls.SEPARATE, Walls.SLIP])
+def test_the_axes_of_three_dimensions_are_equal(walls):
+    """Without friction, where walls meet only rounding may tell the axes apart."""
+    start = cloud((2 * SIZE,) * 3, (6, 9, 5))
+    moved = []
+    for axes in map(list, permutations(range(3))):
+        box = MpmGrid(np.zeros(3), SIZE, tuple(np.array([8, 9, 8])[axes]), 0.0, GRAVITY[axes], walls)
+        stepper, particles = MpmStepper(box, 2e-4), state(start[:, axes], np.array([2.0, 2.0, -2.0])[axes])
+        stepper.enclose(particles)
+        for _ in range(150):
+            stepper.step(particles)
+        moved.append(particles.position[:, np.argsort(axes)] - start)
+    assert np.abs(moved[0]).max() > SIZE / 2
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[0], np.shape(moved)), atol=1e-9)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import quad
 
 from nmpm.sim.sph.neighbours import PairLists
-from nmpm.sim.sph.sums import NORM, SUPPORT, slope, weight
+from nmpm.sim.sph.sums import NORM, SUPPORT, expansion, pair_geometry, push, slope, weight
 
 LOW, HIGH = np.array([-0.3, 0.1]), np.array([0.9, 0.8])
 
@@ -56,3 +56,25 @@ def test_pairs_are_those_of_brute_force_each_once(position, others, reach):
     assert len(pairs.first) == len(as_set(pairs))
     close = (x[:, None] - lists.wall_x) ** 2 + (y[:, None] - lists.wall_y) ** 2 < reach * reach
     assert as_set(wall_pairs) == as_set(np.nonzero(close))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pair_forces_conserve_momenta_and_viscosity_takes_energy_unless_the_motion_is_rigid(seed):
+    rng, h = np.random.default_rng(seed), 0.1
+    _, x, y, pairs, _ = near(rng.uniform(LOW, HIGH, (80, 2)), np.array([LOW, HIGH]), SUPPORT * h)
+    table = np.stack([x, y, *rng.normal(size=(2, 80)), rng.uniform(900, 1100, 80), x, y])
+
+    def accelerations(pressure, viscosity):
+        table[5:] = 0.0
+        pair_geometry(table, pairs, h)
+        expansion(pairs, table, 1.0, 0.0, np.zeros(2), 0.01 * h * h, np.zeros(80))
+        push(pairs, table, pressure, 1.0, viscosity)
+        return table[5:].copy()
+
+    drag = accelerations(np.zeros(80), 1.0)
+    for ax, ay in (drag, accelerations(rng.normal(size=80), 0.0)):
+        assert np.abs(ax).max() > 1e-6
+        np.testing.assert_allclose([ax.sum(), ay.sum(), (x * ay - y * ax).sum()], 0.0, atol=1e-12 * np.abs(ax).sum())
+    assert (table[2:4] * drag).sum() < 0
+    table[2], table[3] = 1.0 - 3.0 * y, 2.0 + 3.0 * x
+    np.testing.assert_allclose(accelerations(np.zeros(80), 1.0), 0.0, atol=1e-12 * np.abs(drag).max())

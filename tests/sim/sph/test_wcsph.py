@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nmpm.sim import InitialState, load_preset
-from nmpm.sim.sph.boundary import SolidBoundary
+from nmpm.sim.sph.boundary import PolygonObstacle, SolidBoundary
 from nmpm.sim.sph.wcsph import Fluid, SphParticles, SphStepper
 
 H = 0.02
@@ -54,6 +54,37 @@ def test_momentum_and_angular_momentum_are_conserved_away_from_walls():
     np.testing.assert_allclose(state.velocity.sum(0), velocity.sum(0), atol=1e-10)
     before, after = cross(position, velocity).sum(), cross(state.position, state.velocity).sum()
     assert after == pytest.approx(before, abs=1e-10)
+
+
+def test_viscosity_brakes_a_shear_wave_at_its_rate_and_only_takes_energy():
+    """u = sin k y is braked by ν k² u. Its axis is 22.5° from the lattice's, where the lattice favours no direction."""
+    wave, fluid, position = 10.0, dataclasses.replace(WATER, viscosity=5.0), lattice(40, 40, (0.1, 0.1))
+    along, across = np.array([[np.cos(np.pi / 8), np.sin(np.pi / 8)], [-np.sin(np.pi / 8), np.cos(np.pi / 8)]])
+    velocity = 0.1 * np.sin(wave * (position - 0.5) @ across)[:, None] * along
+    states = [run(position, velocity, steps, fluid=fluid)[0] for steps in (0, 50, 100)]
+    inner = np.all(np.abs(states[0].table[:2] - 0.5) < 0.25, axis=0)
+    speed, braking = (along @ states[0].table[rows][:, inner] for rows in (slice(2, 4), slice(5, 7)))
+    rate = -(speed @ braking) / (speed @ speed)
+    assert rate == pytest.approx(fluid.kinematic_viscosity(H) * wave**2, rel=0.02)
+    energies = [(state.velocity**2).sum() for state in states]
+    assert energies[0] > energies[1] > energies[2] > 0
+
+
+def test_a_turned_scene_moves_as_the_straight_one():
+    """A quarter turn of the box, its obstacle, the water and gravity, about the box's middle."""
+    triangle, quarter = np.array([[-0.1, -0.3], [0.15, -0.25], [0.1, -0.1]]), np.array([[0.0, -1.0], [1.0, 0.0]])
+    position, gravity, moved = lattice(15, 10, (-0.2, -0.05)), np.array([2.0, -9.0]), []
+    fluid = dataclasses.replace(WATER, viscosity=1.0, diffusion=0.1)
+    for turn in (np.eye(2), quarter):
+        boundary = SolidBoundary(((-0.3, 0.3), (-0.3, 0.3)), (PolygonObstacle(triangle @ turn.T),), H)
+        state = SphParticles(position @ turn.T, np.zeros_like(position), fluid.density)
+        stepper = SphStepper(fluid, boundary, H, turn @ gravity, DT)
+        stepper.initialise(state)
+        for _ in range(800):
+            stepper.step(state)
+        moved.append(state.position @ turn - position)
+    assert np.abs(moved[0] - gravity * (800 * DT) ** 2 / 2).max() > H, "Walls and obstacle should stop some water."
+    np.testing.assert_allclose(moved[1], moved[0], atol=1e-6 * H)
 
 
 @pytest.mark.parametrize(("diffusion", "tolerance"), [pytest.param(0.0, 0.2, marks=pytest.mark.slow), (0.1, 0.05)])
