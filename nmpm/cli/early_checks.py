@@ -48,7 +48,7 @@ class Option(NamedTuple):
 
 
 def read_options(words: Sequence[str]) -> list[Option]:
-    """The options that words are: `--key value`, `--key=value`, `--flag`, or words on their own.
+    """The options among words: with a value that follows or stands behind `=`, or without; and words on their own.
 
     The value of --config becomes the path of the file that it means; ConfigError if there is none.
     """

@@ -87,7 +87,7 @@ def test_an_interruption_says_how_to_go_on(tmp_path):
                 time.sleep(0.1)
             time.sleep(1)
             process.send_signal(signal.SIGINT)
-            assert "the same command continues after the finished trajectories" in process.communicate(timeout=60)[1]
+            assert "the same command continues after finished trajectories" in process.communicate(timeout=60)[1]
         finally:
             process.kill()
     assert process.returncode == 130
