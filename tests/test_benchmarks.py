@@ -170,7 +170,7 @@ def test_every_variant_of_a_sweep_builds_a_model(name):
 
 
 def test_a_tree_equals_itself():
-    text = run_script("frozen", str(ROOT.parent), "--only", "rollouts", "--models", "goop", "--rounds", "1")
+    text = run_script("frozen", str(ROOT.parent), "--only", "rollouts", "--models", "goop", "--rounds", "2")
     assert [line.split("  ")[-1].count("ms a frame") for line in text.splitlines()[1:]] == [1] * 4
     assert text.count(" 0.0e+00  0.0e+00 ") == 4
 

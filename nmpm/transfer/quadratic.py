@@ -88,7 +88,7 @@ class Affine(Quadratic):
         at_nodes = velocity.unsqueeze(2) + torch.einsum("bnde,bnje->bnjd", gradient, offset)
         values = torch.einsum("bnm,bnjd->bnjmd", membership, at_nodes).flatten(-2)
         sums = (_scattered(stencil, values, grid.size), count)
-        momentum, number = (each.transpose(1, 2).reshape(len(each), -1, *grid.shape) for each in sums)
+        momentum, number = (each.transpose(1, 2).reshape(each.shape[0], -1, *grid.shape) for each in sums)
         return momentum, number
 
     def _slopes(

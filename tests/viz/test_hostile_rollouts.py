@@ -28,8 +28,8 @@ VALUES = (None, -1, 0, 1e-308, 1e308, float("nan"), "a", "", [], [[0, 1]], [[1, 
 ARRAYS = (0, -1, float("nan"), b"\xff\xfe", "text", [], [3.5, 1e300], [[3], [4]], np.array([1j]), h5py.Empty("f4"))
 
 
-def written() -> bytes:
-    """A file as `nmpm rollout` writes it."""
+def write(path) -> None:
+    """Write a file as `nmpm rollout` does."""
     generator = torch.Generator().manual_seed(0)
     position = 0.2 + 0.5 * torch.rand(1, 4, 2, generator=generator)
     state = Particles(
@@ -38,9 +38,7 @@ def written() -> bytes:
     )  # fmt: skip
     predicted = position[:, None] + 0.01 * torch.arange(3)[None, :, None, None]
     fields, truth = {"heat": predicted[..., 0]}, position[:, None].expand(-1, 4, -1, -1)
-    file = io.BytesIO()
-    write_split(file, [predicted_trajectory(SCENE, state, predicted, "a test", fields=fields, truth=truth)])
-    return file.getvalue()
+    write_split(path, [predicted_trajectory(SCENE, state, predicted, "a test", fields=fields, truth=truth)])
 
 
 def draw(path, truth):
@@ -85,8 +83,9 @@ def mutated(content, rng):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_damaged_and_foreign_files_are_drawn_or_refused_in_one_line(tmp_path):
-    content, path, truth, rng = written(), tmp_path / "out.h5", tmp_path / "truth.h5", random.Random(0)
-    truth.write_bytes(content)
+    path, truth, rng = tmp_path / "out.h5", tmp_path / "truth.h5", random.Random(0)
+    write(truth)
+    content = truth.read_bytes()
     assert not draw(truth, truth)
     complaints = []
     for _ in range(300):
