@@ -56,6 +56,8 @@ class Particles(_Batched):
         obstacle_mask: (B, M) bool, False for padding.
         gravity: (B, D) in length per frame squared; zero where unknown.
         fields: By name, (B, N) values of the particles, or (B, 1) where each scene has one value.
+        obstacle_velocity: (B, M, D) in length per frame; None where no obstacle moves.
+        volume: (B, N) volume of each particle as a multiple of the scene's `particle_volume`; None for 1.
         obstacle_share: (B, M) how much of a particle's volume each obstacle particle stands for; None for all of it.
             Bodies that are rasterised softly (`nmpm.emulator.bodies`) have shares, and gradients through them.
 
@@ -72,11 +74,15 @@ class Particles(_Batched):
     gravity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     obstacle_share: Tensor | None = None
+    obstacle_velocity: Tensor | None = None
+    volume: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
         _check_shapes(self, batch, count, dim, [(batch, count), (batch, 1)])
         _check_shape("Particles.velocity", self.velocity, [(batch, count, dim)])
+        if self.obstacle_velocity is not None:
+            _check_shape("Particles.obstacle_velocity", self.obstacle_velocity, [tuple(self.obstacle.shape)])
 
     def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
         """The same particles elsewhere: (B, N, D) positions and velocities."""
@@ -92,10 +98,13 @@ class Window(_Batched):
     """Consecutive recorded frames of B scenes: two to start from, the rest to predict.
 
     Args:
-        frames: (B, T, N, D) positions in domain length, T >= 2.
-        material, mask, obstacle, obstacle_mask, gravity, obstacle_share: as in `Particles`.
+        frames: (B, T, N, D) positions in domain length, T >= 2; finite also where a particle is absent.
+        material, mask, obstacle, obstacle_mask, gravity, obstacle_share, volume: as in `Particles`.
         fields: By name, (B, T, N) values of the particles, or (B, 1, N) if they are constant in time, or (B, 1, 1)
             where each scene has one value.
+        present: (B, T, N) bool, whether each particle is there in each frame; None where all of `mask` always are.
+        obstacle_frames: (B, T, M, D) positions of obstacles in each frame; None where no obstacle moves. `obstacle`
+            has those of the second frame.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -109,12 +118,19 @@ class Window(_Batched):
     gravity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     obstacle_share: Tensor | None = None
+    present: Tensor | None = None
+    obstacle_frames: Tensor | None = None
+    volume: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
         if frames < 2:
             raise ValueError(f"A window needs at least 2 frames, for a velocity; it has {frames}.")
         _check_shapes(self, batch, count, dim, [(batch, frames, count), (batch, 1, count), (batch, 1, 1)])
+        if self.present is not None:
+            _check_shape("Window.present", self.present, [(batch, frames, count)])
+        if self.obstacle_frames is not None:
+            _check_shape("Window.obstacle_frames", self.obstacle_frames, [(batch, frames, *self.obstacle.shape[1:])])
 
     @classmethod
     def of(cls, state: Particles) -> Self:
@@ -128,27 +144,37 @@ class Window(_Batched):
             gravity=state.gravity,
             fields={name: values.unsqueeze(1) for name, values in state.fields.items()},
             obstacle_share=state.obstacle_share,
+            volume=state.volume,
         )
 
     @property
     def initial(self) -> Particles:
-        """The state at the window's second frame."""
+        """The state at the window's second frame, of the particles that are there in the first two."""
+        moved = self.obstacle_frames
         return Particles(
             position=self.frames[:, 1],
             velocity=self.frames[:, 1] - self.frames[:, 0],
             material=self.material,
-            mask=self.mask,
+            mask=self.mask if self.present is None else self.mask & self.present[:, 0] & self.present[:, 1],
             obstacle=self.obstacle,
             obstacle_mask=self.obstacle_mask,
             gravity=self.gravity,
             fields={name: values[:, min(1, values.shape[1] - 1)] for name, values in self.fields.items()},
             obstacle_share=self.obstacle_share,
+            obstacle_velocity=None if moved is None else moved[:, 1] - moved[:, 0],
+            volume=self.volume,
         )
 
     def first(self, frames: int) -> Self:
         """The first frames, two or more."""
-        fields = {name: values[:, :frames] for name, values in self.fields.items()}
-        return dataclasses.replace(self, frames=self.frames[:, :frames], fields=fields)
+        timed: dict[str, Any] = {
+            "frames": self.frames,
+            "present": self.present,
+            "obstacle_frames": self.obstacle_frames,
+        }
+        cut: dict[str, Any] = {name: values[:, :frames] for name, values in timed.items() if values is not None}
+        cut["fields"] = {name: values[:, :frames] for name, values in self.fields.items()}
+        return dataclasses.replace(self, **cut)
 
     @property
     def target(self) -> Tensor:
@@ -176,6 +202,8 @@ def _check_shapes(
     kind = type(owner).__name__
     for name, shape in expected.items():
         _check_shape(f"{kind}.{name}", getattr(owner, name), [shape])
+    if owner.volume is not None:
+        _check_shape(f"{kind}.volume", owner.volume, [(batch, count)])
     if owner.obstacle_share is not None:
         _check_shape(f"{kind}.obstacle_share", owner.obstacle_share, [(batch, statics)])
     for name, values in owner.fields.items():

@@ -16,7 +16,7 @@ from typing import Any, Literal, Self, get_args
 from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 
-Boundary = Literal["wall", "periodic"]
+Boundary = Literal["wall", "periodic", "open"]
 Interval = tuple[float, float]
 
 _RESERVED = frozenset({"position", "particle_type", "velocity", "volume", "solid", "gravity"})
@@ -37,10 +37,12 @@ class Scene:
         dt: Time between frames, in seconds.
         materials: Names of the moving materials, in the order of their channels.
         particle_volume: Volume of one particle, in length ** dim.
-        boundary: "wall" or "periodic" per axis; walls everywhere when left out.
+        boundary: "wall", "periodic" or "open" per axis; walls everywhere when left out. Particles that leave the bounds
+            of an open axis are gone.
         gravity: External acceleration in length per second squared; None where it is not known.
         gravity_varies: Whether each trajectory has its own gravity, so that the model must be told.
-        obstacles: Whether there are particles that do not move.
+        obstacles: Whether there are particles that are not predicted: at rest, or moving as recorded.
+        moving_obstacles: Whether some of them move.
         densities: Mass density of each material, in kg per length ** dim; all the same when left out.
         evolving: Names of per-particle fields that change in time and are predicted, such as a temperature.
         properties: Names of per-particle fields that are constant in time, such as a stiffness.
@@ -63,6 +65,7 @@ class Scene:
     evolving: tuple[str, ...] = ()
     properties: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
+    moving_obstacles: bool = False
 
     def __post_init__(self) -> None:
         if not self.boundary:
@@ -90,6 +93,8 @@ class Scene:
                     f"Axis {axis} is periodic: the bounds {bounds} and the domain {domain} must be the same, one period"
                     " apart."
                 )
+        if self.moving_obstacles and not self.obstacles:
+            raise ConfigError("A scene with moving_obstacles has obstacles.")
         if not (self.dt > 0 and self.particle_volume > 0):
             raise ConfigError(f"dt = {self.dt} and particle_volume = {self.particle_volume} must be positive.")
         if not self.materials or len(set(self.materials)) != len(self.materials):
@@ -147,6 +152,7 @@ class Scene:
         names = [f"{m}.velocity_{a}" for m in self.materials for a in axes]
         names += [f"{m}.volume" for m in self.materials]
         names += ["solid"] if self.walled else []
+        names += [f"solid.velocity_{a}" for a in axes] if self.moving_obstacles else []
         names += [f"gravity_{a}" for a in axes] if self.gravity_varies else []
         names += [f"{m}.{f}" for m in self.materials for f in self.particle_fields]
         return (*names, *self.parameters)
@@ -173,7 +179,7 @@ class Scene:
         Names of materials, their densities and fields are not compared; volumes of particles, which may be estimates,
         are compared to 5%.
         """
-        facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles")
+        facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles", "moving_obstacles")
         different = [name for name in facts if getattr(self, name) != getattr(other, name)]
         if len(self.materials) != len(other.materials):
             different.append("materials")
@@ -199,9 +205,9 @@ class Scene:
         return dataclasses.replace(self, bounds=bounds, domain=domain)
 
     def to_dict(self) -> dict[str, Any]:
-        """The scene as plain lists, strings and numbers; without densities and fields where there are none."""
+        """The scene as plain lists, strings and numbers; without what is optional and absent."""
         plain = dataclasses.asdict(self)
-        for name in ("densities", "evolving", "properties", "parameters"):
+        for name in ("densities", "evolving", "properties", "parameters", "moving_obstacles"):
             if not plain[name]:
                 del plain[name]
         return {key: to_plain(value) for key, value in plain.items()}

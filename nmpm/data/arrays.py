@@ -123,7 +123,7 @@ def scene_metadata(scene: Scene, types: dict[int, str], static_type: int | None)
         sequence_length=1,
         particle_types=types,
         static_types=frozenset() if static_type is None else frozenset({static_type}),
-        periodic=scene.periodic,
+        boundary=scene.boundary,
         domain=scene.domain,
         gravity=scene.gravity,
         particle_volume=scene.particle_volume,

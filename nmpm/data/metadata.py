@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Interval
+from nmpm.scene import Boundary, Interval
 
 METADATA_FILE = "metadata.json"
 PADDING = "padding"
@@ -67,7 +67,8 @@ class Metadata:
     sequence_length: int  # frames per trajectory as the dataset declares them
     particle_types: dict[int, str]  # name of each type id
     static_types: frozenset[int] = frozenset()  # ids of the types that do not move
-    periodic: tuple[bool, ...] = ()  # per axis; none is when left out
+    prescribed_types: frozenset[int] = frozenset()  # ids of obstacles that move as recorded; not among static_types
+    boundary: tuple[Boundary, ...] = ()  # per axis; walls when left out
     domain: tuple[Interval, ...] | None = None  # what a grid should cover, (lower, upper) per axis
     gravity: tuple[float, ...] | None = None  # acceleration in length/s² per axis; None where unknown
     particle_volume: float | None = None  # in length ** dim; None where unknown
@@ -76,14 +77,24 @@ class Metadata:
     extra: dict[str, Any] = field(default_factory=dict)  # every other key of the file, unchanged
 
     def __post_init__(self) -> None:
-        if not self.periodic:
-            object.__setattr__(self, "periodic", (False,) * self.dim)
+        if not self.boundary:
+            object.__setattr__(self, "boundary", ("wall",) * self.dim)
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Whether each axis wraps."""
+        return tuple(kind == "periodic" for kind in self.boundary)
+
+    @property
+    def obstacle_types(self) -> frozenset[int]:
+        """Ids of the types that are not predicted: static, or moving as recorded."""
+        return self.static_types | self.prescribed_types
 
     @property
     def moving_types(self) -> tuple[int, ...]:
-        """Ids of the types that move, in order of id."""
+        """Ids of the materials, which move and are predicted, in order of id."""
         names = self.particle_types
-        return tuple(sorted(i for i in names if i not in self.static_types and names[i] != PADDING))
+        return tuple(sorted(i for i in names if i not in self.obstacle_types and names[i] != PADDING))
 
     def is_moving(self, particle_type: np.ndarray) -> np.ndarray:
         """(N,) bool, of (N,) type ids."""

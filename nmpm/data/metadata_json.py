@@ -1,9 +1,10 @@
 """Reads and writes `metadata.json`: DeepMind's keys, and optional ones for facts that DeepMind's do not state.
 
 Required are `bounds`, `dt`, `dim` and `sequence_length` (as in DeepMind's files this may be one less than the frames
-stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `domain`, `gravity` (length/s²),
-`particle_volume` (length ** dim), `densities` ({"water": 1000}, kg / length ** dim), `periodic_boundary_conditions` and
-`fields` (["temperature"], see `nmpm.data.fields`). All other keys are kept unchanged.
+stored). Optional are `particle_types` ({"7": "goop"}), `static_types` ([3]), `prescribed_types` ([2], obstacles that
+move as recorded), `domain`, `gravity` (length/s²), `particle_volume` (length ** dim), `densities` ({"water": 1000}, kg
+/ length ** dim), `periodic_boundary_conditions`, `boundary` (["wall", "open"], where an axis is open) and `fields`
+(["temperature"], see `nmpm.data.fields`). All other keys are kept unchanged.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_plain, read_bounded
@@ -21,7 +22,7 @@ from nmpm._support.messages import one_line
 from nmpm._support.numbers import is_finite
 from nmpm.data.metadata import FAMILIES, METADATA_FILE, STATIC_NAMES, Metadata, find_family
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Interval, check_field_names
+from nmpm.scene import Boundary, Interval, check_field_names
 
 _BYTES = 2**24
 _LENGTH_KEYS = ("sequence_length", "sequence_length_train", "sequence_length_test")
@@ -58,6 +59,8 @@ def parse_metadata(
     length_key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
     length = keys.peek(length_key, parse_count)
     keys.left.pop("sequence_length", None)
+    periodic = keys.take("periodic_boundary_conditions", lambda value: parse_flags(value, dim), (False,) * dim)
+    kinds: tuple[Boundary, ...] = tuple("periodic" if wraps else "wall" for wraps in periodic)
     return Metadata(
         bounds=keys.take("bounds", lambda value: parse_intervals(value, dim)),
         dt=keys.take("dt", parse_positive) * keys.peek("write_every", parse_positive, 1.0),
@@ -65,7 +68,8 @@ def parse_metadata(
         sequence_length=length,
         particle_types=types,
         static_types=static,
-        periodic=keys.take("periodic_boundary_conditions", lambda value: parse_flags(value, dim), (False,) * dim),
+        prescribed_types=keys.take("prescribed_types", parse_ids, frozenset()),
+        boundary=keys.take("boundary", lambda value: parse_boundary(value, dim), kinds),
         domain=keys.take("domain", lambda value: parse_intervals(value, dim), None),
         gravity=keys.take("gravity", lambda value: parse_vector(value, dim), None),
         particle_volume=keys.take("particle_volume", parse_positive, None),
@@ -105,7 +109,9 @@ def write_metadata(folder: Path, metadata: Metadata) -> None:
         "sequence_length": metadata.sequence_length,
         "particle_types": {str(i): name for i, name in sorted(metadata.particle_types.items())},
         "static_types": sorted(metadata.static_types),
+        "prescribed_types": sorted(metadata.prescribed_types) or None,
         "periodic_boundary_conditions": metadata.periodic,
+        "boundary": metadata.boundary if "open" in metadata.boundary else None,
         "domain": metadata.domain,
         "gravity": metadata.gravity,
         "particle_volume": metadata.particle_volume,
@@ -254,6 +260,13 @@ def parse_flags(value: Any, dim: int) -> tuple[bool, ...]:
     """A truth value for each of `dim` axes; LagrangeBench gives three to two-dimensional scenes as well."""
     _check(_is_list(value, bool) and len(value) >= dim, f"a list of at least {dim} booleans, one per axis")
     return tuple(value[:dim])
+
+
+def parse_boundary(value: Any, dim: int) -> tuple[Boundary, ...]:
+    """The kind of boundary of each of `dim` axes."""
+    known = get_args(Boundary)
+    _check(_is_list(value, str) and len(value) == dim and set(value) <= set(known), f"{', '.join(known)} per axis")
+    return tuple(value)
 
 
 def _is_list(value: Any, kind: type) -> bool:

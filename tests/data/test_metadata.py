@@ -30,23 +30,25 @@ def test_all_keys_are_read(write_keys):
     more = {"gravity": [0, -9.81], "domain": [[0, 1], [0, 1]], "particle_volume": 1e-4, "densities": {"goop": 1000}}
     assert read_metadata(write_keys(**more)) == Metadata(
         bounds=((0.1, 0.9), (0.1, 0.9)), dt=0.0025, dim=2, sequence_length=400,
-        particle_types={3: "boundary", 7: "goop"}, static_types=frozenset({3}), periodic=(False, False),
+        particle_types={3: "boundary", 7: "goop"}, static_types=frozenset({3}), boundary=("wall", "wall"),
         domain=((0.0, 1.0), (0.0, 1.0)), gravity=(0.0, -9.81), particle_volume=1e-4, densities={"goop": 1000.0},
         extra={"default_connectivity_radius": 0.015, "vel_std": [1.0, 2.0]},
     )  # fmt: skip
 
 
 @given(
-    dim=st.integers(1, 3), low=st.floats(-5, 5), dt=st.floats(1e-5, 1), flags=st.booleans(),
+    dim=st.integers(1, 3), low=st.floats(-5, 5), dt=st.floats(1e-5, 1),
+    kind=st.sampled_from(["wall", "periodic", "open"]),
     types=st.dictionaries(st.integers(-1, 20), st.text("abc", min_size=1), min_size=1),
     volume=st.none() | st.floats(1e-9, 1),
 )  # fmt: skip
 @settings(max_examples=10, deadline=None)
-def test_what_is_written_is_read_again(tmp_path_factory, dim, low, dt, types, flags, volume):
+def test_what_is_written_is_read_again(tmp_path_factory, dim, low, dt, types, kind, volume):
     folder = tmp_path_factory.mktemp("metadata")
     metadata = Metadata(
         bounds=((low, low + 1),) * dim, dt=dt, dim=dim, sequence_length=12, particle_types=types,
-        static_types=frozenset(list(types)[:1]), periodic=(flags,) * dim, particle_volume=volume,
+        static_types=frozenset(list(types)[:1]), prescribed_types=frozenset(list(types)[1:2]),
+        boundary=(kind,) * dim, particle_volume=volume,
         extra={"vel_mean": [0.0] * dim, "generator": "made up"},
     )  # fmt: skip
     write_metadata(folder, metadata)

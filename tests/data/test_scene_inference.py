@@ -71,7 +71,7 @@ class TestExtents:
         assert scene.boundary == CHANNEL
         assert scene.domain[0] == scene.bounds[0] == (0.1, 0.9)
         assert scene.domain[1] != scene.bounds[1]
-        stated = replace(BOX, periodic=(True, False), domain=((0.08, 0.92),) * 2)
+        stated = replace(BOX, boundary=("periodic", "wall"), domain=((0.08, 0.92),) * 2)
         with pytest.raises(DataError, match=r"metadata.json: axis 0 is periodic.*\[0.1, 0.9\].*\[0.08, 0.92\].*same"):
             scene_of(STILL, metadata=stated)
         assert scene_of(STILL, metadata=replace(stated, bounds=((0.08, 0.92), (0.1, 0.9)))).domain == stated.domain
@@ -84,7 +84,7 @@ class TestExtents:
         assert scene.gravity == (0, -1)
 
     @pytest.mark.parametrize(
-        "arguments", [{"gravity": [0.0]}, {"bounds": [(0, 1)]}, {"boundary": ["wall"]}, {"boundary": ["wall", "open"]}]
+        "arguments", [{"gravity": [0.0]}, {"bounds": [(0, 1)]}, {"boundary": ["wall"]}, {"boundary": ["wall", "ajar"]}]
     )
     def test_arguments_that_do_not_fit_are_named(self, scene_of, arguments):
         with pytest.raises(ConfigError, match=next(iter(arguments))):
@@ -99,7 +99,7 @@ class TestParticles:
 
     @pytest.mark.parametrize("dim", [1, 2, 3])
     def test_volume_from_the_spacing(self, scene_of, dim):
-        box = replace(BOX, dim=dim, bounds=((0.1, 0.9),) * dim, periodic=())
+        box = replace(BOX, dim=dim, bounds=((0.1, 0.9),) * dim, boundary=())
         scene = scene_of(run(lattice(0.02, dim=dim)), metadata=box)
         assert scene.particle_volume == pytest.approx(0.02**dim, rel=1e-4)
 

@@ -21,7 +21,7 @@ def test_statistics_of_moving_particles_equal_those_computed_at_once():
 def test_displacements_use_the_minimum_image():
     x = np.mod(0.1 + 0.3 * np.arange(8), 0.8) + 0.1
     position = np.stack([x, np.full(8, 0.5)], axis=-1)[:, None].astype(np.float32)
-    statistics = MotionStatistics(made_up_metadata(periodic=(True, False)))
+    statistics = MotionStatistics(made_up_metadata(boundary=("periodic", "wall")))
     statistics.add(Trajectory(position[:2], np.array([7])))
     assert set(statistics.result()) == {"vel_mean", "vel_std"}  # two frames have no acceleration
     statistics.add(Trajectory(position, np.array([7])))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.data.metadata import STATIC_NAMES
@@ -33,12 +33,12 @@ class Options:
     bounds: Sequence[Interval] | None = None  # where particles may be, (lower, upper) per axis, in domain length
     dt: float | None = None  # time between stored frames, in seconds
     gravity: Sequence[float] | None = None  # acceleration in length/s² per axis
-    boundary: Sequence[Boundary] | None = None  # "wall" or "periodic" per axis
+    boundary: Sequence[Boundary] | None = None  # "wall", "periodic" or "open" per axis
     fields: Sequence[str] | None = None  # names of the fields that are inputs of models
 
     def __post_init__(self) -> None:
-        if self.boundary is not None and not set(self.boundary) <= {"wall", "periodic"}:
-            raise ConfigError(f'boundary = {list(self.boundary)} must be "wall" or "periodic" per axis.')
+        if self.boundary is not None and not set(self.boundary) <= set(get_args(Boundary)):
+            raise ConfigError(f"boundary = {list(self.boundary)} must be {', '.join(get_args(Boundary))} per axis.")
         check_field_names(self.fields or ())
 
     def apply_to(self, metadata: Metadata) -> Metadata:
@@ -64,7 +64,7 @@ class Options:
         if self.gravity is not None:
             changes["gravity"] = tuple(map(float, self.gravity))
         if self.boundary is not None:
-            changes["periodic"] = tuple(kind == "periodic" for kind in self.boundary)
+            changes["boundary"] = tuple(self.boundary)
         if self.fields is not None:
             changes["fields"] = tuple(self.fields)
         return replace(metadata, **{name: value for name, value in changes.items() if value is not None})
@@ -79,6 +79,7 @@ class ForeignDataset:
     notes: tuple[str, ...] = ()  # for the user, on assumptions and inconsistencies
     counts: Mapping[str, int | None] = field(default_factory=dict)  # None where only reading all would tell
     assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
+    unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
 
 
 class DatasetFormat(abc.ABC):
