@@ -176,3 +176,17 @@ def split_files(path: Path, pattern: str) -> dict[str, tuple[Path, ...]]:
         if not any(files.values()):
             files = {split_of(path.name) or "test": beside}
     return {split: tuple(sorted(paths, key=order)) for split, paths in files.items() if paths}
+
+
+def split_runs(count: int) -> dict[str, range]:
+    """Splits runs that nobody has split: the last tenth (at least one) for tests, the tenth before to validate.
+
+    One or two runs are all for training.
+    """
+    tenth = max(1, count // 10) if count > 2 else 0
+    parts = {
+        "train": range(count - 2 * tenth),
+        "valid": range(count - 2 * tenth, count - tenth),
+        "test": range(count - tenth, count),
+    }
+    return {split: part for split, part in parts.items() if part}
