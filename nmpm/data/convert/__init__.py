@@ -39,7 +39,9 @@ def open_dataset(path: Path, format_name: str | None = None, options: Options | 
         DataError: if the path is missing, of no known format, or damaged.
         ConfigError: if there is no format of that name, or an option is invalid.
     """
-    return _find_format(Path(path), format_name).open(Path(path), options or Options())
+    options = options or Options()
+    dataset = _find_format(Path(path), format_name).open(Path(path), options)
+    return replace(dataset, unknown=dataset.unknown - options.stated)
 
 
 def _find_format(path: Path, name: str | None) -> DatasetFormat:
@@ -103,7 +105,7 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
     path, options = Path(path).resolve(), options or Options()
     if options.gravity is not None:
         stated = open_dataset(path, options=replace(options, gravity=None))
-        if "gravity" not in stated.assumed:
+        if "gravity" not in stated.assumed | stated.unknown:
             metadata = (path if path.is_dir() else path.parent) / METADATA_FILE
             check_gravity(options.gravity, stated.metadata.gravity, metadata if metadata.is_file() else path)
     cache = user_home() / "converted"

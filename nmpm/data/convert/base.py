@@ -18,6 +18,8 @@ from nmpm.scene import Boundary, Interval, check_field_names
 UNKNOWN_LENGTH = 0
 """`Metadata.sequence_length` where the files do not state it; the conversion sets the length that it finds."""
 
+_SETTLED = ("bounds", "dt", "gravity", "boundary")
+
 
 @dataclass(frozen=True)
 class Options:
@@ -40,6 +42,12 @@ class Options:
         if self.boundary is not None and not set(self.boundary) <= set(get_args(Boundary)):
             raise ConfigError(f"boundary = {list(self.boundary)} must be {', '.join(get_args(Boundary))} per axis.")
         check_field_names(self.fields or ())
+
+    @property
+    def stated(self) -> frozenset[str]:
+        """Fields of the metadata that these facts settle; names of types may be of some types only."""
+        given = {"static_types": self.static, **{name: getattr(self, name) for name in _SETTLED}}
+        return frozenset(name for name, value in given.items() if value is not None)
 
     def apply_to(self, metadata: Metadata) -> Metadata:
         """The metadata with the user's corrections; the family is applied where the type ids are read.

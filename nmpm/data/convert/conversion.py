@@ -6,13 +6,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset
-from nmpm.data.format import SPLITS, Metadata, Trajectory, write_metadata, write_split
+from nmpm.data.facts import FOUND, FactFinder
+from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, write_metadata, write_split
 from nmpm.data.statistics import (
     STATISTICS_KEYS,
     Extent,
@@ -26,6 +28,9 @@ from nmpm.errors import ConfigError, DataError
 NOTES = "conversion"
 STATED = "stated_statistics"
 MOVING_BOUNDARIES = "moving_boundaries"
+_SAMPLE_BYTES = 2**28
+_MOVE_STATISTICS = {"bounds", "boundary", "particle_types", "static_types"}
+"""Facts that displacements of moving particles depend on."""
 
 
 def write_native(source: ForeignDataset, destination: Path, problems: list[str] | None = None) -> tuple[str, ...]:
@@ -54,7 +59,7 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
     names = [name for name in SPLITS if name in source.splits]
     counts = [source.counts.get(name) for name in names]
     total = None if None in counts else sum(count or 0 for count in counts)
-    log = _Log(source.metadata, problems)
+    log = _Log(source, problems)
     with progress_bar("Converting", total) as advance:
         for name in names:
             before = log.number
@@ -67,25 +72,29 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
             log.statistics = log.statistics or log.motion.result()
     if problems and not log.number:
         raise DataError(problems[0])
+    if source.unknown:
+        log.find_unknown(Split(folder / f"{names[0]}.h5"))
     metadata, notes = log.final_metadata()
     write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *notes]}))
-    return (*source.notes, *notes, *log.extent.notes(source.metadata))
+    return (*source.notes, *notes, *log.extent.notes(metadata))
 
 
 class _Log:
     """Collects facts about the trajectories of a conversion.
 
     Args:
-        metadata: As the files state it.
+        source: The dataset.
         problems: Collects what is wrong with trajectories; None raises it.
     """
 
-    def __init__(self, metadata: Metadata, problems: list[str] | None) -> None:
-        self.metadata, self.problems = metadata, problems
-        self.motion, self.statistics = MotionStatistics(metadata), dict[str, list[float]]()
+    def __init__(self, source: ForeignDataset, problems: list[str] | None) -> None:
+        self.metadata, self.unknown, self.problems = source.metadata, source.unknown, problems
+        self.motion, self.statistics = MotionStatistics(self.metadata), dict[str, list[float]]()
         self.number = self.moving_boundaries = self.particles = 0
         self.frames: set[int] = set()
-        self.extent = Extent(metadata.dim)
+        self.extent = Extent(self.metadata.dim)
+        self._finder = FactFinder(self.metadata.dim)
+        self._facts: list[str] = []
 
     def watch(
         self, trajectories: Iterable[Trajectory], split: str, advance: Callable[[], object]
@@ -105,7 +114,9 @@ class _Log:
         types, position, metadata = trajectory.particle_type, trajectory.position, self.metadata
         if position.shape[2] != metadata.dim:
             raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {metadata.dim}.")
-        if self.problems is None:
+        if self.unknown:
+            self._finder.add(trajectory)
+        if self.problems is None and "particle_types" not in self.unknown:
             metadata.check_types(types, where)
         if not self.statistics:
             self.motion.add(trajectory)
@@ -115,6 +126,19 @@ class _Log:
         self.extent.add(position[:, static | metadata.is_moving(types)])
         self.frames.add(len(position))
         self.particles = max(self.particles, position.shape[1])
+
+    def find_unknown(self, split: Split) -> None:
+        """Completes the metadata by facts about the trajectories; `split` is the first one, as written."""
+        self.metadata = self._finder.facts().complete(self.metadata, self.unknown)
+        self._facts = [
+            f"{name} {_short(getattr(self.metadata, name))} ({how.rstrip('.')})."
+            for name, how in self.metadata.extra[FOUND].items()
+        ]
+        if self.unknown & _MOVE_STATISTICS:
+            self.motion = MotionStatistics(self.metadata)
+            for index in split.sample(_SAMPLE_BYTES):
+                self.motion.add(split.read(index))
+            self.statistics = self.motion.result()
 
     def final_metadata(self) -> tuple[Metadata, list[str]]:
         """The metadata with the measured statistics, and notes on inconsistencies."""
@@ -132,9 +156,21 @@ class _Log:
                 f"Particles of a static type move in {self.moving_boundaries} of {self.number} trajectories. Their"
                 " positions are kept; to train on them, state which types are static (--static)."
             )
+        notes += self._facts
         if self.metadata.sequence_length != UNKNOWN_LENGTH:
             return replace(self.metadata, extra=extra), notes + notes_on_lengths(self.frames, self.metadata)
         return replace(self.metadata, extra=extra, sequence_length=max(self.frames) - 1), notes
+
+
+def _short(value: Any) -> str:
+    """A value of the metadata as text, its numbers with four digits."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {name}" for key, name in value.items())
+    if isinstance(value, frozenset | tuple):
+        return "(" + ", ".join(map(_short, value)) + ")" if value else "none"
+    return "unknown" if value is None else str(value)
 
 
 def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDataset:
