@@ -4,6 +4,8 @@ A dataset is a folder with `metadata.json` and `train.h5`, `valid.h5`, `test.h5`
 trajectory, named `00000`, `00001`, …, with the datasets `position` (T, N, D), float32, and `particle_type` (N,),
 integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`. All other datasets of a group, such as
 `temperature` (T, N), are fields and kept unchanged.
+
+A particle that is not there in a frame has NaN in all coordinates of its position there.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from nmpm.data.array_checks import CORE, check_arrays, check_end, check_field, check_positions
 from nmpm.data.hdf5 import (
     FILTERS,
     check_self_contained,
@@ -39,7 +42,6 @@ _OTHER_NAMES = {
 }
 TRUTH = "truth"
 """Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
-_CORE = ("position", "particle_type")
 _CHUNK_BYTES = 2**20
 _LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"
 
@@ -49,13 +51,14 @@ class Trajectory:
     """One recorded run.
 
     Args:
-        position: (T, N, D) float32, in domain length.
+        position: (T, N, D) float32, in domain length; NaN in all coordinates where a particle is absent.
         particle_type: (N,) int64 type ids.
         attributes: Further facts by name, e.g. `gravity` (D,) in length/s², `seed`.
         fields: Further arrays of numbers by name, of any shape and unit, e.g. `temperature` (T, N).
 
     Raises:
-        DataError: if the shapes do not fit together, a position is not finite, or a field is not an array of numbers.
+        DataError: if the shapes do not fit together, a position is infinite or NaN in some coordinates only, or a field
+            is not an array of numbers.
     """
 
     position: np.ndarray
@@ -64,20 +67,25 @@ class Trajectory:
     fields: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_arrays(self.position, self.particle_type, "trajectory")
+        check_arrays(self.position, self.particle_type, "trajectory")
         object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float32))
         object.__setattr__(self, "particle_type", np.asarray(self.particle_type, dtype=np.int64))
-        _check_finite(self.position, "trajectory", first_frame=0)
+        check_positions(self.position, "trajectory", first_frame=0)
         for name, values in self.fields.items():
-            _check_field(name, values)
+            check_field(name, values)
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
-    """Writes trajectories, in order, into one file; equal trajectories give equal bytes."""
+    """Writes trajectories, in order, into one file; equal trajectories give equal bytes.
+
+    Raises:
+        DataError: if there are none, writing fails, or one ends in frames without any particle.
+    """
     path, count = Path(path), 0
     # The earliest format has no time stamps in groups.
     with writable_hdf5(path, libver=("earliest", "v108")) as (file, check_written):
         for count, trajectory in enumerate(trajectories, start=1):
+            check_end(trajectory.position, f"{path}, trajectory {count - 1:05d}")
             _write_trajectory(file.create_group(f"{count - 1:05d}"), trajectory)
             check_written()
         if not count:
@@ -169,8 +177,8 @@ class Split:
         with open_hdf5(self.path) as file:
             group = file[self._entries[index].name]
             for name in group:
-                if name not in _CORE and isinstance(group[name], h5py.Dataset):
-                    _check_field(name, group[name], self.where(index))
+                if name not in CORE and isinstance(group[name], h5py.Dataset):
+                    check_field(name, group[name], self.where(index))
                     check_stored_size(group[name], f"{self.where(index)}: {name}")
                     fields[name] = np.asarray(group[name][()])
         return fields
@@ -183,7 +191,8 @@ class Split:
         """Reads the frames from `start` up to `stop` (to the end when None) of a trajectory, without its fields.
 
         Raises:
-            DataError: if they cannot be read or a position is not finite.
+            DataError: if they cannot be read, a position is infinite or NaN in some coordinates only, or the whole
+                trajectory is read and ends in frames without any particle.
         """
         name = self._entries[index].name  # an IndexError ends iterations, within `open_hdf5` it would be a DataError
         with open_hdf5(self.path) as file:
@@ -191,7 +200,9 @@ class Split:
             position = np.asarray(group["position"][start:stop], dtype=np.float32)
             particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
             attributes = dict(group.attrs)
-        _check_finite(position, self.where(index), first_frame=start)
+        check_positions(position, self.where(index), first_frame=start)
+        if start == 0 and stop is None:
+            check_end(position, self.where(index))
         return Trajectory(position, particle_type, attributes)
 
     @cached_property
@@ -212,51 +223,15 @@ def _entry(group: Any, name: str, path: Path) -> _Entry:
     where = f"{path}, trajectory {name}"
     if not isinstance(group, h5py.Group):
         raise DataError(f"{path}: {name!r} is not a group; {_LAYOUT}.")
-    missing = [key for key in _CORE if not isinstance(group.get(key), h5py.Dataset)]
+    missing = [key for key in CORE if not isinstance(group.get(key), h5py.Dataset)]
     if missing:
         names = ", ".join(group) or "nothing"
         raise DataError(f"{where}: the key {' and '.join(map(repr, missing))} is missing (found: {names}); {_LAYOUT}.")
-    _check_arrays(group["position"], group["particle_type"], where)
-    for key in _CORE:
+    check_arrays(group["position"], group["particle_type"], where)
+    for key in CORE:
         check_stored_size(group[key], f"{where}: {key}")
     frames, particles, dim = group["position"].shape
     return _Entry(name, frames, particles, dim)
-
-
-def _check_arrays(position: Any, particle_type: Any, where: str) -> None:
-    """Checks dtypes and shapes of two arrays or HDF5 datasets."""
-    wanted = {"position": ("f", 3, "floats of shape (T, N, D)"), "particle_type": ("iu", 1, "integers of shape (N,)")}
-    for key, array in (("position", position), ("particle_type", particle_type)):
-        kinds, axes, description = wanted[key]
-        if array.dtype.kind not in kinds or array.ndim != axes or 0 in array.shape:
-            raise DataError(f"{where}: {key} should be {description}; it is {array.dtype} of shape {array.shape}.")
-    if position.shape[2] > 3:
-        raise DataError(f"{where}: position has {position.shape[2]} dimensions; 1, 2 or 3 are possible.")
-    if position.shape[1] != particle_type.shape[0]:
-        swapped = position.shape[0] == particle_type.shape[0]
-        mend = " Are its axes swapped? It should be (T, N, D), frames first: np.swapaxes(position, 0, 1)."
-        raise DataError(
-            f"{where}: position has {position.shape[1]} particles but particle_type has {particle_type.shape[0]}."
-            f"{mend if swapped else ''}"
-        )
-
-
-def _check_field(name: str, values: Any, where: str = "trajectory") -> None:
-    kind = getattr(getattr(values, "dtype", None), "kind", None)
-    if name in _CORE or not name or kind is None or kind not in "biufS":
-        raise DataError(
-            f"{where}: the field {name!r} must be an array of numbers; it is {getattr(values, 'dtype', type(values))}."
-        )
-
-
-def _check_finite(position: np.ndarray, where: str, first_frame: int) -> None:
-    if not np.isfinite(position).all():
-        frame, particle, _ = map(int, np.argwhere(~np.isfinite(position))[0])
-        raise DataError(
-            f"{where}: position of particle {particle} in frame {first_frame + frame} is"
-            f" {position[frame, particle].tolist()}; positions must be finite. Remove the trajectory, or cut it"
-            " before that frame."
-        )
 
 
 def _other_files(folder: Path) -> str:

@@ -1,4 +1,7 @@
-"""Statistics of trajectories: extents, distances of neighbours, displacements, and what contradicts the metadata."""
+"""Statistics of trajectories: extents, distances of neighbours, displacements, and what contradicts the metadata.
+
+Positions of absent particles are NaN and count nowhere; the displacement to or from them is NaN.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +29,8 @@ class Extent:
     def add(self, position: np.ndarray) -> None:
         """Adds (T, N, D) positions, or none."""
         if position.size:
-            self.lower = np.minimum(self.lower, position.min(axis=(0, 1)))
-            self.upper = np.maximum(self.upper, position.max(axis=(0, 1)))
+            self.lower = np.fmin(self.lower, np.fmin.reduce(position, axis=(0, 1)))
+            self.upper = np.fmax(self.upper, np.fmax.reduce(position, axis=(0, 1)))
 
     @property
     def intervals(self) -> tuple[Interval, ...]:
@@ -65,22 +68,35 @@ def notes_on_lengths(frames: set[int], metadata: Metadata, others: Iterable[int]
 def neighbour_distance(split: Split, indices: Sequence[int], metadata: Metadata) -> float:
     """Median distance of moving particles to the nearest other one, in the first frames of some trajectories.
 
-    At most 8 of them are read, evenly spaced; those that cannot be read are left out. It is 0 where it is unknown.
+    At most 8 of them are read, evenly spaced; those that cannot be read are left out. Where particles are absent in the
+    first frame, it is measured in the frame that has most. It is 0 where it is unknown.
     """
     distances = [np.empty(0)]
     lower, upper = np.asarray(metadata.bounds).T
     period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
     for index in indices[:: -(-len(indices) // _SPACING_TRAJECTORIES)]:
         try:
-            first = split.read(index, 0, 1)
+            frame = _fullest_frame(split, index, metadata)
         except DataError:
             continue
-        position = first.position[0, metadata.is_moving(first.particle_type)].astype(np.float64) - lower
+        position = frame.astype(np.float64) - lower
         if len(position) > 1:
             wrapped = np.where(metadata.periodic, np.mod(position, np.where(period > 0, period, 1.0)), position)
             distances.append(cKDTree(wrapped, boxsize=period).query(wrapped, k=2)[0][:, 1])
     every = np.concatenate(distances)
     return float(np.median(every)) if len(every) else 0.0
+
+
+def _fullest_frame(split: Split, index: int, metadata: Metadata) -> np.ndarray:
+    """(N', D) positions of the moving particles in the first frame, or in the first of those that have most."""
+    moving = metadata.is_moving(split.particle_type(index))
+    frame = split.read(index, 0, 1).position[0, moving]
+    if not np.isnan(frame).any():
+        return np.asarray(frame)
+    position = split.read(index).position[:, moving]
+    present = ~np.isnan(position[..., 0])
+    fullest = int(np.argmax(present.sum(axis=1)))
+    return np.asarray(position[fullest, present[fullest]])
 
 
 def displacements(position: np.ndarray, metadata: Metadata) -> np.ndarray:
@@ -111,7 +127,10 @@ class MotionStatistics:
         velocity = displacements(trajectory.position[:, moving], self._metadata)
         for key, values in (("vel", velocity), ("acc", np.diff(velocity, axis=0))):
             flat = values.reshape(-1, values.shape[-1])
-            self._sums[key] += np.stack([np.full(flat.shape[1], len(flat)), flat.sum(0), (flat**2).sum(0)])
+            if np.isnan(total := flat.sum(0)).any():
+                flat = flat[~np.isnan(flat[:, 0])]
+                total = flat.sum(0)
+            self._sums[key] += np.stack([np.full(flat.shape[1], len(flat)), total, (flat**2).sum(0)])
 
     def result(self) -> dict[str, list[float]]:
         """`vel_mean`, `vel_std`, `acc_mean` and `acc_std` per axis; those without any sample are left out."""
@@ -164,5 +183,16 @@ def first_moving_particle(position: np.ndarray, particles: np.ndarray, extent: S
         return None
     lower, upper = np.asarray(extent).T
     candidates = position[:, particles]
-    moves = (np.abs(candidates - candidates[0]) > _STILL * (upper - lower)).any(axis=(0, 2))
+    moves = (np.abs(candidates - first_positions(candidates)) > _STILL * (upper - lower)).any(axis=(0, 2))
     return int(np.flatnonzero(particles)[int(np.argmax(moves))]) if moves.any() else None
+
+
+def first_positions(position: np.ndarray) -> np.ndarray:
+    """(N, D) of (T, N, D) positions: where each particle is when it is there first; NaN if it never is."""
+    first: np.ndarray = position[0]
+    late = np.flatnonzero(np.isnan(first[:, 0]))
+    if not len(late):
+        return first
+    first, frames = first.copy(), np.argmax(~np.isnan(position[:, late, 0]), axis=0)
+    first[late] = position[frames, late]
+    return first

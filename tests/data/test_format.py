@@ -145,6 +145,29 @@ def test_positions_that_are_not_finite_are_named(file, bad, start):
         Trajectory(position, np.zeros(6, int))
 
 
+def test_absent_particles_are_nan_in_all_coordinates(tmp_path):
+    position = np.ones((6, 3, 2), np.float32)
+    position[:2, 0] = np.nan
+    position[3] = np.nan  # a missing frame
+    write_split(tmp_path / "train.h5", [Trajectory(position, np.zeros(3, int))])
+    np.testing.assert_array_equal(Split(tmp_path / "train.h5").read(0).position, position)
+
+
+@pytest.mark.parametrize(
+    ("last", "message"), [(3, r"NaN from frame 4 on.*diverged.*position\[:4\]"), (-1, "no particle is there")]
+)
+def test_a_trajectory_that_ends_without_particles_has_diverged(file, last, message):
+    with h5py.File(file, "a") as opened:
+        opened["00000/position"][last + 1 :] = np.nan
+    with pytest.raises(DataError, match=message):
+        Split(file).read(0)
+    assert np.isnan(Split(file).read(0, 5, 6).position).all()
+    position = Split(file).read(1).position
+    position[last + 1 :] = np.nan
+    with pytest.raises(DataError, match=f"trajectory 00000.*{message}"):
+        write_split(file.parent / "valid.h5", [Trajectory(position, np.zeros(6, int))])
+
+
 def test_recorded_lennard_jones(recorded):
     folder = recorded / "lagrangebench-3d-lj"
     metadata, split = read_metadata(folder, "deepmind"), Split(folder / "train.h5")

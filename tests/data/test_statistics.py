@@ -1,8 +1,16 @@
 import numpy as np
 import pytest
 
-from nmpm.data.format import Trajectory
-from nmpm.data.statistics import MotionStatistics, find_disagreements
+from nmpm.data.format import Split, Trajectory, write_split
+from nmpm.data.statistics import (
+    MotionStatistics,
+    displacements,
+    extent_of,
+    find_disagreements,
+    first_moving_particle,
+    first_outside,
+    neighbour_distance,
+)
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 
@@ -36,3 +44,28 @@ def test_small_differences_are_ignored():
     assert "vel_std = (1.2, 2); these trajectories have (1, 2)" in sentence
     assert len(find_disagreements(measured, {"vel_std": [1.0]})) == 1
     assert find_disagreements(measured, {"vel_std": "unknown"}) == []
+
+
+@pytest.mark.filterwarnings("error")
+def test_absent_particles_count_nowhere(tmp_path):
+    metadata, trajectory = made_up_metadata(), made_up_trajectory(12, 20, statics=4)
+    absent, types = trajectory.position.copy(), trajectory.particle_type
+    absent[3, :5] = absent[0, 7] = absent[6] = absent[4:, 21] = np.nan
+    extent = extent_of(absent)
+    np.testing.assert_array_equal(extent.lower, np.nanmin(absent, axis=(0, 1)))
+    extent.add(np.full((2, 3, 2), np.nan))
+    np.testing.assert_array_equal(extent.upper, np.nanmax(absent, axis=(0, 1)))
+    statistics = MotionStatistics(metadata)
+    statistics.add(Trajectory(absent, types))
+    steps = np.diff(absent[:, :20].astype(np.float64), axis=0)
+    np.testing.assert_array_equal(displacements(absent[:, :20], metadata), steps)
+    np.testing.assert_allclose(statistics.result()["vel_std"], np.nanstd(steps, axis=(0, 1)), rtol=1e-9)
+    assert first_outside(absent, metadata.bounds, (False, False)) is None
+    assert first_moving_particle(absent, types == 3, metadata.bounds) is None
+    late = absent.copy()
+    late[:9, 22] = np.nan
+    late[10, 22] += 0.1
+    assert first_moving_particle(late, types == 3, metadata.bounds) == 22
+    write_split(tmp_path / "train.h5", [trajectory, Trajectory(absent[6:], types)])
+    split = Split(tmp_path / "train.h5")
+    assert neighbour_distance(split, [0], metadata) == pytest.approx(neighbour_distance(split, [1], metadata), rel=0.3)

@@ -12,6 +12,7 @@ import numpy as np
 
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
+from nmpm.data.array_checks import check_end
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset
 from nmpm.data.facts import FOUND, FactFinder
 from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, write_metadata, write_split
@@ -120,10 +121,12 @@ class _Log:
             metadata.check_types(types, where)
         if not self.statistics:
             self.motion.add(trajectory)
-        static = metadata.is_static(types)
+        static, moving = metadata.is_static(types), metadata.is_moving(types)
+        if moving.any():
+            check_end(position[:, moving], where)
         self.number += 1
         self.moving_boundaries += first_moving_particle(position, static, metadata.bounds) is not None
-        self.extent.add(position[:, static | metadata.is_moving(types)])
+        self.extent.add(position[:, static | moving])
         self.frames.add(len(position))
         self.particles = max(self.particles, position.shape[1])
 

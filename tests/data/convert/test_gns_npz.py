@@ -64,7 +64,7 @@ def test_reads_one_member_with_all_trajectories(tmp_path):
         (positions(0), "found 7 parts"),
         (pair(positions(0)[0], 5), r"shape \(T, N, D\)"),
         (pair(positions(0), np.arange(3)), "one for each of 4 particles"),
-        (pair(positions(0) * np.nan, 5), "finite"),
+        (pair(positions(0) * [np.nan, 1], 5), "finite"),
         (
             pair(positions(0), Runs(Path.touch, Path("ran"))),
             r"requests pathlib\.Path\.touch|requests builtins\.getattr",

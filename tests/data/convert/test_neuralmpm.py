@@ -67,7 +67,7 @@ def test_an_unknown_dataset_needs_the_time_step_and_material(tmp_path):
         ("particles", None, "'particles' is missing"),
         ("boundary", np.zeros((3, 3, 2)), "do not match"),
         ("types", np.zeros(4, int), r"types \(4,\) match neither 5 particles"),
-        ("particles", np.full((8, 5, 2), np.nan), "particle 0 in frame 0"),
+        ("particles", np.full((8, 5, 2), np.inf), "particle 0 in frame 0"),
     ],
 )
 def test_inconsistent_content_is_refused_by_name(tmp_path, name, value, message):
@@ -79,4 +79,12 @@ def test_inconsistent_content_is_refused_by_name(tmp_path, name, value, message)
         if value is not None:
             file[name] = value
     with pytest.raises(DataError, match=rf"sim_0\.h5.*{message}"):
+        convert(tmp_path / "Goop", tmp_path / "out")
+
+
+def test_material_that_diverges_beside_walls_at_rest_is_named(tmp_path):
+    write(tmp_path / "Goop" / "train" / "sim_0.h5")
+    with h5py.File(tmp_path / "Goop" / "train" / "sim_0.h5", "a") as file:
+        file["particles"][4:] = np.nan
+    with pytest.raises(DataError, match=r"train split, trajectory 0.*NaN from frame 4 on.*diverged"):
         convert(tmp_path / "Goop", tmp_path / "out")

@@ -1,0 +1,72 @@
+"""Checks of a trajectory's arrays: positions, types and fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from nmpm.errors import DataError
+
+CORE = ("position", "particle_type")
+"""Names of the arrays that every trajectory has; all others are fields."""
+
+
+def check_arrays(position: Any, particle_type: Any, where: str) -> None:
+    """Raises a DataError for wrong dtypes or shapes of two arrays or HDF5 datasets."""
+    wanted = {"position": ("f", 3, "floats of shape (T, N, D)"), "particle_type": ("iu", 1, "integers of shape (N,)")}
+    for key, array in (("position", position), ("particle_type", particle_type)):
+        kinds, axes, description = wanted[key]
+        if array.dtype.kind not in kinds or array.ndim != axes or 0 in array.shape:
+            raise DataError(f"{where}: {key} should be {description}; it is {array.dtype} of shape {array.shape}.")
+    if position.shape[2] > 3:
+        raise DataError(f"{where}: position has {position.shape[2]} dimensions; 1, 2 or 3 are possible.")
+    if position.shape[1] != particle_type.shape[0]:
+        swapped = position.shape[0] == particle_type.shape[0]
+        mend = " Are its axes swapped? It should be (T, N, D), frames first: np.swapaxes(position, 0, 1)."
+        raise DataError(
+            f"{where}: position has {position.shape[1]} particles but particle_type has {particle_type.shape[0]}."
+            f"{mend if swapped else ''}"
+        )
+
+
+def check_field(name: str, values: Any, where: str = "trajectory") -> None:
+    """Raises a DataError if a field, an array or HDF5 dataset, does not contain numbers."""
+    kind = getattr(getattr(values, "dtype", None), "kind", None)
+    if name in CORE or not name or kind is None or kind not in "biufS":
+        raise DataError(
+            f"{where}: the field {name!r} must be an array of numbers; it is {getattr(values, 'dtype', type(values))}."
+        )
+
+
+def check_positions(position: np.ndarray, where: str, first_frame: int) -> None:
+    """Raises a DataError for the first of (T, N, D) positions that is infinite, or NaN in some coordinates only."""
+    finite = np.isfinite(position)
+    if finite.all():
+        return
+    wrong = ~(finite.all(axis=-1) | np.isnan(position).all(axis=-1))
+    if wrong.any():
+        frame, particle = map(int, np.argwhere(wrong)[0])
+        raise DataError(
+            f"{where}: position of particle {particle} in frame {first_frame + frame} is"
+            f" {position[frame, particle].tolist()}; positions must be finite, or NaN in all coordinates where the"
+            " particle is absent. Remove the trajectory, or cut it before that frame."
+        )
+
+
+def check_end(position: np.ndarray, where: str) -> None:
+    """Raises a DataError, naming the first of these frames, if (T, N, D) positions end in frames without any particle.
+
+    A particle that is absent from some frame on has left, or its simulation has diverged; of all particles at once only
+    the latter is likely.
+    """
+    if not np.isnan(position[-1, :, 0]).all():
+        return
+    inhabited = np.flatnonzero(~np.isnan(position[..., 0]).all(axis=1))
+    if not len(inhabited):
+        raise DataError(f"{where}: no particle is there in any frame, all positions are NaN. Remove the trajectory.")
+    frame = int(inhabited[-1]) + 1
+    raise DataError(
+        f"{where}: all positions are NaN from frame {frame} on; the simulation seems to have diverged. Cut the"
+        f" trajectory before that frame: position[:{frame}]."
+    )
