@@ -12,7 +12,8 @@ from nmpm._support.progress import progress_bar
 from nmpm.data.fields import FieldFacts, Kind, add_fields
 from nmpm.data.format import Metadata, Split
 from nmpm.data.gravity import distinct_gravities, trajectory_gravity
-from nmpm.data.inspection.measurements import GridFacts, Measurements, find_anomalies
+from nmpm.data.grid_rule import GridFacts
+from nmpm.data.inspection.measurements import Measurements, find_anomalies
 from nmpm.data.inspection.reading import open_dataset
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.statistics import MotionStatistics, find_disagreements, neighbour_distance, notes_on_lengths

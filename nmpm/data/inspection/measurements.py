@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.grid_rule import GridFacts
 from nmpm.data.statistics import Extent, displacements, first_moving_particle, first_outside
 from nmpm.scene import Interval
 
@@ -22,18 +22,6 @@ _FRAMES_ON_GRIDS = 12
 _REST = 0.02  # of a trajectory's peak speed
 _JUMP = 5.0  # in spacings; a larger change between successive displacements of a particle is an anomaly
 _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 2.3% wide
-
-
-@dataclass(frozen=True)
-class GridFacts:
-    """Facts about the data on one grid."""
-
-    cells: int  # cells along the longest side
-    shape: tuple[int, ...]  # cells along each axis
-    per_cell: float  # particles per occupied cell, median over frames
-    median_speed: float  # median speed of the moving particles, in cells per frame
-    high_speed: float  # 99.9% quantile of their speeds, in cells per frame
-    most_speed: float  # largest speed, in cells per frame
 
 
 class Measurements:
