@@ -10,7 +10,7 @@ A particle that is not there in a frame has NaN in all coordinates of its positi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +42,8 @@ _OTHER_NAMES = {
 }
 TRUTH = "truth"
 """Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
+VTKHDF = "VTKHDF"
+"""Group by which ParaView reads a file, see `nmpm.data.write.vtkhdf`; it is not a trajectory."""
 _CHUNK_BYTES = 2**20
 _LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"
 
@@ -81,15 +83,22 @@ def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
     Raises:
         DataError: if there are none, writing fails, or one ends in frames without any particle.
     """
-    path, count = Path(path), 0
     # The earliest format has no time stamps in groups.
-    with writable_hdf5(path, libver=("earliest", "v108")) as (file, check_written):
-        for count, trajectory in enumerate(trajectories, start=1):
-            check_end(trajectory.position, f"{path}, trajectory {count - 1:05d}")
-            _write_trajectory(file.create_group(f"{count - 1:05d}"), trajectory)
-            check_written()
-        if not count:
-            raise DataError(f"{path}: there are no trajectories to write.")
+    with writable_hdf5(Path(path), libver=("earliest", "v108")) as (file, check_written):
+        add_trajectories(file, trajectories, check_written, Path(path))
+
+
+def add_trajectories(
+    file: Any, trajectories: Iterable[Trajectory], check_written: Callable[[], None], path: Path
+) -> None:
+    """As `write_split`, into an empty HDF5 file that `writable_hdf5` has opened."""
+    count = 0
+    for count, trajectory in enumerate(trajectories, start=1):
+        check_end(trajectory.position, f"{path}, trajectory {count - 1:05d}")
+        _write_trajectory(file.create_group(f"{count - 1:05d}"), trajectory)
+        check_written()
+    if not count:
+        raise DataError(f"{path}: there are no trajectories to write.")
 
 
 def _write_trajectory(group: Any, trajectory: Trajectory) -> None:
@@ -210,7 +219,7 @@ class Split:
         with open_hdf5(self.path) as file:
             check_self_contained(file, self.path)
             # By names: an error within `items()` would keep HDF5 locked for other threads as long as its traceback.
-            entries = tuple(_entry(file.get(name), name, self.path) for name in file)
+            entries = tuple(_entry(file.get(name), name, self.path) for name in file if name != VTKHDF)
         for entry in entries:
             if entry.dim != entries[0].dim:
                 raise DataError(

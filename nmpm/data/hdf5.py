@@ -1,7 +1,7 @@
 """Reads HDF5 files from anywhere, and writes HDF5 files fast and to disks that may be full.
 
 An HDF5 file can refer to other files (external links, external storage, virtual datasets), so that the bytes of any
-file would be read as positions; `check_self_contained` refuses these. HDF5 crashes the process when a write fails, so
+file would be read as positions; `check_self_contained` refuses these (not virtual datasets of the file's own content). HDF5 crashes the process when a write fails, so
 `writable_hdf5` gives it a file whose writes never fail, and reports the error afterwards. HDF5 compresses one chunk
 after the other, so `write_compressed` compresses in threads what HDF5's own filters would store.
 """
@@ -84,8 +84,14 @@ def check_self_contained(file: Any, path: Path) -> None:
                 pending.append(item)
             elif isinstance(item, h5py.Dataset) and item.external:
                 raise _elsewhere_error(path, f"{where!r} is stored in another file, {item.external[0][0]!r}")
-            elif isinstance(item, h5py.Dataset) and item.is_virtual:
+            elif isinstance(item, h5py.Dataset) and item.is_virtual and not _maps_within(file, item):
                 raise _elsewhere_error(path, f"{where!r} is a virtual dataset")
+
+
+def _maps_within(file: Any, dataset: Any) -> bool:
+    """Whether a virtual dataset is made of datasets of its own file alone, of which none is virtual itself."""
+    sources = [(source.file_name, file.get(source.dset_name)) for source in dataset.virtual_sources()]
+    return all(name == "." and isinstance(item, h5py.Dataset) and not item.is_virtual for name, item in sources)
 
 
 def _elsewhere_error(path: Path, problem: str) -> DataError:

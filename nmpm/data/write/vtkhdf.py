@@ -1,0 +1,155 @@
+"""Makes native HDF5 files readable by ParaView and VTK: a group `VTKHDF` beside the trajectories.
+
+VTK's format (https://docs.vtk.org, "VTKHDF file format") keeps the points of all time steps in one array (T·N, 3), as
+the native layout does but for its shape and the third axis of 2-D data. So the points, and the numbers of each point,
+are virtual datasets, which refer to the native ones and take no room; where those have two axes, z is the fill value 0.
+LagrangeBench takes each group of a file for a trajectory, so that the files of a dataset's splits are left without.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+
+from nmpm.data.format import TRUTH, VTKHDF
+
+MOST_TRAJECTORIES = 32
+"""Of a file, which VTK would show; each is a block that it reads in every time step."""
+_POLY_DATA_VERSION, _COLLECTION_VERSION = (2, 0), (2, 1)
+_CELLS = ("Vertices", "Lines", "Polygons", "Strips")
+_COMPRESSED = {"compression": "gzip", "shuffle": True}
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Points that VTK shows as one object: the dataset of their positions, in a trajectory's group."""
+
+    name: str
+    trajectory: Any
+    position: str = "position"
+
+    @property
+    def frames(self) -> int:
+        return int(self.trajectory[self.position].shape[0])
+
+
+def add_vtkhdf(file: Any, dt: float) -> None:
+    """Adds what VTK needs to show the trajectories of an open HDF5 file, the first `MOST_TRAJECTORIES` of them.
+
+    One trajectory alone becomes VTK's poly data; several, or one with its truth, become a collection with a block for
+    each. A block that is shorter than others stays at its last frame.
+
+    Args:
+        file: Open for writing, with the format's upper bound at least "v110".
+        dt: Time between frames, where a trajectory has no `time` (T,).
+    """
+    blocks = list(_blocks([file[name] for name in list(file)[:MOST_TRAJECTORIES]]))
+    longest = max(blocks, key=lambda block: block.frames)
+    stated = longest.trajectory.get("time")
+    times = np.arange(longest.frames) * dt if stated is None else np.asarray(stated[()], dtype=np.float64)
+    root = _ordered_group(file, VTKHDF)
+    if len(blocks) == 1:
+        _set_type(root, "PolyData", _POLY_DATA_VERSION)
+        _write_block(root, blocks[0], times)
+        return
+    _set_type(root, "PartitionedDataSetCollection", _COLLECTION_VERSION)
+    assembly = _ordered_group(root, "Assembly")
+    for index, block in enumerate(blocks):
+        group = root.create_group(block.name)
+        _set_type(group, "PolyData", _COLLECTION_VERSION)
+        group.attrs["Index"] = index
+        assembly[block.name] = h5py.SoftLink(group.name)
+        _write_block(group, block, times)
+
+
+def _blocks(trajectories: list[Any]) -> Iterator[_Block]:
+    for trajectory in trajectories:
+        number = "" if len(trajectories) == 1 else "_" + trajectory.name.strip("/")
+        yield _Block("trajectory" + number, trajectory)
+        if _is_like_position(trajectory.get(TRUTH), trajectory["position"].shape):
+            yield _Block(TRUTH + number, trajectory, TRUTH)
+
+
+def _is_like_position(truth: Any, shape: tuple[int, ...]) -> bool:
+    return isinstance(truth, h5py.Dataset) and truth.ndim == 3 and truth.shape[1:] == shape[1:] and truth.shape[0] > 0
+
+
+def _ordered_group(parent: Any, name: str) -> Any:
+    """A group that keeps the order of its members, as VTK needs of collections, without a time stamp."""
+    properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
+    properties.set_link_creation_order(h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED)
+    properties.set_obj_track_times(False)
+    h5py.h5g.create(parent.id, name.encode(), gcpl=properties)
+    return parent[name]
+
+
+def _set_type(group: Any, name: str, version: tuple[int, int]) -> None:
+    group.attrs["Version"] = np.array(version, dtype=np.int64)
+    group.attrs.create("Type", name.encode(), dtype=h5py.string_dtype("ascii", len(name)))
+
+
+def _write_block(group: Any, block: _Block, times: np.ndarray) -> None:
+    position = block.trajectory[block.position]
+    frames, particles, dim = position.shape
+    steps = group.create_group("Steps")
+    steps.attrs["NSteps"] = len(times)
+    frame = np.minimum(np.arange(len(times)), frames - 1)
+    _write(steps, "Values", times)
+    _write(steps, "PartOffsets", frame)
+    _write(steps, "NumberOfParts", np.ones(len(times)))
+    _write(steps, "PointOffsets", frame * particles)
+    for name in ("CellOffsets", "ConnectivityIdOffsets"):
+        _write(steps, name, np.zeros((len(times), len(_CELLS))))
+    _write(group, "NumberOfPoints", np.full(frames, particles))
+    _write_cells(group, frames, particles)
+    _map(group, "Points", position, 2, dim)
+    data, offsets = group.create_group("PointData"), steps.create_group("PointDataOffsets")
+    for name, values in block.trajectory.items():
+        if leading := _point_axes(name, values, frames, particles):
+            _map(data, name, values, leading, dim)
+            _write(offsets, name, frame * particles if leading == 2 else np.zeros(len(times)))
+
+
+def _point_axes(name: str, values: Any, frames: int, particles: int) -> int:
+    """Leading axes of a field that are those of points: 2 for (T, N, …), 1 for (N, …), 0 if it is not of points."""
+    if not isinstance(values, h5py.Dataset) or name in ("position", TRUTH, "time"):
+        return 0
+    if values.dtype.kind not in "iuf" or values.dtype.itemsize == 2 or not 1 <= values.ndim <= 3:
+        return 0
+    if values.shape[:2] == (frames, particles):
+        return 2
+    return int(values.shape[0] == particles and values.ndim < 3)
+
+
+def _write_cells(group: Any, frames: int, particles: int) -> None:
+    """A vertex for each point; the same cells in every frame."""
+    for name in _CELLS:
+        cells, count = group.create_group(name), particles if name == "Vertices" else 0
+        _write(cells, "Connectivity", np.arange(count))
+        _write(cells, "Offsets", np.arange(count + 1))
+        for total in ("NumberOfCells", "NumberOfConnectivityIds"):
+            _write(cells, total, np.full(frames, count))
+
+
+def _write(group: Any, name: str, values: np.ndarray) -> None:
+    """Numbers of VTK's bookkeeping: integers, but for times."""
+    values = values if name == "Values" else values.astype(np.int64)
+    group.create_dataset(name, data=values, **(_COMPRESSED if values.size > 1 else {}))
+
+
+def _map(group: Any, name: str, values: Any, leading: int, dim: int) -> None:
+    """A virtual dataset with a row for each point in each frame, the `leading` axes of the values; vectors have z."""
+    rest = values.shape[leading:]
+    width = (3,) if rest == (dim,) else rest
+    layout = h5py.VirtualLayout((math.prod(values.shape[:leading]), *width), values.dtype)
+    source = h5py.VirtualSource(".", values.name, values.shape, values.dtype)
+    if rest == (dim,):
+        layout[:, :dim] = source
+    else:
+        layout[...] = source
+    group.create_virtual_dataset(name, layout, fillvalue=0)
