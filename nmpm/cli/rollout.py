@@ -157,14 +157,14 @@ def _write(
     model: Pretrained, state: Particles, rollout: Rollout, window: Window | None, options: argparse.Namespace
 ) -> None:
     """Write the start and the prediction, beside what was recorded, with what is needed to draw them."""
-    from nmpm.data.format import write_split
     from nmpm.data.predictions import predicted_trajectory
+    from nmpm.data.write.vtkhdf import write_viewable
 
     origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
     truth = None if window is None else window.frames[:, : rollout.position.shape[1] + 2]
     start = state.to("cpu")
     predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields, truth=truth)
-    write_split(options.out, [predicted])
+    write_viewable(options.out, [predicted], model.scene.dt)
     frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
     sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {options.out}\n")
 

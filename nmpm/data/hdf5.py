@@ -1,9 +1,10 @@
 """Reads HDF5 files from anywhere, and writes HDF5 files fast and to disks that may be full.
 
 An HDF5 file can refer to other files (external links, external storage, virtual datasets), so that the bytes of any
-file would be read as positions; `check_self_contained` refuses these (not virtual datasets of the file's own content). HDF5 crashes the process when a write fails, so
-`writable_hdf5` gives it a file whose writes never fail, and reports the error afterwards. HDF5 compresses one chunk
-after the other, so `write_compressed` compresses in threads what HDF5's own filters would store.
+file would be read as positions; `check_self_contained` refuses these, but not virtual datasets of the file's own
+content. HDF5 crashes the process when a write fails, so `writable_hdf5` gives it a file whose writes never fail, and
+reports the error afterwards. HDF5 compresses one chunk after the other, so `write_compressed` compresses in threads
+what HDF5's own filters would store.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ def _elsewhere_error(path: Path, problem: str) -> DataError:
 def check_stored_size(dataset: Any, where: str) -> None:
     """Refuses, with a DataError, a dataset that declares far more than its file stores, before memory is taken."""
     declared, chunk = (math.prod(shape) * dataset.dtype.itemsize for shape in (dataset.shape, dataset.chunks or (0,)))
-    stored = int(dataset.id.get_storage_size())
+    sources = {source.dset_name for source in dataset.virtual_sources()} if dataset.is_virtual else {dataset.name}
+    stored = sum(int(dataset.file[name].id.get_storage_size()) for name in sources)
     if max(declared, chunk) > expansion_limit(stored):
         raise DataError(
             f"{where}: has the shape {dataset.shape}, {max(declared, chunk):,} bytes, but only {stored:,} bytes are"

@@ -45,6 +45,14 @@ def make_virtual(file: h5py.File) -> None:
     file["00001"].create_virtual_dataset("position", layout)
 
 
+def make_chain(file: h5py.File) -> None:
+    """Of virtual datasets of the same file; a ring of them would be followed without end."""
+    for name, source in (("position", "/00001/copy"), ("copy", "/00000/position")):
+        layout = h5py.VirtualLayout((4, 3, 2), np.float32)
+        layout[:] = h5py.VirtualSource(".", source, (4, 3, 2))
+        file["00001"].create_virtual_dataset(name, layout)
+
+
 def link(file: h5py.File) -> None:
     file["00001/deep/er"] = h5py.ExternalLink("other.h5", "/00000/position")
 
@@ -56,8 +64,9 @@ def link(file: h5py.File) -> None:
         (link, "'00001/deep/er' is an external link to 'other.h5'"),
         (link_through_another_link, "'hidden/door' is an external link"),
         (make_virtual, "'00001/position' is a virtual dataset"),
+        (make_chain, "'00001/position' is a virtual dataset"),
     ],
-    ids=["storage", "link", "soft", "virtual"],
+    ids=["storage", "link", "soft", "virtual", "chain"],
 )
 def test_content_of_other_files_is_refused(split, change, message):
     with h5py.File(split, "a") as file:
@@ -72,6 +81,15 @@ def test_links_within_the_file_are_read(split):
         del file["00001/particle_type"]
         file["00001/particle_type"] = h5py.SoftLink("/00000/particle_type")
     assert Split(split).read(1).particle_type.tolist() == [7, 7, 7]
+
+
+def test_virtual_datasets_of_the_files_own_content_are_read(split):
+    layout = h5py.VirtualLayout((4, 3, 2), np.float32)
+    layout[:] = h5py.VirtualSource(".", "/00000/position", (4, 3, 2))
+    with h5py.File(split, "a", libver=("earliest", "v110")) as file:
+        del file["00001/position"]
+        file["00001"].create_virtual_dataset("position", layout)
+    np.testing.assert_array_equal(Split(split).read(1).position, Split(split).read(0).position)
 
 
 @pytest.mark.parametrize("by", ["this program", "another program"])

@@ -9,14 +9,16 @@ LagrangeBench takes each group of a file for a trajectory, so that the files of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from nmpm.data.format import TRUTH, VTKHDF
+from nmpm.data.format import TRUTH, VTKHDF, Trajectory, add_trajectories
+from nmpm.data.hdf5 import writable_hdf5
 
 MOST_TRAJECTORIES = 32
 """Of a file, which VTK would show; each is a block that it reads in every time step."""
@@ -36,6 +38,14 @@ class _Block:
     @property
     def frames(self) -> int:
         return int(self.trajectory[self.position].shape[0])
+
+
+def write_viewable(path: Path, trajectories: Iterable[Trajectory], dt: float) -> None:
+    """As `nmpm.data.format.write_split`, with what VTK needs to show them; `dt` is the time between frames."""
+    # The earliest format that has virtual datasets.
+    with writable_hdf5(path, libver=("earliest", "v110")) as (file, check_written):
+        add_trajectories(file, trajectories, check_written, path)
+        add_vtkhdf(file, dt)
 
 
 def add_vtkhdf(file: Any, dt: float) -> None:
@@ -144,12 +154,14 @@ def _write(group: Any, name: str, values: np.ndarray) -> None:
 
 def _map(group: Any, name: str, values: Any, leading: int, dim: int) -> None:
     """A virtual dataset with a row for each point in each frame, the `leading` axes of the values; vectors have z."""
-    rest = values.shape[leading:]
-    width = (3,) if rest == (dim,) else rest
-    layout = h5py.VirtualLayout((math.prod(values.shape[:leading]), *width), values.dtype)
-    source = h5py.VirtualSource(".", values.name, values.shape, values.dtype)
-    if rest == (dim,):
-        layout[:, :dim] = source
-    else:
-        layout[...] = source
-    group.create_virtual_dataset(name, layout, fillvalue=0)
+    rows, rest = math.prod(values.shape[:leading]), values.shape[leading:]
+    space = h5py.h5s.create_simple((rows, *((3,) if rest == (dim,) else rest)))
+    space.select_hyperslab((0,) * space.get_simple_extent_ndims(), (rows, *rest))
+    # By hand: h5py's `create_virtual_dataset` writes time stamps.
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_layout(h5py.h5d.VIRTUAL)
+    properties.set_virtual(space, b".", values.name.encode(), h5py.h5s.create_simple(values.shape))
+    properties.set_fill_value(np.zeros(1, values.dtype))
+    properties.set_obj_track_times(False)
+    space.select_all()
+    h5py.h5d.create(group.id, name.encode(), values.id.get_type(), space, properties)

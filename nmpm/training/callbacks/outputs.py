@@ -23,9 +23,10 @@ from nmpm._support.collectives import all_gather, gather_to_rank0, rank_and_worl
 from nmpm._support.devices import device_name, join_hardware
 from nmpm._support.digests import float32_digest
 from nmpm._support.version import __version__
-from nmpm.data.format import Trajectory, write_split
+from nmpm.data.format import Trajectory
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.predictions import predicted_trajectory
+from nmpm.data.write.vtkhdf import write_viewable
 from nmpm.emulator import Rollout
 from nmpm.evaluation.figures import error_table, no_better_than_trivial
 from nmpm.evaluation.pictures import labelled_trajectories
@@ -230,6 +231,6 @@ class PredictionWriter(BasePredictionWriter):
         if trainer.is_global_zero:
             path = Path(trainer.default_root_dir) / "predictions.h5"
             predicted = dict(pair for rank in by_rank for pair in rank.items())
-            write_split(path, [predicted[index] for index in sorted(predicted)])
+            write_viewable(path, [predicted[index] for index in sorted(predicted)], pl_module.emulator.scene.dt)  # type: ignore[union-attr,arg-type]  # (an EmulatorModule)
             sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
         self._predicted = {}

@@ -1,0 +1,1 @@
+"""Writes trajectories for other programs."""
