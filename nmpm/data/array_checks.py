@@ -11,6 +11,9 @@ from nmpm.errors import DataError
 CORE = ("position", "particle_type")
 """Names of the arrays that every trajectory has; all others are fields."""
 
+_SWAPPED = 10.0
+_SAMPLE = 64  # frames and particles that are compared
+
 
 def check_arrays(position: Any, particle_type: Any, where: str) -> None:
     """Raises a DataError for wrong dtypes or shapes of two arrays or HDF5 datasets."""
@@ -69,4 +72,41 @@ def check_end(position: np.ndarray, where: str) -> None:
     raise DataError(
         f"{where}: all positions are NaN from frame {frame} on; the simulation seems to have diverged. Cut the"
         f" trajectory before that frame: position[:{frame}]."
+    )
+
+
+def check_axes(position: np.ndarray, particles: int | None, where: str) -> None:
+    """Refuses (N, T, D) positions where the number of particles does not tell the axes apart, or is not known (None).
+
+    Between frames a particle moves less than the distance to another particle, which may be anywhere; the limit is
+    `_SWAPPED` times that distance.
+
+    Raises:
+        DataError: naming `where`, and how to swap the axes.
+    """
+    sizes = position.shape[:2]
+    if sizes[0] != sizes[1] and particles in sizes:
+        if particles == sizes[0]:
+            raise _swapped_error(position, f"there are {particles} particles", where)
+        return
+    sample = position[:_SAMPLE, :_SAMPLE].astype(np.float64)
+    if min(sample.shape[:2]) < 2:
+        return
+    first, second = (_median_distance(sample, axis) for axis in (0, 1))
+    if first > _SWAPPED * second:
+        reason = f"neighbours along the first axis are {first:.3g} apart, along the second {second:.3g}"
+        raise _swapped_error(position, reason, where)
+
+
+def _median_distance(sample: np.ndarray, axis: int) -> float:
+    """Median distance between neighbours along an axis, of those that are present; 0 if none are."""
+    distances = np.linalg.norm(np.diff(sample, axis=axis), axis=-1)
+    finite = distances[np.isfinite(distances)]
+    return float(np.median(finite)) if finite.size else 0.0
+
+
+def _swapped_error(position: np.ndarray, reason: str, where: str) -> DataError:
+    return DataError(
+        f"{where}: the axes of positions {position.shape} look swapped: {reason}. Give (T, N, D), frames first:"
+        " np.swapaxes(position, 0, 1)."
     )

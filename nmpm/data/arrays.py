@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from nmpm.data.array_checks import check_axes
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.statistics import first_outside
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
 STATIC_NAME = "boundary"
-
-_SWAPPED = 10.0
-_SAMPLE = 64  # frames and particles that are compared
 
 
 def write_trajectories(path: str | Path, trajectories: Iterable[Trajectory | np.ndarray], scene: Scene) -> None:
@@ -62,7 +60,7 @@ def _check_trajectories(
         where = f"{path}: trajectory {index}"
         trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
         position, types = trajectory.position, np.unique(trajectory.particle_type)
-        _check_axes(position, isinstance(item, Trajectory), where)
+        check_axes(position, position.shape[1] if isinstance(item, Trajectory) else None, where)
         if position.shape[2] != scene.dim:
             raise DataError(f"{where} has {position.shape[2]} axes, the scene has {scene.dim}.")
         if types.min() < 0 or types.max() >= kinds:
@@ -88,26 +86,6 @@ def _from_bare_array(position: np.ndarray, kinds: int, where: str) -> Trajectory
     if position.ndim != 3 or position.dtype.kind != "f":
         raise DataError(f"{where} must be floats of shape (T, N, D); it is {position.dtype} {position.shape}.")
     return Trajectory(position, np.zeros(position.shape[1], dtype=np.int64))
-
-
-def _check_axes(position: np.ndarray, typed: bool, where: str) -> None:
-    """Refuses (N, T, D) arrays where the number of particle types does not tell the axes apart.
-
-    Between frames a particle moves less than the distance to another particle, which may be anywhere; the limit is
-    `_SWAPPED` times that distance.
-    """
-    if typed and position.shape[0] != position.shape[1]:
-        return  # `Trajectory` compared the types with the second axis
-    sample = position[:_SAMPLE, :_SAMPLE].astype(np.float64)
-    if min(sample.shape[:2]) < 2:
-        return
-    first, second = (float(np.median(np.linalg.norm(np.diff(sample, axis=axis), axis=-1))) for axis in (0, 1))
-    if first > _SWAPPED * second:
-        raise DataError(
-            f"{where}: the axes of positions {position.shape} look swapped: neighbours along the first axis are"
-            f" {first:.3g} apart, along the second {second:.3g}. Give (T, N, D), frames first:"
-            " np.swapaxes(position, 0, 1)."
-        )
 
 
 def _types(scene: Scene) -> dict[int, str]:

@@ -35,7 +35,7 @@ from nmpm.data.metadata_json import write_metadata as write_metadata
 from nmpm.errors import DataError
 
 SPLITS = ("train", "valid", "test")
-_OTHER_NAMES = {
+OTHER_NAMES = {
     "train": ("training", "trn"),
     "valid": ("val", "validation", "eval", "dev"),
     "test": ("testing", "tst"),
@@ -271,6 +271,6 @@ def split_renames(folder: Path, names: Iterable[str] = SPLITS) -> list[str]:
     return [
         f"Rename {other}.h5 to {name}.h5."
         for name in names
-        for other in _OTHER_NAMES[name]
+        for other in OTHER_NAMES[name]
         if name not in paths and (Path(folder) / f"{other}.h5").is_file()
     ]

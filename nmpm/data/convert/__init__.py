@@ -13,6 +13,7 @@ from pathlib import Path
 
 from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
+from nmpm.data.convert.array_files import ArrayFiles
 from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
@@ -29,7 +30,15 @@ from nmpm.errors import ConfigError, DataError
 
 _log = logging.getLogger(__name__)
 
-FORMATS: tuple[DatasetFormat, ...] = (Native(), DeepMind(), GnsNpz(), NeuralMpm(), Dmcf(), RolloutPickle())
+FORMATS: tuple[DatasetFormat, ...] = (
+    Native(),
+    DeepMind(),
+    GnsNpz(),
+    NeuralMpm(),
+    Dmcf(),
+    RolloutPickle(),
+    ArrayFiles(),
+)
 
 
 def open_dataset(path: Path, format_name: str | None = None, options: Options | None = None) -> ForeignDataset:

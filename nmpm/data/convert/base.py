@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
-from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.format import OTHER_NAMES, SPLITS, Metadata, Trajectory
 from nmpm.data.metadata import STATIC_NAMES
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval, check_field_names
@@ -166,24 +166,41 @@ class FileFormat(DatasetFormat):
             yield from self.read(file, metadata, options)
 
 
-def split_files(path: Path, pattern: str) -> dict[str, tuple[Path, ...]]:
-    """The files of each split, ordered by the numbers in their names; see `FileFormat`."""
+def split_files(path: Path, *patterns: str, unsplit: str = "test") -> dict[str, tuple[Path, ...]]:
+    """The files of each split, ordered by the numbers in their names; see `FileFormat`.
+
+    Names such as "val" mean a split too. Files that are in none are those of `unsplit`.
+    """
 
     def split_of(name: str) -> str | None:
-        return next((split for split in SPLITS if name.lower().startswith(split)), None)
+        words = re.findall(r"[a-z]+", name.lower())[:1]
+        return next((split for split in SPLITS if name.lower().startswith(split)), None) or find_split_name(*words)
 
-    def order(file: Path) -> tuple[list[int], str]:
-        return [int(digits) for digits in re.findall(r"\d{1,18}", file.name)], file.name
+    def matching(folder: Path) -> list[Path]:
+        return list({file: None for pattern in patterns for file in folder.glob(pattern)})
 
     if path.is_file():
-        return {split_of(path.name) or "test": (path,)} if path.match(pattern) else {}
-    files = {split: list((path / split).glob(pattern)) for split in SPLITS}
+        return {split_of(path.name) or unsplit: (path,)} if any(map(path.match, patterns)) else {}
+    files = {
+        split: [file for name in (split, *OTHER_NAMES[split]) for file in matching(path / name)] for split in SPLITS
+    }
     if not any(files.values()):
-        beside = list(path.glob(pattern))
+        beside = matching(path)
         files = {split: [file for file in beside if split_of(file.name) == split] for split in SPLITS}
         if not any(files.values()):
-            files = {split_of(path.name) or "test": beside}
-    return {split: tuple(sorted(paths, key=order)) for split, paths in files.items() if paths}
+            files = {split_of(path.name) or unsplit: beside}
+    return {split: tuple(sorted(paths, key=number_order)) for split, paths in files.items() if paths}
+
+
+def number_order(path: Path) -> tuple[list[int], str]:
+    """Sorts files by the numbers in their names: 10 follows 9."""
+    return [int(digits) for digits in re.findall(r"\d{1,18}", path.name)], path.name
+
+
+def find_split_name(*words: str) -> str | None:
+    """The split that one of some words means, such as "val" or "training"; None if none does."""
+    lower = [word.lower() for word in words]
+    return next((split for split in SPLITS if {split, *OTHER_NAMES[split]} & set(lower)), None)
 
 
 def split_runs(count: int) -> dict[str, range]:

@@ -8,7 +8,6 @@ per trajectory. NumPy stores objects as a pickle, which is read by the restricte
 from __future__ import annotations
 
 import math
-import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +15,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
+from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.messages import one_line
+from nmpm.data.convert.array_files import npz_members
 from nmpm.data.convert.base import FileFormat, Options
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
@@ -40,32 +40,15 @@ class GnsNpz(FileFormat):
         return read_metadata(file.parent, options.family or self.family), ()
 
     def count(self, file: Path) -> int | None:
-        names = _members(file)
+        names = npz_members(file)
         return None if names == (_ALL,) else len(names)
 
     def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
-        for name in _members(file):
+        for name in npz_members(file):
             where = f"{file}: {one_line(name, 60)}"
             content = _array(file, name, where)
             for row in content if name == _ALL else [content]:
                 yield _trajectory(row, where)
-
-
-def _members(path: Path) -> tuple[str, ...]:
-    """Names of the members, ordered by the numbers in them."""
-    check_regular(path)
-    try:
-        with zipfile.ZipFile(path) as file:
-            items = [item for item in file.infolist() if item.filename.endswith(".npy")]
-    except NPZ_ERRORS as error:
-        raise DataError(f"{path}: cannot be read as .npz ({error}). Copy or download it again.") from error
-    if not items:
-        raise DataError(f"{path}: the file has no array.")
-    unpacked = sum(item.file_size for item in items)
-    if unpacked > expansion_limit(path.stat().st_size):
-        raise DataError(f"{path}: unpacks to {unpacked:,} bytes, more than {EXPANSION} times its size.")
-    names = [item.filename.removesuffix(".npy") for item in items]
-    return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d{1,18}", name)]))
 
 
 def _array(path: Path, name: str, where: str) -> Any:

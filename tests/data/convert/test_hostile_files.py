@@ -111,7 +111,7 @@ def test_hdf5_shapes_without_content(tmp_path, name, options):
     ids=["shape", "depth", "kind", "zeros"],
 )
 def test_arrays_that_ask_for_much(folder, monkeypatch, kind, shape, limit, message):
-    monkeypatch.setattr("nmpm.data.convert.gns_npz.expansion_limit", lambda _: limit)
+    monkeypatch.setattr("nmpm.data.convert.array_files.expansion_limit", lambda _: limit)
     text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     with zipfile.ZipFile(folder / "train.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("simulation_0.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(8))

@@ -1,0 +1,225 @@
+"""NumPy and HDF5 files of arrays under usual names: `.npz`, `.npy`, `.h5`, `.hdf5`, and folders of them.
+
+A file holds one run, or several: stacked, numbered, or in groups (`nmpm.data.convert.named_arrays`). A folder of `.npy`
+files of which one is called positions, and the others types, velocities and the like, is one run. Objects are not
+unpickled.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+
+from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
+from nmpm._support.messages import one_line
+from nmpm.data.convert.base import UNKNOWN_LENGTH, Options, split_files
+from nmpm.data.convert.named_arrays import (
+    USUAL_NAMES,
+    ArrayLike,
+    Arrays,
+    RunArrays,
+    group_runs,
+    is_flat,
+    plain_name,
+)
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
+from nmpm.data.metadata import find_family
+from nmpm.errors import DataError, NmpmError
+
+
+class ArrayFiles(RunFiles):
+    """Files of arrays: positions (T, N, D) or (R, T, N, D), and whatever fits them."""
+
+    name: ClassVar[str] = "arrays"
+    summary: ClassVar[str] = "arrays of positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, with usual names"
+    patterns: ClassVar[tuple[str, ...]] = ("*.npz", "*.npy", "*.h5", "*.hdf5")
+
+    def recognises(self, path: Path) -> bool:
+        try:
+            first = next(iter(self.files(path).values()), ())[:1]
+            return any(self.runs(file) for file in first)
+        except (NmpmError, OSError):
+            return False
+
+    def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
+        if is_array_folder(path):
+            return {"all": (path,)}
+        folders = {} if path.is_file() else split_files(path, "*/", unsplit="all")
+        runs = {split: tuple(filter(is_array_folder, inside)) for split, inside in folders.items()}
+        return {split: inside for split, inside in runs.items() if inside} or super().files(path)
+
+    def runs(self, file: Path) -> Sequence[Run]:
+        with open_arrays(file) as arrays:
+            groups = list(group_runs(arrays, str(file)))
+        numbered = [group for group in groups for _ in range(group.count)]
+        return [Run(file, index, group.frames, group.split) for index, group in enumerate(numbered)]
+
+    def facts(self, file: Path, options: Options) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+        with open_arrays(file) as arrays:
+            first = next(group_runs(arrays, str(file)))
+            return array_facts(first, options)
+
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
+        wanted, offset = set(indices), 0
+        ids = {name: i for i, name in metadata.particle_types.items()}
+        with open_arrays(file) as arrays:
+            for group in group_runs(arrays, str(file)):
+                for run in range(group.count):
+                    if offset + run in wanted:
+                        yield group.read(run, metadata.dim, ids)
+                offset += group.count
+
+
+def array_facts(first: RunArrays, options: Options) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+    """Metadata from the arrays of a run, names of those that are unknown, and notes on how arrays are read."""
+    run, dt = first.positions(0), first.fact("dt")
+    dim = 2 if is_flat(run) else run.shape[2]
+    bounds, stated = first.bounds(), dict[str, Any]()
+    if bounds is not None:
+        stated["bounds"] = bounds[:dim]
+    if names := first.type_names():
+        stated["particle_types"] = names
+    if dt is not None and (dt > 0).all():
+        stated["dt"] = float(dt.reshape(-1)[0])
+    if options.family is not None:
+        family = find_family(options.family)
+        stated |= {"particle_types": dict(family.types), "static_types": family.static}
+    facts: dict[str, Any] = {"bounds": ((0.0, 1.0),) * dim, "dt": 1.0, "particle_types": {}} | stated
+    known = {*stated, *({"gravity"} if "gravity" in first.roles else ())}
+    flat = ("z is 0 everywhere: the data are 2-D.",) if dim < run.shape[2] else ()
+    metadata = Metadata(dim=dim, sequence_length=UNKNOWN_LENGTH, **facts)
+    return metadata, EVERYTHING_UNKNOWN - known, (*first.notes(), *flat)
+
+
+def is_array_folder(path: Path) -> bool:
+    """Whether the `.npy` files of a folder are positions and what belongs to them, not a run each."""
+    if not path.is_dir():
+        return False
+    names = {plain_name(file.stem) for file in path.glob("*.npy")}
+    positions = names & set(USUAL_NAMES["position"])
+    return bool(positions) and any(names - positions & set(usual) for usual in USUAL_NAMES.values())
+
+
+@contextmanager
+def open_arrays(path: Path) -> Iterator[Arrays]:
+    """The arrays of a file or folder by name, read when indexed, while the context lasts.
+
+    Raises:
+        DataError: if it cannot be read, holds objects, or unpacks to far more than its size.
+    """
+    if path.is_dir():
+        yield {file.stem: _open_npy(file) for file in sorted(path.glob("*.npy"))}
+    elif path.suffix == ".npy":
+        yield {"position": _open_npy(path)}
+    elif path.suffix == ".npz":
+        members = npz_members(path)
+        with zipfile.ZipFile(path) as archive:
+            yield {name: NpzArray(archive, name, f"{path}: {one_line(name, 60)}") for name in members}
+    else:
+        with open_hdf5(path) as file:
+            check_self_contained(file, path)
+            yield dict(_hdf5_arrays(file, path))
+
+
+def _open_npy(path: Path) -> np.ndarray:
+    check_regular(path)
+    try:
+        array: np.ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+    except NPZ_ERRORS as error:
+        raise DataError(f"{path}: cannot be read as an array of numbers ({one_line(error)}).") from error
+
+
+def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
+    """Datasets and numbers in attributes, by path in the file."""
+    pending = [file]
+    while pending:
+        group = pending.pop()
+        prefix = group.name.strip("/") + "/" if group.name != "/" else ""
+        for name, value in group.attrs.items():
+            if name not in group and np.asarray(value).dtype.kind in "biuf":
+                yield prefix + name, np.asarray(value)
+        for name in group:
+            item = group.get(name)
+            if isinstance(item, h5py.Dataset) and item.shape is not None:
+                check_stored_size(item, f"{path}: {prefix}{name}")
+                yield prefix + name, item
+        groups = [group[name] for name in group if isinstance(group.get(name), h5py.Group) and name != "VTKHDF"]
+        pending += reversed(groups)
+
+
+class NpzArray:
+    """A member of an `.npz` file, of which slices are read; cheap where they are read in order.
+
+    Args:
+        archive: The open file.
+        name: The member, without its suffix.
+        where: For messages.
+
+    Raises:
+        DataError: if the member is damaged.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, name: str, where: str) -> None:
+        self._where = where
+        with self._named_errors():
+            self._file: Any = archive.open(f"{name}.npy")
+            version = np.lib.format.read_magic(self._file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            self.shape, self._fortran, self.dtype = read(self._file)
+            self._start = self._file.tell()
+
+    @contextmanager
+    def _named_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except NPZ_ERRORS as error:
+            raise DataError(
+                f"{self._where}: cannot be read ({one_line(error)}). Copy or download the file again."
+            ) from error
+
+    def __getitem__(self, rows: int | slice | tuple[()]) -> np.ndarray:
+        if self.dtype.hasobject:
+            raise DataError(f"{self._where}: holds Python objects, which are not unpickled. Save arrays of numbers.")
+        if isinstance(rows, tuple):
+            return self._read(0, math.prod(self.shape)).reshape(self.shape, order="F" if self._fortran else "C")
+        if self._fortran or isinstance(rows, slice):
+            whole: np.ndarray = self[()][rows]
+            return whole
+        size = math.prod(self.shape[1:])
+        return self._read(rows * size, size).reshape(self.shape[1:])
+
+    def _read(self, first: int, count: int) -> np.ndarray:
+        with self._named_errors():
+            self._file.seek(self._start + first * self.dtype.itemsize)
+            data = self._file.read(count * self.dtype.itemsize)
+            if len(data) != count * self.dtype.itemsize:
+                raise ValueError(f"{len(data)} bytes are not {count} numbers of {self.dtype}")
+            return np.frombuffer(data, self.dtype)
+
+
+def npz_members(path: Path) -> tuple[str, ...]:
+    """Names of the members, ordered by the numbers in them."""
+    check_regular(path)
+    try:
+        with zipfile.ZipFile(path) as file:
+            items = [item for item in file.infolist() if item.filename.endswith(".npy")]
+    except NPZ_ERRORS as error:
+        raise DataError(f"{path}: cannot be read as .npz ({error}). Copy or download it again.") from error
+    if not items:
+        raise DataError(f"{path}: the file has no array.")
+    unpacked = sum(item.file_size for item in items)
+    if unpacked > expansion_limit(path.stat().st_size):
+        raise DataError(f"{path}: unpacks to {unpacked:,} bytes, more than {EXPANSION} times its size.")
+    names = [item.filename.removesuffix(".npy") for item in items]
+    return tuple(sorted(names, key=lambda name: [int(part) for part in re.findall(r"\d{1,18}", name)]))

@@ -1,0 +1,141 @@
+"""Readers of files that hold one run or several, which may be divided into splits or not."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from nmpm._support.messages import counted
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files, split_runs
+from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.errors import DataError
+
+LEAST_FRAMES = 50
+"""Frames of the parts for validation and tests when one or two runs are cut along time."""
+
+EVERYTHING_UNKNOWN = frozenset(
+    {"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "sequence_length", "particle_types"}
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run in a file.
+
+    Args:
+        file: Where it is.
+        index: Which of the file's runs it is.
+        frames: Number of frames.
+        split: Name of the split, where names in the file state one.
+        part: Frames to take; all when left out.
+    """
+
+    file: Path
+    index: int
+    frames: int
+    split: str | None = None
+    part: range | None = None
+
+
+class RunFiles(DatasetFormat):
+    """Abstract reader of a format whose files hold one run or several each, one subclass per format.
+
+    Files are divided into splits as for `FileFormat`, or runs by their names. Where nothing divides them, the last
+    tenths of the runs test and validate (`split_runs`); one or two long runs are cut along time, 80:10:10.
+
+    Attributes:
+        patterns: Of the files' names.
+    """
+
+    patterns: ClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def runs(self, file: Path) -> Sequence[Run]:
+        """The runs in a file, in order; cheap where the format allows it."""
+
+    @abc.abstractmethod
+    def facts(self, file: Path, options: Options) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+        """Metadata from the first file, names of those that are unknown, and notes for the user."""
+
+    @abc.abstractmethod
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
+        """Yields some of the runs of a file, in ascending order."""
+
+    def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
+        """The files of each split; those that nothing divides are "all"."""
+        return split_files(path, *self.patterns, unsplit="all")
+
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        files = self.files(path)
+        if not files:
+            raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
+        runs = {split: [run for file in paths for run in self.runs(file)] for split, paths in files.items()}
+        splits, divided = divide(runs.pop("all")) if "all" in runs else (runs, ())
+        stated, unknown, notes = self.facts(next(iter(files.values()))[0], options)
+        metadata = options.apply_to(stated)
+        return ForeignDataset(
+            metadata,
+            {split: partial(self._read_all, parts, metadata) for split, parts in splits.items()},
+            (*notes, *divided),
+            {split: len(parts) for split, parts in splits.items()},
+            unknown=unknown,
+        )
+
+    def _read_all(self, runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
+        for file in dict.fromkeys(run.file for run in runs):
+            inside = [run for run in runs if run.file == file]
+            trajectories = self.read(file, [run.index for run in inside], metadata)
+            for run, trajectory in zip(inside, trajectories, strict=True):
+                yield trajectory if run.part is None else cut(trajectory, run.part)
+
+
+def divide(runs: Sequence[Run]) -> tuple[dict[str, Sequence[Run]], tuple[str, ...]]:
+    """Runs that no folder divides, by split; and notes on how they were divided."""
+    named = {split: [run for run in runs if run.split == split] for split in SPLITS}
+    if any(named.values()):
+        rest = [run for run in runs if run.split is None]
+        left_out = (f"{counted(len(rest), 'run')} in no split left out.",) if rest else ()
+        return {split: parts for split, parts in named.items() if parts}, left_out
+    if len(runs) > 2:
+        parts = split_runs(len(runs))
+        sizes = ", ".join(f"{len(part)} {split}" for split, part in parts.items())
+        note = f"Nothing divides the {len(runs)} runs: in their order {sizes}. Folders train, valid, test would."
+        return {split: [runs[index] for index in part] for split, part in parts.items()}, (note,)
+    if all(run.frames >= 10 * LEAST_FRAMES for run in runs):
+        note = "Cut along time: the first 80% of the frames train, then 10% valid, 10% test."
+        return {split: [replace(run, part=time_parts(run.frames)[split]) for run in runs] for split in SPLITS}, (note,)
+    return {"train": runs}, (f"{counted(len(runs), 'run')}, too few to divide: all for training.",)
+
+
+def time_parts(frames: int) -> dict[str, range]:
+    """The frames of a long run by split."""
+    tenth = frames // 10
+    return {
+        "train": range(frames - 2 * tenth),
+        "valid": range(frames - 2 * tenth, frames - tenth),
+        "test": range(frames - tenth, frames),
+    }
+
+
+def cut(trajectory: Trajectory, part: range) -> Trajectory:
+    """Some consecutive frames of a trajectory, without particles that are in none of them."""
+    frames, particles = trajectory.position.shape[:2]
+    position = trajectory.position[part.start : part.stop]
+    keep = ~np.isnan(position[..., 0]).all(axis=0)
+    if len(part) == frames and (keep.all() or not keep.any()):
+        return trajectory
+
+    def cut_field(values: np.ndarray) -> np.ndarray:
+        if values.shape[:1] == (frames,):
+            values = values[part.start : part.stop]
+            return values[:, keep] if values.shape[1:2] == (particles,) else values
+        return values[keep] if values.shape[:1] == (particles,) else values
+
+    fields = {name: cut_field(values) for name, values in trajectory.fields.items()}
+    return Trajectory(position[:, keep], trajectory.particle_type[keep], trajectory.attributes, fields)

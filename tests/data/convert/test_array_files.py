@@ -1,0 +1,191 @@
+"""Arrays under usual names, as people save them."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from nmpm.data.convert import convert, open_dataset
+from nmpm.data.format import Split, read_metadata
+from nmpm.errors import DataError
+
+FRAMES, PARTICLES = 12, 5
+
+
+def made(seed: int = 0, runs: tuple[int, ...] = (), frames: int = FRAMES, particles: int = PARTICLES, dim: int = 2):
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(scale=1e-3, size=(*runs, frames, particles, dim))
+    return (rng.uniform(0.2, 0.8, (*runs, 1, particles, dim)) + np.cumsum(steps, axis=-3)).astype(np.float32)
+
+
+def read(path: Path, split: str = "train", index: int = 0):
+    return next(run for number, run in enumerate(open_dataset(path).splits[split]()) if number == index)
+
+
+def splits(path: Path) -> dict[str, int]:
+    return {name: sum(1 for _ in start()) for name, start in open_dataset(path).splits.items()}
+
+
+def test_runs_stacked_in_an_npz_are_split_and_converted(tmp_path):
+    position, types = made(runs=(8,)), np.array([0, 0, 1, 1, 2])
+    rng = np.random.default_rng(1)
+    heat, fields = rng.random((8, FRAMES, PARTICLES)), {"stiffness": rng.random((8, PARTICLES)), "mass": rng.random(8)}
+    facts = {"dt": 0.004, "gravity": [0.0, -30.0], "odd": np.zeros(77)}
+    velocity = np.gradient(position, axis=1)
+    np.savez_compressed(
+        tmp_path / "mpm.npz", positions=position, types=types, Velocities=velocity, heat=heat, **fields, **facts
+    )
+    notes = convert(tmp_path / "mpm.npz", tmp_path / "out")
+    assert any("Left out" in note and "odd float64 (77,)" in note for note in notes)
+    assert any("6 train, 1 valid, 1 test" in note for note in notes)
+    last = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
+    np.testing.assert_array_equal(last.position, position[7])
+    np.testing.assert_array_equal(last.particle_type, types)
+    np.testing.assert_array_equal(last.attributes["gravity"], [0.0, -30.0])
+    assert {name: values.shape for name, values in last.fields.items()} == {
+        "heat": (FRAMES, PARTICLES), "stiffness": (PARTICLES,), "mass": (), "velocity": (FRAMES, PARTICLES, 2)
+    }  # fmt: skip
+    np.testing.assert_array_equal(last.fields["heat"], heat[7])
+    metadata = read_metadata(tmp_path / "out")
+    assert (metadata.dt, metadata.dim, sorted(metadata.particle_types)) == (0.004, 2, [0, 1, 2])
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.h5", "a.hdf5", "folder"])
+def test_files_of_every_kind_hold_one_run(tmp_path, name):
+    path, position, types = tmp_path / name, made(), np.arange(PARTICLES) % 2
+    match path.suffix:
+        case ".npz":
+            np.savez(path, pos=position, material=types)
+        case ".npy":
+            np.save(path, position)
+            types = types * 0
+        case "":
+            path.mkdir()
+            np.save(path / "Positions.npy", position)
+            np.save(path / "particle_types.npy", types)
+        case _:
+            with h5py.File(path, "w") as file:
+                file["coordinates"], file["phase"] = position, types
+    run = read(path)
+    np.testing.assert_array_equal(run.position, position)
+    np.testing.assert_array_equal(run.particle_type, types)
+
+
+def test_runs_have_groups_or_numbers(tmp_path):
+    runs = [made(seed) for seed in range(11)]
+    types = np.array([3, 3, 3, 4, 4])
+    np.savez(tmp_path / "numbered.npz", types=types, **{f"run{i}": run for i, run in enumerate(runs)})
+    np.savez(tmp_path / "named.npz", **{f"x_{i}": run for i, run in enumerate(runs)},
+             **{f"types_{i}": types for i in range(11)})  # fmt: skip
+    np.savez(tmp_path / "unnamed.npz", *runs)
+    with h5py.File(tmp_path / "groups.h5", "w") as file:
+        file["type"] = types
+        file.attrs["dt"] = 0.02
+        for index, run in enumerate(runs):
+            file[f"experiment {index:02d}/data/pos"] = run
+    for name in ("numbered.npz", "named.npz", "unnamed.npz", "groups.h5"):
+        path = tmp_path / name
+        assert splits(path) == {"train": 9, "valid": 1, "test": 1}
+        np.testing.assert_array_equal(read(path, "test").position, runs[10])
+        np.testing.assert_array_equal(read(path).particle_type, types * (name != "unnamed.npz"))
+    assert open_dataset(tmp_path / "groups.h5").metadata.dt == 0.02
+
+
+def test_names_and_folders_divide_runs(tmp_path):
+    np.savez(tmp_path / "parts.npz", train=made(runs=(3,)), val=made(runs=(2,)))
+    assert splits(tmp_path / "parts.npz") == {"train": 3, "valid": 2}
+    for name, count in {"train": 2, "val": 1, "test": 1}.items():
+        (tmp_path / "many" / name).mkdir(parents=True)
+        for index in range(count):
+            np.savez(tmp_path / "many" / name / f"{index}.npz", position=made(index))
+    assert splits(tmp_path / "many") == {"train": 2, "valid": 1, "test": 1}
+    for index in range(5):
+        (tmp_path / "runs" / f"run{index}").mkdir(parents=True)
+        np.save(tmp_path / "runs" / f"run{index}" / "position.npy", made(index))
+        np.save(tmp_path / "runs" / f"run{index}" / "time.npy", np.arange(FRAMES) * 0.5)
+    assert splits(tmp_path / "runs") == {"train": 3, "valid": 1, "test": 1}
+    assert read(tmp_path / "runs").fields["time"].dtype == np.float64
+
+
+def test_one_long_run_is_cut_along_time(tmp_path):
+    position = made(frames=600)
+    np.savez(tmp_path / "long.npz", position=position, time=np.arange(600) * 0.1)
+    run = read(tmp_path / "long.npz", "valid")
+    np.testing.assert_array_equal(run.position, position[480:540])
+    np.testing.assert_allclose(run.fields["time"], np.arange(480, 540) * 0.1)
+    np.savez(tmp_path / "short.npz", position=position[:400])
+    assert splits(tmp_path / "short.npz") == {"train": 1}
+
+
+def test_absent_particles_become_nan(tmp_path):
+    position = made()
+    changing = np.tile([1, 1, 1, 2, 2], (FRAMES, 1))
+    changing[:4, 0] = changing[8:, 3] = -1
+    np.savez(tmp_path / "types.npz", position=position, types=changing)
+    np.savez(tmp_path / "mask.npz", position=position, active=changing >= 0, types=[1, 1, 1, 2, 2])
+    for name in ("types.npz", "mask.npz"):
+        run = read(tmp_path / name)
+        np.testing.assert_array_equal(np.isnan(run.position).all(axis=2), changing == -1)
+        assert run.particle_type.tolist() == [1, 1, 1, 2, 2]
+    changing[5, 2] = 2
+    np.savez(tmp_path / "types.npz", position=position, types=changing)
+    with pytest.raises(DataError, match=r"types\.npz: the type of particle 2 changes, to 2 in frame 5"):
+        read(tmp_path / "types.npz")
+    padded = np.array([1, 1, -1, 2, 2])
+    np.savez(tmp_path / "padded.npz", position=position, types=padded, heat=np.arange(5.0))
+    run = read(tmp_path / "padded.npz")
+    np.testing.assert_array_equal(run.position, position[:, padded >= 0])
+    assert run.fields["heat"].tolist() == [0, 1, 3, 4]
+
+
+def test_flat_data_become_two_dimensional(tmp_path):
+    position = made(runs=(4,), dim=3)
+    position[..., 2] = 0
+    velocity = position * 2
+    np.savez(tmp_path / "flat.npz", position=position, velocity=velocity, gravity=[0.0, -9.81, 0.0])
+    dataset, run = open_dataset(tmp_path / "flat.npz"), read(tmp_path / "flat.npz")
+    assert dataset.metadata.dim == 2
+    assert any("2-D" in note for note in dataset.notes)
+    assert (run.position.shape[2], run.fields["velocity"].shape[2], len(run.attributes["gravity"])) == (2, 2, 2)
+    position[3, 5, 1, 2] = 0.1
+    np.savez(tmp_path / "bumpy.npz", position=position)
+    with pytest.raises(DataError, match=r"bumpy.npz, run 3: z is 0 in the first run, but not here"):
+        convert(tmp_path / "bumpy.npz", tmp_path / "out")
+
+
+def test_components_and_names_of_types_are_joined(tmp_path):
+    position, names = made(), np.array(["sand", "clay", "sand", "clay", "clay"])
+    x, y = np.moveaxis(position, -1, 0)
+    np.savez(tmp_path / "xy.npz", x=x, y=y, vx=2 * x, vy=2 * y, material=names)
+    run = read(tmp_path / "xy.npz")
+    np.testing.assert_array_equal(run.position, position)
+    np.testing.assert_array_equal(run.fields["velocity"], 2 * position)
+    types = open_dataset(tmp_path / "xy.npz").metadata.particle_types
+    assert [types[i] for i in run.particle_type.tolist()] == names.tolist()
+
+
+def test_swapped_axes_are_refused_with_the_mend(tmp_path):
+    position, types = made(frames=30, particles=20).swapaxes(0, 1), np.zeros(20, int)
+    np.savez(tmp_path / "swapped.npz", position=position, types=types)
+    with pytest.raises(DataError, match=r"swapped.npz: the axes of positions \(20, 30, 2\) look swapped: there are 20"):
+        read(tmp_path / "swapped.npz")
+    np.save(tmp_path / "bare.npy", position)
+    with pytest.raises(DataError, match=r"bare.npy: .*look swapped: neighbours along the first axis.*swapaxes"):
+        read(tmp_path / "bare.npy")
+
+
+def test_objects_are_not_unpickled(tmp_path):
+    ragged = np.array([made(), made(frames=7)], dtype=object)
+    np.savez(tmp_path / "ragged.npz", ragged=ragged, position=made())
+    assert any("ragged object (2,)" in note for note in open_dataset(tmp_path / "ragged.npz").notes)
+    np.save(tmp_path / "ragged.npy", ragged)
+    with pytest.raises(DataError, match=r"ragged\.npy"):
+        open_dataset(tmp_path / "ragged.npy", "arrays")
+
+
+def test_a_sample_of_taichi_is_read(recorded):
+    path = recorded / "third-party" / "taichi-mpm128"
+    assert splits(path) == {"train": 6, "valid": 1, "test": 1}
+    with np.load(path / "mpm128.npz") as content:
+        np.testing.assert_array_equal(read(path, "test").position, content["positions"][7])
