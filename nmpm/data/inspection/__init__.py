@@ -12,7 +12,7 @@ from nmpm._support.progress import progress_bar
 from nmpm.data.fields import FieldFacts, Kind, add_fields
 from nmpm.data.format import Metadata, Split
 from nmpm.data.gravity import distinct_gravities, trajectory_gravity
-from nmpm.data.grid_rule import GridFacts
+from nmpm.data.grid_rule import GridFacts, candidates, recommended_cells
 from nmpm.data.inspection.measurements import Measurements, find_anomalies
 from nmpm.data.inspection.reading import open_dataset
 from nmpm.data.loading.sources import FolderSource
@@ -102,7 +102,8 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
     first = next(iter(splits))
     spacing = neighbour_distance(splits[first], samples[first], metadata)
     spacing = spacing or max(high - low for low, high in metadata.bounds) / 64
-    measured, statistics = Measurements(metadata, domain), MotionStatistics(metadata)
+    numbers = candidates(domain, scene.particle_spacing if scene else spacing)
+    measured, statistics = Measurements(metadata, domain, numbers), MotionStatistics(metadata)
     shapes: dict[str, tuple[int, ...]] = {}
     facts: dict[str, FieldFacts] = {}
     with progress_bar("Inspecting", sum(map(len, samples.values()))) as advance:
@@ -150,7 +151,7 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         varies=(*counts.varies(), *(name for name, field in facts.items() if field.kind != "constant")),
         fields=shapes,
         grids=measured.grids(),
-        recommended=measured.recommended(),
+        recommended=recommended_cells(measured.grids(), counts.most_moving),
         occupied=occupied,
         occupied_each=occupied_each,
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
@@ -185,6 +186,11 @@ class _Counts:
     def frames(self) -> set[int]:
         """Numbers of frames that occur."""
         return {frames for sizes in self.sizes.values() for frames, _, _ in sizes}
+
+    @property
+    def most_moving(self) -> int:
+        """Moving particles in a trajectory, at most."""
+        return max(moving for sizes in self.sizes.values() for _, moving, _ in sizes)
 
     def facts(self, name: str, inspected: int) -> SplitFacts:
         """The facts about a split."""

@@ -8,15 +8,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.grid_rule import GridFacts
+from nmpm.data.grid_rule import GridFacts, grid_shape
 from nmpm.data.statistics import Extent, displacements, first_moving_particle, first_outside
 from nmpm.scene import Interval
 
-CANDIDATES = (16, 32, 64, 128, 256, 512)
-"""Cells along the longest side: powers of two, as networks that halve the grid need."""
-PER_CELL = 2.0
-"""Particles per occupied cell that a grid should have. The paper's grids have 1.3 to 3: 64 cells for its MPM scenes,
-128 for WBC-SPH. Its goop, at 3, is worse on 32 cells and on 128 (MSE 5.5, 2.4 and 7.1 ×10⁻³ for 32, 64 and 128)."""
 _MASK_CELLS = 64
 _FRAMES_ON_GRIDS = 12
 _REST = 0.02  # of a trajectory's peak speed
@@ -25,10 +20,16 @@ _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 
 
 
 class Measurements:
-    """Accumulates measurements of a dataset's trajectories; `domain` is the extent of the grids."""
+    """Accumulates measurements of a dataset's trajectories.
 
-    def __init__(self, metadata: Metadata, domain: Sequence[Interval]) -> None:
-        self.metadata = metadata
+    Args:
+        metadata: Facts about the dataset.
+        domain: The extent of the grids.
+        numbers: Cells along the longest side of each grid to measure on.
+    """
+
+    def __init__(self, metadata: Metadata, domain: Sequence[Interval], numbers: Sequence[int]) -> None:
+        self.metadata, self.domain = metadata, domain
         self.low, high = np.asarray(domain).T
         self.extent = high - self.low
         self.longest = float(self.extent.max())
@@ -37,13 +38,13 @@ class Measurements:
         self.falls: list[np.ndarray] = []
         self._counts = np.zeros(len(_BINS) + 1)
         self._fastest = 0.0
-        self._per_cell: dict[int, list[float]] = {cells: [] for cells in CANDIDATES}
+        self._per_cell: dict[int, list[float]] = {cells: [] for cells in numbers}
         self._mask = np.zeros(math.prod(self.shape(_MASK_CELLS)), bool)
         self._shares: list[float] = []
 
     def shape(self, cells: int) -> tuple[int, ...]:
-        """Cells along each axis, as close to square as possible."""
-        return tuple(max(1, round(cells * side / self.longest)) for side in self.extent.tolist())
+        """Cells along each axis."""
+        return grid_shape(self.domain, self.metadata.periodic, cells)
 
     def add(self, trajectory: Trajectory) -> None:
         """Adds a trajectory."""
@@ -67,7 +68,7 @@ class Measurements:
         self.rests.append(first if first < len(speed) else None)
 
     def _add_cells(self, position: np.ndarray) -> None:
-        for cells in CANDIDATES:
+        for cells in self._per_cell:
             for frame in np.unique(np.linspace(0, len(position) - 1, _FRAMES_ON_GRIDS).astype(int)):
                 index = self._cells(position[frame], cells)
                 self._per_cell[cells].append(len(index) / len(np.unique(index)))
@@ -99,11 +100,6 @@ class Measurements:
             GridFacts(cells, self.shape(cells), per_cell, *(speed / (self.longest / cells) for speed in speeds))
             for cells, per_cell in medians.items()
         )
-
-    def recommended(self) -> int:
-        """The candidate whose particles per occupied cell are closest to `PER_CELL`, by ratio."""
-        ratios = {grid.cells: abs(math.log(grid.per_cell / PER_CELL)) for grid in self.grids() if grid.per_cell > 0}
-        return min(ratios, key=lambda cells: ratios[cells]) if ratios else CANDIDATES[0]
 
     def occupied(self) -> tuple[float, float]:
         """Share of the domain ever occupied, in all trajectories together and in one of them (median)."""
