@@ -153,7 +153,7 @@ class TrajectoryDataModule(LightningDataModule):
             recordings = self.data_source.recordings(name)
             recordings.check_ends()
             if name != "train":
-                recordings.require_frames(3, "an evaluation")
+                recordings.with_frames(3, "an evaluation")
 
     @property
     def has_test(self) -> bool:

@@ -218,11 +218,24 @@ def test_a_path_replaces_a_name(make_dataset):
     assert TrajectoryDataModule(path="???", name="goop").description == "goop, simulated by nmpm"
 
 
+def test_trajectories_too_short_for_a_window_are_left_out_and_counted(make_dataset):
+    folder = make_dataset(train=TRAIN, valid=((2, 5), (6, 4), (5, 3)))
+    with pytest.warns(UserWarning, match=r"train.h5: 3 of 5 trajectories have fewer than 10 frames, a training window"):
+        loader = module_of(folder, horizon=8).train_dataloader()
+    provider = loader.buffer.provider
+    assert [provider.indices[number] for number in loader.buffer.plan.members(0)] == [0, 2]
+    assert loader.buffer.plan.frames == (12, 14)
+    with pytest.warns(UserWarning, match=r"valid.h5: 1 of 3 trajectories have fewer than 3 frames, an evaluation"):
+        loader = module_of(folder).val_dataloader()
+    assert sorted(index for batch in loader.batches for index in batch) == [1, 2]
+    assert {window.frames.shape[1:3] for window in loader} == {(5, 3), (6, 4)}
+
+
 def test_files_that_do_not_suffice_are_named(make_dataset):
     folder = make_dataset(train=TRAIN, valid=((2, 5),))
-    with pytest.raises(DataError, match=r"trajectory 00001: it has 9 frames, .* needs 10.*horizon"):
-        module_of(folder, horizon=8).train_dataloader()
-    with pytest.raises(DataError, match="trajectory 00000: it has 2 frames, an evaluation needs 3"):
+    with pytest.raises(DataError, match=r"its longest trajectory has 14 frames, a training window needs 22.*horizon"):
+        module_of(folder, horizon=20).train_dataloader()
+    with pytest.raises(DataError, match="its longest trajectory has 2 frames, an evaluation needs 3"):
         module_of(folder).val_dataloader()
     (folder / "valid.h5").rename(folder / "validation.h5")
     with pytest.raises(DataError, match=r"no valid.h5 there.*Rename validation.h5 to valid.h5"):

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import count, groupby
 from typing import Protocol
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nmpm._support.threads import Task
 from nmpm.data.loading.padded_batch import PaddedRecordings, displacements
+from nmpm.data.loading.presence import first_frames
 from nmpm.data.loading.recording import Recording
 from nmpm.data.loading.window_plan import Drawn, WindowPlan
 from nmpm.particles import Window
@@ -32,8 +34,6 @@ class RecordingProvider(Protocol):
     def max_bytes(self) -> int: ...  # of the positions of the largest trajectory
 
     def load(self, indices: Sequence[int]) -> list[Recording]: ...  # reads or simulates several trajectories
-
-    def require_frames(self, frames: int, purpose: str) -> None: ...  # an error names the first that has fewer
 
     def close(self) -> None: ...  # stops unfinished work; the provider can be used again afterwards
 
@@ -58,9 +58,17 @@ class MotionSampler:
 def _window_distances(recording: Recording, scene: Scene, length: int) -> np.ndarray:
     """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
     steps = displacements(recording.frames, scene).numpy()
-    speed = np.linalg.norm(steps, axis=-1).mean(axis=-1, dtype=np.float64)
+    speed = _mean_over_present(np.linalg.norm(steps, axis=-1), recording.present)
     total = np.concatenate([[0.0], np.cumsum(speed)])
     return np.asarray(total[length - 1 :] - total[: len(total) - length + 1])
+
+
+def _mean_over_present(speed: np.ndarray, present: Tensor | None) -> np.ndarray:
+    """(T - 1,) mean of the (T - 1, N) speeds of those particles that are there before and after; 0 of none."""
+    if present is None:
+        return np.asarray(speed.mean(axis=-1, dtype=np.float64))
+    there = (present[1:] & present[:-1]).numpy()
+    return np.asarray((speed * there).sum(axis=-1, dtype=np.float64) / np.maximum(there.sum(axis=-1), 1))
 
 
 @dataclass(frozen=True)
@@ -70,16 +78,37 @@ class _BufferContents:
     padded: PaddedRecordings  # all of them, one per row, in the order of `recordings`
     recordings: Mapping[int, Recording]  # views by index of the trajectory, without padding, in host memory
     motion: MotionSampler | None  # draws windows in proportion to motion; None where the plan has no emphasis
+    length: int  # frames of a window
 
-    def size(self, trajectory: int) -> int:
-        """Number of particles of a trajectory."""
-        return self.recordings[trajectory].frames.shape[1]
+    @cached_property
+    def rows(self) -> dict[int, int]:
+        """The row of each trajectory in `padded`."""
+        return {trajectory: row for row, trajectory in enumerate(self.recordings)}
 
-    def gather(self, drawn: Sequence[Drawn], length: int, particles: int) -> Window:
+    @cached_property
+    def first_frames(self) -> dict[int, np.ndarray]:
+        """For trajectories with absent particles, the frame at which a window that is drawn starts instead."""
+        present = {trajectory: recording.present for trajectory, recording in self.recordings.items()}
+        return {index: first_frames(mask.numpy(), self.length) for index, mask in present.items() if mask is not None}
+
+    def start_inhabited(self, drawn: Drawn) -> Drawn:
+        """The same window, or the next in whose first two frames there is a particle."""
+        trajectory, first = drawn
+        return (trajectory, int(self.first_frames[trajectory][first])) if trajectory in self.first_frames else drawn
+
+    def size(self, drawn: Drawn) -> int:
+        """Number of particles of a window."""
+        trajectory, first = drawn
+        if self.padded.spans is None:
+            return self.recordings[trajectory].frames.shape[1]
+        begin, end = self.padded.spans[self.rows[trajectory]].T
+        return int(np.count_nonzero((begin < first + self.length) & (end >= first)))
+
+    def gather(self, drawn: Sequence[Drawn], particles: int) -> Window:
         """The windows, padded to a number of particles."""
-        row = {trajectory: row for row, trajectory in enumerate(self.recordings)}
         trajectories, starts = zip(*drawn, strict=True)
-        return self.padded.gather([row[trajectory] for trajectory in trajectories], starts, length, particles)
+        rows = [self.rows[trajectory] for trajectory in trajectories]
+        return self.padded.gather(rows, starts, self.length, particles)
 
 
 class TrajectoryBuffer:
@@ -88,12 +117,16 @@ class TrajectoryBuffer:
     While one buffer is in use, a thread reads the next: up to three times `plan.buffer_size` trajectories are in
     memory, however large the dataset is.
 
-    Raises:
-        DataError: if a trajectory is shorter than a window.
+    Windows start where particles are: the next in whose first two frames there is one takes the place of a window that
+    starts in missing frames.
+
+    Args:
+        provider: The trajectories, none shorter than a window.
+        plan: Which of their windows make up which batch.
+        device: Where the buffer is; the CPU when None.
     """
 
     def __init__(self, provider: RecordingProvider, plan: WindowPlan, device: torch.device | None = None) -> None:
-        provider.require_frames(plan.length, f"a training window of {plan.length - 2} frames to predict")
         self.provider, self.plan, self.device = provider, plan, device or torch.device("cpu")
 
     def batches(self, start: int = 0, rank: int = 0, world: int = 1) -> Iterator[Window]:
@@ -113,9 +146,9 @@ class TrajectoryBuffer:
                         dealt = self._deal(bucket, contents, rank, world)
                     batch = dealt[index - bucket.start]
                     # The largest of all ranks: noise is drawn for tensors of equal shape on all of them.
-                    most = max(contents.size(trajectory) for trajectory, _ in batch)
+                    most = max(map(contents.size, batch))
                     first = (rank - plan.drawing_ranks(rank, world).start) * plan.batch_size
-                    yield contents.gather(batch[first : first + plan.batch_size], plan.length, most)
+                    yield contents.gather(batch[first : first + plan.batch_size], most)
                 contents = upcoming.result()
             finally:
                 upcoming.cancel()
@@ -131,8 +164,8 @@ class TrajectoryBuffer:
                 windows = self.plan.emphasise(windows, contents.motion.window_at, index, *numbers)
             if self.plan.openings:
                 windows = self.plan.move_to_openings(windows, index, *numbers)
-            drawn += windows
-        return self.plan.deal(bucket, drawn, [contents.size(trajectory) for trajectory, _ in drawn])
+            drawn += map(contents.start_inhabited, windows)
+        return self.plan.deal(bucket, drawn, [contents.size(window) for window in drawn])
 
     def _load(self, members: Sequence[int], previous: _BufferContents | None) -> _BufferContents:
         """Loads a buffer's trajectories, reusing those of the previous buffer."""
@@ -146,4 +179,4 @@ class TrajectoryBuffer:
         # Views of the padded tensor, so that the memory of the loaded recordings is freed.
         recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}
         motion = MotionSampler(recordings, self.provider.scene, self.plan.length) if self.plan.emphasis else None
-        return _BufferContents(padded.to(self.device), recordings, motion)
+        return _BufferContents(padded.to(self.device), recordings, motion, self.plan.length)

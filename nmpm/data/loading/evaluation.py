@@ -15,8 +15,9 @@ from nmpm.particles import Window
 class EvaluationLoader:
     """Whole trajectories in batches of equal length; each trajectory goes to exactly one rank.
 
-    Similar numbers of particles share a batch, so that few are padded much. `batches` holds the indices of each batch's
-    trajectories. A rank without any has one batch of none, so that it takes part in all collectives.
+    Similar numbers of particles share a batch, so that few are padded much. `batches` holds the indices of each
+    batch's trajectories. Trajectories with fewer than 3 frames are left out, with a warning that counts them. A
+    rank without any has one batch of none, so that it takes part in all collectives.
 
     Args:
         recordings: The trajectories.
@@ -26,7 +27,7 @@ class EvaluationLoader:
         device: Where the batches are used; those for a GPU are in pinned memory.
 
     Raises:
-        DataError: if a trajectory has fewer than 3 frames, so that there is nothing to predict.
+        DataError: if all trajectories have fewer than 3 frames, so that there is nothing to predict.
     """
 
     def __init__(
@@ -40,13 +41,13 @@ class EvaluationLoader:
     ) -> None:
         self.recordings, self.device = recordings, device or torch.device("cpu")
         self._batch_size, self._rank, self._world = batch_size, rank, world
-        recordings.require_frames(3, "an evaluation")
+        self._indices = recordings.with_frames(3, "an evaluation").indices
         self.restrict(limit)
 
     def restrict(self, limit: int | None) -> None:
         """Use only the first `limit` trajectories from now on; all when None."""
         split = self.recordings.split
-        order = sorted(range(len(split))[:limit], key=split.frames)[self._rank :: self._world]
+        order = sorted(self._indices[:limit], key=split.frames)[self._rank :: self._world]
         batches: list[tuple[int, ...]] = []
         for _, equally_long in itertools.groupby(order, key=split.frames):
             by_size, size = sorted(equally_long, key=split.particles), self._batch_size
@@ -60,5 +61,5 @@ class EvaluationLoader:
         return pin_for(self.device, map(self._read, self.batches))
 
     def _read(self, indices: Sequence[int]) -> Window:
-        read = collate([self.recordings[index] for index in indices or (0,)], self.recordings.scene)
+        read = collate([self.recordings[index] for index in indices or self._indices[:1]], self.recordings.scene)
         return read.scenes(slice(len(indices)))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.data.loading.presence import spans
 from nmpm.data.loading.recording import Recording
 from nmpm.errors import DataError
 from nmpm.particles import Window
@@ -22,8 +23,10 @@ class PaddedRecordings:
 
     Args:
         frames: (S, T, N, D) positions, in domain length.
-        material, mask, obstacle, obstacle_mask, gravity, fields: as in `Window`, with S in place of B.
+        material, mask, obstacle, obstacle_mask, gravity, fields, present, obstacle_frames, volume: as in `Window`, with
+            S in place of B.
         scene: The recordings' scene.
+        spans: (S, N, 2) first and last frame in which each particle is there; None where all always are.
     """
 
     frames: Tensor
@@ -34,6 +37,10 @@ class PaddedRecordings:
     gravity: Tensor
     scene: Scene
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+    present: Tensor | None = None
+    obstacle_frames: Tensor | None = None
+    volume: Tensor | None = None
+    spans: np.ndarray | None = None
 
     @classmethod
     def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
@@ -43,11 +50,22 @@ class PaddedRecordings:
         obstacle, obstacle_mask = _pad_and_stack([recording.obstacle[None] for recording in recordings], centre)
         material, _ = _pad_and_stack([recording.material[None, :, None] for recording in recordings], [0])
         gravity = torch.stack([recording.gravity for recording in recordings])
-        fields = _stack_fields(recordings)
-        return cls(frames, material[:, 0, :, 0], mask, obstacle[:, 0], obstacle_mask, gravity, scene, fields)
+        return cls(
+            frames=frames,
+            material=material[:, 0, :, 0],
+            mask=mask,
+            obstacle=obstacle[:, 0],
+            obstacle_mask=obstacle_mask,
+            gravity=gravity,
+            scene=scene,
+            fields=_stack_fields(recordings),
+            **_stack_presence(recordings),
+            obstacle_frames=_stack_obstacle_frames(recordings, centre),
+            volume=_stack_volumes(recordings),
+        )
 
     def recording(self, row: int, original: Recording) -> Recording:
-        """A view of one row without its padding; `original` is the recording that was stacked there."""
+        """A view of one row's particles without its padding; `original` is the recording that was stacked there."""
         frames, count, _ = original.frames.shape
         return Recording(
             frames=self.frames[row, :frames, :count],
@@ -58,6 +76,9 @@ class PaddedRecordings:
                 name: self.fields[name][row, : values.shape[0], : values.shape[1]]
                 for name, values in original.fields.items()
             },
+            present=None if original.present is None or self.present is None else self.present[row, :frames, :count],
+            obstacle_frames=original.obstacle_frames,
+            volume=original.volume,
         )
 
     def to(self, device: torch.device) -> PaddedRecordings:
@@ -69,16 +90,28 @@ class PaddedRecordings:
         """Gathers `length` consecutive frames of B recordings, by their rows and first frames.
 
         On the scene's periodic axes positions are unwrapped from the first frame on, so that differences between frames
-        are displacements. Windows are padded to a number of particles, the largest recording's if left out.
+        are displacements. Windows are padded to a number of particles, without those that are there only before or
+        only after the window; when it is left out, all particles of the largest recording are in the windows.
         """
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)
         frame = first[:, None] + torch.arange(length, device=self.frames.device)
-        kept = slice(particles)
-        frames = self.frames[:, :, kept][row[:, None], frame]
-        unwrap(frames, self.scene)
+        if particles is not None and self.spans is not None:
+            there = _present_particles(self.spans[rows], starts, length, particles)
+            window = self._gather_some(row, frame, _index_tensor(there, self.frames.device))
+        else:
+            window = self._gather_all(row, frame, slice(particles))
+        unwrap(window.frames, self.scene)
+        if self.obstacle_frames is None:
+            return window
+        moved = self.obstacle_frames[row[:, None], frame]
+        unwrap(moved, self.scene)
+        return replace(window, obstacle_frames=moved, obstacle=moved[:, 1])
+
+    def _gather_all(self, row: Tensor, frame: Tensor, kept: slice) -> Window:
+        """The windows of (B,) rows and (B, T) frames with some particles, the same ones for all rows."""
         return Window(
-            frames=frames,
+            frames=self.frames[:, :, kept][row[:, None], frame],
             material=self.material[:, kept][row],
             mask=self.mask[:, kept][row],
             obstacle=self.obstacle[row],
@@ -88,6 +121,27 @@ class PaddedRecordings:
                 name: values[:, :, kept][row] if values.shape[1] == 1 else values[:, :, kept][row[:, None], frame]
                 for name, values in self.fields.items()
             },
+            present=None if self.present is None else self.present[:, :, kept][row[:, None], frame],
+            volume=None if self.volume is None else self.volume[:, kept][row],
+        )
+
+    def _gather_some(self, row: Tensor, frame: Tensor, particles: Tensor) -> Window:
+        """The windows of (B,) rows and (B, T) frames with (B, N') of their particles; −1 is padding."""
+        real, chosen = particles >= 0, particles.clamp(min=0)
+        scene, moment, each = row[:, None, None], frame[:, :, None], chosen[:, None, :]
+        return Window(
+            frames=self.frames[scene, moment, each],
+            material=self.material[row[:, None], chosen],
+            mask=real,
+            obstacle=self.obstacle[row],
+            obstacle_mask=self.obstacle_mask[row],
+            gravity=self.gravity[row],
+            fields={
+                name: values[scene, moment if values.shape[1] > 1 else 0, each if values.shape[2] > 1 else 0]
+                for name, values in self.fields.items()
+            },
+            present=None if self.present is None else self.present[scene, moment, each] & real[:, None],
+            volume=None if self.volume is None else self.volume[row[:, None], chosen],
         )
 
 
@@ -147,7 +201,50 @@ def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
     return stacked
 
 
-def _index_tensor(values: Sequence[int], device: torch.device) -> Tensor:
+def _stack_presence(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """`present` and `spans` of `PaddedRecordings`; nothing where all particles always are there."""
+    if all(recording.present is None for recording in recordings):
+        return {}
+    parts = [
+        torch.ones(recording.frames.shape[:2], dtype=torch.bool) if recording.present is None else recording.present
+        for recording in recordings
+    ]
+    present = _pad_and_stack([part.unsqueeze(-1) for part in parts], [False])[0].squeeze(-1)
+    padded = np.full((*present.shape[::2], 2), [present.shape[1], -1])
+    for row, part in enumerate(parts):
+        padded[row, : part.shape[1]] = spans(part.numpy())
+    return {"present": present, "spans": padded}
+
+
+def _present_particles(spans: np.ndarray, starts: Sequence[int], length: int, count: int) -> np.ndarray:
+    """(B, count) particles, by their (B, N, 2) spans, that are there at some time in windows, padded with −1."""
+    first = np.asarray(starts)[:, None]
+    there = (spans[..., 0] < first + length) & (spans[..., 1] >= first)
+    particles = np.full((len(there), count), -1)
+    for row, mask in enumerate(there):
+        index = np.flatnonzero(mask)
+        particles[row, : len(index)] = index
+    return particles
+
+
+def _stack_obstacle_frames(recordings: Sequence[Recording], centre: Sequence[float]) -> Tensor | None:
+    """(S, T, M, D) positions of obstacles that move; None where there are none."""
+    parts = [recording.obstacle_frames for recording in recordings if recording.obstacle_frames is not None]
+    return _pad_and_stack(parts, centre)[0] if len(parts) == len(recordings) else None
+
+
+def _stack_volumes(recordings: Sequence[Recording]) -> Tensor | None:
+    """(S, N) relative volumes, 1 in padding and where a recording has none; None where none has."""
+    if all(recording.volume is None for recording in recordings):
+        return None
+    parts = [
+        torch.ones(len(recording.material)) if recording.volume is None else recording.volume
+        for recording in recordings
+    ]
+    return _pad_and_stack([part[None, :, None] for part in parts], [1.0])[0][:, 0, :, 0]
+
+
+def _index_tensor(values: Sequence[int] | np.ndarray, device: torch.device) -> Tensor:
     """Indices on a device; the copy to a GPU does not wait for the kernels that are queued there."""
     index = torch.as_tensor(values)
     return index.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else index.to(device)

@@ -1,11 +1,14 @@
 """Trajectories as tensors, validated against their scene.
 
-A recording holds what a model needs of a trajectory: the moving particles, their materials and fields, the static
-particles once, and gravity in length per frame squared.
+A recording holds what a model needs of a trajectory: the moving particles, their materials and fields, the obstacles,
+at rest or moving as recorded, and gravity in length per frame squared. Where a particle is absent, its position and its
+fields are those that it had last, or else will have first, so that all values are finite and no border of a period lies
+between them.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,9 +17,11 @@ import torch
 from torch import Tensor
 
 from nmpm._support.threads import raise_if_abandoned
+from nmpm.data.array_checks import check_end
 from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.loading.presence import Presence, without_those_gone
 from nmpm.data.statistics import first_moving_particle, first_outside
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -26,11 +31,14 @@ from nmpm.scene import Scene
 class Recording:
     """One trajectory of a known scene; all values are finite."""
 
-    frames: Tensor  # (T, N, D) float32 positions of the moving particles, in domain length
+    frames: Tensor  # (T, N, D) float32 positions of the moving particles that are ever there, in domain length
     material: Tensor  # (N,) int64 index into `Scene.materials`
-    obstacle: Tensor  # (M, D) float32 positions of the static particles
+    obstacle: Tensor  # (M, D) float32 positions of the obstacles in their first frame
     gravity: Tensor  # (D,) float32 in length per frame squared, zero where unknown
     fields: Mapping[str, Tensor] = field(default_factory=dict)  # float32 (T, N), (1, N) if constant in time, or (1, 1)
+    present: Tensor | None = None  # (T, N) bool; None where all particles always are
+    obstacle_frames: Tensor | None = None  # (T, M, D) float32; None where no obstacle of the scene moves
+    volume: Tensor | None = None  # (N,) float32 volumes as multiples of the scene's `particle_volume`; None for 1
 
 
 @dataclass(frozen=True)
@@ -48,34 +56,63 @@ class RecordingReader:
                 moves, or a field that the metadata declare is missing or not finite.
         """
         types = trajectory.particle_type
-        moving, static = self.check(trajectory, where)
-        mover = first_moving_particle(trajectory.position, static, self.scene.domain)
-        if mover is not None:
-            name = self.metadata.particle_types[int(types[mover])]
-            raise DataError(
-                f"{where}: particle {mover} is of the static type {types[mover]} ({name}) but moves. Obstacles must be"
-                " at rest; to predict it like a material, remove its type from static_types in the metadata."
-            )
+        moving, obstacle = self.check(trajectory, where)
+        self._check_rest(trajectory, where)
         gravity = trajectory_gravity(trajectory.attributes, self.scene, where) or (0.0,) * self.scene.dim
+        position = without_those_gone(trajectory.position[:, moving], self.scene)
+        presence = Presence.of(position)
+        if presence is not None:
+            check_end(position, where)
+            presence.check(where)
+            moving[moving] = presence.ever
+            position = presence.fill(position[:, presence.ever])
+        obstacles = self._obstacles(trajectory.position, obstacle)
         return Recording(
-            frames=torch.from_numpy(np.ascontiguousarray(trajectory.position[:, moving])),
+            frames=torch.from_numpy(np.ascontiguousarray(position)),
             material=torch.from_numpy(self._materials(types[moving], where)),
-            obstacle=torch.from_numpy(trajectory.position[0, static]),
+            obstacle=torch.from_numpy(obstacles[0]),
             gravity=(torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float(),
-            fields=dict(self._fields(trajectory.fields, moving, where)),
+            fields=dict(self._fields(trajectory.fields, moving, presence, where)),
+            present=None if presence is None else torch.from_numpy(presence.present),
+            obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
         )
+
+    def _obstacles(self, position: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
+        """(T, M, D) positions of the obstacles that are ever there; of one frame, T = 1, where none of the scene moves.
+
+        Where one is absent, it is where it was last.
+        """
+        if not self.scene.moving_obstacles and not np.isnan(position[0, obstacle]).any():
+            return np.asarray(position[:1, obstacle])
+        frames = position[:, obstacle]
+        presence = Presence.of(frames)
+        return frames if presence is None else presence.fill(frames[:, presence.ever])
+
+    def _check_rest(self, trajectory: Trajectory, where: str) -> None:
+        types, metadata = trajectory.particle_type, self.metadata
+        resting = metadata.static_types if self.scene.moving_obstacles else metadata.obstacle_types
+        mover = first_moving_particle(trajectory.position, np.isin(types, list(resting)), self.scene.domain)
+        if mover is not None:
+            number = int(types[mover])
+            raise DataError(
+                f"{where}: particle {mover} is of the static type {number} ({metadata.particle_types[number]}) but"
+                f" moves. If it moves as recorded, like a paddle or a lid, add --prescribed {number} (fit:"
+                f" --data.prescribed=[{number}]); to predict it like a material, remove its type from static_types in"
+                " the metadata."
+            )
 
     def check(self, trajectory: Trajectory, where: str, first_frame: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Checks types and positions of a trajectory's frames, counted from `first_frame`; raises as `recording`.
 
         Returns:
-            (N,) whether each particle moves, and whether it is static.
+            (N,) whether each particle moves and is predicted, and whether it is an obstacle.
         """
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
         moving = self.metadata.is_moving(types)
-        static = self.metadata.is_static(types)
-        if outside := first_outside(trajectory.position, self.scene.domain, self.scene.periodic, moving | static):
+        obstacle = np.isin(types, list(self.metadata.obstacle_types))
+        passable = [kind != "wall" for kind in self.scene.boundary]
+        if outside := first_outside(trajectory.position, self.scene.domain, passable, moving | obstacle):
             frame, particle, number = outside
             raise DataError(
                 f"{where}: particle {particle} in frame {first_frame + frame} is at"
@@ -86,22 +123,28 @@ class RecordingReader:
         if not moving.any():
             raise DataError(f"{where}: no particle has a moving type; check static_types in the metadata.")
         self._materials(types[moving], where)
-        return moving, static
+        return moving, obstacle
 
-    def _fields(self, fields: Mapping[str, np.ndarray], moving: np.ndarray, where: str) -> Iterator[tuple[str, Tensor]]:
+    def _fields(
+        self, fields: Mapping[str, np.ndarray], moving: np.ndarray, presence: Presence | None, where: str
+    ) -> Iterator[tuple[str, Tensor]]:
         """The fields of the moving particles by name."""
         missing = [name for name in self.metadata.fields if name not in fields]
         if missing:
             raise DataError(f"{where}: it has no field {', '.join(missing)}, which the metadata or data.fields name.")
-        for name, values in fields.items():
-            wrong = ~np.isfinite(values) & (moving if values.shape[1] > 1 else True)
+        for name, stored in fields.items():
+            values = stored if stored.shape[1] == 1 else stored[:, moving]
+            if presence is not None and values.shape == presence.present.shape:
+                values = presence.fill(values)
+            wrong = ~np.isfinite(values)
             if wrong.any():
-                frame, particle = map(int, np.argwhere(wrong)[0])
+                frame, index = map(int, np.argwhere(wrong)[0])
+                particle = int(np.flatnonzero(moving)[index])
                 raise DataError(
-                    f"{where}: {name} of particle {particle} in frame {frame} is {values[frame, particle]}; fields of"
+                    f"{where}: {name} of particle {particle} in frame {frame} is {values[frame, index]}; fields of"
                     " moving particles must be finite. Remove the trajectory, or leave the field out of data.fields."
                 )
-            yield name, torch.from_numpy(np.ascontiguousarray(values if values.shape[1] == 1 else values[:, moving]))
+            yield name, torch.from_numpy(np.ascontiguousarray(values))
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)
@@ -117,31 +160,44 @@ class RecordingReader:
 
 
 class SplitRecordings(Sequence[Recording]):
-    """The trajectories of a split as recordings, read and validated on access.
+    """Trajectories of a split as recordings, read and validated on access.
+
+    Args:
+        split: The split.
+        metadata: Of its dataset.
+        scene: The scene that the trajectories share.
+        indices: Those of the trajectories in the split; all of them when None.
 
     Raises:
         DataError: if file and scene differ in the number of axes.
     """
 
-    def __init__(self, split: Split, metadata: Metadata, scene: Scene) -> None:
+    def __init__(self, split: Split, metadata: Metadata, scene: Scene, indices: Sequence[int] | None = None) -> None:
         if split.dim != scene.dim:
             raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
         self.split, self.scene = split, scene
+        self.indices = range(len(split)) if indices is None else indices
         self.reader = RecordingReader(metadata, scene)
 
     def __len__(self) -> int:
-        return len(self.split)
+        return len(self.indices)
 
-    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]  # (no slices)
+    def __getitem__(self, number: int) -> Recording:  # type: ignore[override]  # (no slices)
+        index = self.indices[number]
         names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
         fields = read_fields(self.split, index, names) if names else {}
         return self.reader.recording(replace(self.split.read(index), fields=fields), self.split.where(index))
 
     @property
+    def frames(self) -> tuple[int, ...]:
+        """Number of frames of each trajectory."""
+        return tuple(map(self.split.frames, self.indices))
+
+    @property
     def max_bytes(self) -> int:
         """Size of the positions and fields of the largest trajectory."""
         split, numbers = self.split, self.split.dim + len(self.reader.metadata.fields)
-        return max(4 * split.frames(index) * split.particles(index) * numbers for index in range(len(self)))
+        return max(4 * split.frames(index) * split.particles(index) * numbers for index in self.indices)
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
         """Reads several trajectories, until the task is cancelled."""
@@ -154,18 +210,35 @@ class SplitRecordings(Sequence[Recording]):
     def check_ends(self) -> None:
         """Checks the first and the last frame of each trajectory, and that it has the fields, as reading all would."""
         require_fields(self.split, self.reader.metadata.fields)
-        for index in range(len(self)):
+        for index in self.indices:
             for frame in sorted({0, self.split.frames(index) - 1}):
                 self.reader.check(self.split.read(index, frame, frame + 1), self.split.where(index), frame)
 
-    def require_frames(self, frames: int, purpose: str) -> None:
-        """Raises a DataError that names the first trajectory with fewer frames."""
-        for index in range(len(self)):
-            if self.split.frames(index) < frames:
-                raise DataError(
-                    f"{self.split.where(index)}: it has {self.split.frames(index)} frames, {purpose} needs {frames}."
-                    " Shorten the horizon (frames per bundle x bundles unrolled) or remove the trajectory."
-                )
+    def with_frames(self, least: int, purpose: str) -> SplitRecordings:
+        """Those of the trajectories that have enough frames; a warning counts the others.
+
+        Args:
+            least: Frames that a trajectory needs.
+            purpose: What needs them, in words.
+
+        Raises:
+            DataError: if no trajectory has as many.
+        """
+        frames = self.frames
+        if min(frames) >= least:
+            return self
+        if max(frames) < least:
+            raise DataError(
+                f"{self.split.path}: its longest trajectory has {max(frames)} frames, {purpose} needs {least}. Shorten"
+                " the horizon (frames per bundle x bundles unrolled), or record more frames."
+            )
+        enough = [index for index, count in zip(self.indices, frames, strict=True) if count >= least]
+        warnings.warn(
+            f"{self.split.path}: {len(frames) - len(enough)} of {len(frames)} trajectories have fewer than {least}"
+            f" frames, {purpose}'s, and are left out.",
+            stacklevel=2,
+        )
+        return SplitRecordings(self.split, self.reader.metadata, self.scene, enough)
 
     def close(self) -> None:
         """Does nothing: a split keeps no file open and no thread running."""

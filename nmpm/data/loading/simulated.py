@@ -87,8 +87,15 @@ class SimulatedSource(EmbeddedSource):
         return SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
 
     def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
-        frames = (self.training_recordings.preset.frames + 1,) * plan["buffer_size"]
-        return self.training_recordings, EndlessWindowPlan(frames=frames, length=length, **plan)
+        frames = self.training_recordings.preset.frames + 1
+        if frames < length:
+            raise ConfigError(
+                f"{self.name}: its trajectories have {frames} frames, a training window of {length - 2} frames to"
+                f" predict needs {length}. Shorten the horizon (frames per bundle x bundles unrolled) or simulate more"
+                " frames."
+            )
+        plan["frames"] = (frames,) * plan["buffer_size"]
+        return self.training_recordings, EndlessWindowPlan(length=length, **plan)
 
 
 class SimulatedRecordings:
@@ -123,14 +130,6 @@ class SimulatedRecordings:
                 self._requests.popitem(last=False)
             request = self._requests[key]
         return request.result()
-
-    def require_frames(self, frames: int, purpose: str) -> None:
-        """Raises a ConfigError if the trajectories have fewer frames."""
-        if self.preset.frames + 1 < frames:
-            raise ConfigError(
-                f"{self.preset.name}: its trajectories have {self.preset.frames + 1} frames, {purpose} needs {frames}."
-                " Shorten the horizon (frames per bundle x bundles unrolled) or simulate more frames."
-            )
 
     def close(self) -> None:
         """Stops the simulations that are running and forgets the cached ones."""

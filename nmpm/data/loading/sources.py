@@ -55,12 +55,14 @@ class DataSource(abc.ABC):
         """The trajectories to train on, and which of their windows make up which batch.
 
         Args:
-            length: Frames of a window.
+            length: Frames of a window; shorter trajectories are left out, with a warning that counts them.
             plan: The other fields of `WindowPlan`, except `frames`.
+
+        Raises:
+            DataError: if all trajectories are shorter.
         """
-        recordings = self.recordings("train")
-        frames = tuple(map(recordings.split.frames, range(len(recordings))))
-        return recordings, WindowPlan(frames=frames, length=length, **plan)
+        recordings = self.recordings("train").with_frames(length, "a training window")
+        return recordings, WindowPlan(frames=recordings.frames, length=length, **plan)
 
 
 @dataclass(frozen=True)

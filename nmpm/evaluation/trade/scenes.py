@@ -138,10 +138,9 @@ def read_scenes(name: str, folder: Path, count: int) -> Scenes:
     preset = None if plain is None else preset_from_dict(plain)
     scene = infer_scene(folder) if preset is None else preset.scene
     split = Split(find_split(folder, "test"))
-    recordings = SplitRecordings(split, metadata, scene)
-    recordings.require_frames(3, "an evaluation")
-    indices = range(min(count, len(recordings)))
-    scenes = Scenes(name, scene, tuple(recordings[index] for index in indices), preset)
+    recordings = SplitRecordings(split, metadata, scene).with_frames(3, "an evaluation")
+    indices = recordings.indices[:count]
+    scenes = Scenes(name, scene, tuple(map(recordings.__getitem__, range(len(indices)))), preset)
     if preset is None:
         return scenes
     seeds: list[Any] = [split.attributes(index).get("seed") for index in indices]

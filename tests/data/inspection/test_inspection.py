@@ -118,7 +118,7 @@ def test_damaged_trajectories_are_left_out(tmp_path):
     assert found.grids[0].per_cell > 0  # the others were looked at
     with h5py.File(tmp_path / "train.h5", "a") as file:
         for name in file:
-            file[name]["position"][0] = np.nan
+            file[name]["position"][0] = np.inf
     with pytest.raises(DataError, match="none of its trajectories could be read"):
         inspect(FolderSource(tmp_path))
 
@@ -173,7 +173,7 @@ def test_missing_metadata_and_a_damaged_split_become_findings(folder):
 def test_foreign_data_that_convert_refuses_are_inspected(tmp_path, capsys):
     position, types = made()
     right, unknown = records.trajectory_record(position, types), records.trajectory_record(position, types * 0 + 9)
-    damaged = records.trajectory_record(position * np.nan, types)
+    damaged = records.trajectory_record(position * np.inf, types)
     records.write_records(tmp_path / "ramps" / "train.tfrecord", right, unknown, damaged)
     (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
     assert main(["convert", str(tmp_path / "ramps"), str(tmp_path / "out")]) == 1

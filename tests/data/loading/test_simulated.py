@@ -71,7 +71,7 @@ def test_closing_stops_simulations_and_a_later_request_starts_anew(monkeypatch):
 
 def test_a_horizon_longer_than_the_trajectories_is_refused():
     with pytest.raises(ConfigError, match=r"goop: its trajectories have 9 frames, .* needs 10"):
-        TrajectoryBuffer(live(), dataclasses.replace(PLAN, length=10))
+        TrajectoryDataModule(name="goop", source="simulate", horizon=8, generate={"frames": 8}).train_dataloader()
 
 
 @pytest.mark.usefixtures("home")

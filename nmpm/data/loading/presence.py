@@ -1,0 +1,77 @@
+"""Which particles of a trajectory are there in which frames, and finite values for those that are not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nmpm.errors import DataError
+from nmpm.scene import Scene
+
+
+@dataclass(frozen=True)
+class Presence:
+    """The presence of a trajectory's particles, of N of which N' are there in some frame.
+
+    Args:
+        ever: (N,) whether each particle is there in any frame.
+        present: (T, N') whether each of those is there in each frame.
+    """
+
+    ever: np.ndarray
+    present: np.ndarray
+
+    @classmethod
+    def of(cls, position: np.ndarray) -> Presence | None:
+        """The presence of particles from their (T, N, D) positions; None where all always are."""
+        absent = np.isnan(position[..., 0])
+        if not absent.any():
+            return None
+        ever = ~absent.all(axis=0)
+        return cls(ever, ~absent[:, ever])
+
+    def check(self, where: str) -> None:
+        """Raises a DataError if no particle is there in two successive frames, so that none has a velocity."""
+        if len(self.present) > 1 and not (self.present[1:] & self.present[:-1]).any():
+            raise DataError(f"{where}: no particle is there in two successive frames. Remove the trajectory.")
+
+    def fill(self, values: np.ndarray) -> np.ndarray:
+        """(T, N', …) values, those of absent particles replaced by those they had last, or else will have first."""
+        frames = np.where(self.present, np.arange(len(values))[:, None], -1)
+        last = np.maximum.accumulate(frames, axis=0)
+        source = np.where(last < 0, self.present.argmax(axis=0), last)
+        return np.asarray(values[source, np.arange(values.shape[1])])
+
+
+def spans(present: np.ndarray) -> np.ndarray:
+    """(N, 2) first and last frame in which each particle is there, of (T, N) presence."""
+    return np.stack([present.argmax(axis=0), len(present) - 1 - present[::-1].argmax(axis=0)], axis=1)
+
+
+def first_frames(present: np.ndarray, length: int) -> np.ndarray:
+    """The first frame, for each of the windows of `length` frames, of the next window that has a velocity at its start.
+
+    That is, of the next in whose first two frames some particle is there, or else of the last such window.
+
+    Args:
+        present: (T, N) whether each particle is there in each frame.
+        length: Frames of a window.
+    """
+    windows = len(present) - length + 1
+    inhabited = np.flatnonzero((present[1:] & present[:-1]).any(axis=1)[:windows])
+    if not len(inhabited):
+        return np.full(windows, windows - 1)
+    following = np.searchsorted(inhabited, np.arange(windows))
+    return np.asarray(inhabited[np.minimum(following, len(inhabited) - 1)])
+
+
+def without_those_gone(position: np.ndarray, scene: Scene) -> np.ndarray:
+    """(T, N, D) positions, NaN from the frame on in which a particle is beyond the bounds of an open axis."""
+    open_axes = [kind == "open" for kind in scene.boundary]
+    if not any(open_axes):
+        return position
+    lower, upper = np.asarray(scene.bounds, dtype=np.float32).T
+    outside = (((position < lower) | (position > upper)) & open_axes).any(axis=-1)
+    gone = np.logical_or.accumulate(outside, axis=0)
+    return np.where(gone[..., None], np.float32(np.nan), position)

@@ -1,0 +1,174 @@
+"""Particles that come and go: their recordings, and windows of them."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.loading.buffer import TrajectoryBuffer
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.presence import Presence, first_frames, spans
+from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.loading.window_plan import WindowPlan
+from nmpm.data.scene_inference import infer_scene
+from nmpm.errors import DataError
+from tests.made_up import made_up_metadata, made_up_trajectory
+
+FRAMES = (16, 20, 13, 18)
+MISSING = 6  # a frame without any particle
+
+
+def comes_and_goes(trajectory: Trajectory, seed: int) -> Trajectory:
+    """The same with tracks that begin and end, holes, a missing frame, and particle 2 never there."""
+    rng, position = np.random.default_rng(seed), trajectory.position.copy()
+    frames, particles, _ = position.shape
+    births, lives = rng.integers(-6, frames - 2, particles), rng.integers(2, 9, particles)
+    births[0], lives[0] = 0, frames
+    time = np.arange(frames)[:, None]
+    there = (time >= births) & (time < births + lives) & (rng.random((frames, particles)) > 0.1)
+    there[:, 0], there[:, 2], there[MISSING] = True, False, False
+    position[~there] = np.nan
+    return Trajectory(position, trajectory.particle_type)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A dataset of such trajectories; the last one is complete."""
+    whole = [made_up_trajectory(frames, 12 + seed, seed) for seed, frames in enumerate(FRAMES)]
+    write_split(tmp_path / "train.h5", [*(comes_and_goes(run, seed) for seed, run in enumerate(whole[:3])), whole[3]])
+    write_metadata(tmp_path, made_up_metadata())
+    return tmp_path
+
+
+def recordings_of(folder) -> SplitRecordings:
+    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
+
+
+def buffer_of(folder, **options) -> TrajectoryBuffer:
+    known = {"length": 5, "batch_size": 4, "buffer_size": 2, "passes": 1.0, "seed": 0}
+    return TrajectoryBuffer(recordings_of(folder), WindowPlan(frames=FRAMES, **(known | options)))
+
+
+@given(seed=st.integers(0, 10**6), frames=st.integers(2, 30), particles=st.integers(1, 8), share=st.floats(0, 1))
+@settings(max_examples=30, deadline=None)
+def test_absent_particles_are_where_they_were_last_or_will_be_first(seed, frames, particles, share):
+    rng = np.random.default_rng(seed)
+    position = rng.random((frames, particles, 2)).astype(np.float32)
+    there = rng.random((frames, particles)) < share
+    position[~there] = np.nan
+    presence = Presence.of(position)
+    if presence is None:
+        assert there.all()
+        return
+    filled = presence.fill(position[:, presence.ever])
+    for column, particle in enumerate(np.flatnonzero(there.any(axis=0))):
+        known = np.flatnonzero(there[:, particle])
+        for frame in range(frames):
+            before = known[known <= frame]
+            source = before[-1] if len(before) else known[0]
+            np.testing.assert_array_equal(filled[frame, column], position[source, particle])
+        assert spans(presence.present)[column].tolist() == [known[0], known[-1]]
+
+
+@given(seed=st.integers(0, 10**6), frames=st.integers(3, 20), length=st.integers(3, 8))
+@settings(max_examples=30, deadline=None)
+def test_windows_start_where_particles_are(seed, frames, length):
+    length = min(length, frames)
+    present = np.random.default_rng(seed).random((frames, 2)) < 0.4
+    inhabited = [frame for frame in range(frames - length + 1) if (present[frame] & present[frame + 1]).any()]
+    for window, first in enumerate(first_frames(present, length)):
+        later = [frame for frame in inhabited if frame >= window]
+        assert first == (later[0] if later else inhabited[-1] if inhabited else frames - length)
+
+
+@pytest.mark.parametrize("options", [{}, {"emphasis": 0.5, "openings": 0.3}, {"bucket": 3}], ids=str)
+def test_windows_hold_the_particles_that_are_there_at_some_time(folder, options):
+    buffer, split = buffer_of(folder, **options), Split(folder / "train.h5")
+    runs = [split.read(index).position for index in range(len(split))]
+    for window in islice(buffer.batches(), 16):
+        assert window.frames.isfinite().all()
+        present = torch.ones_like(window.frames[..., 0], dtype=torch.bool) & window.mask[:, None]
+        present = present if window.present is None else window.present
+        assert not (present & ~window.mask[:, None]).any()
+        assert (present[:, 0] & present[:, 1]).any(dim=-1).all()
+        for row in range(len(window.mask)):
+            sequence = window.frames[row].masked_fill(~present[row, ..., None], torch.nan)[:, window.mask[row]].numpy()
+            assert any(
+                np.array_equal(np.nan_to_num(sequence), np.nan_to_num(run[first : first + 5, there]))
+                for run in runs
+                for first in range(len(run) - 4)
+                if (there := overlapping(run, first)).sum() == sequence.shape[1]
+            )
+
+
+def overlapping(run: np.ndarray, first: int) -> np.ndarray:
+    """(N,) whether the time between a particle's first and last frame overlaps a window of five frames."""
+    there = ~np.isnan(run[..., 0])
+    return there[: first + 5].any(axis=0) & there[first:].any(axis=0)
+
+
+@pytest.mark.parametrize("options", [{}, {"emphasis": 0.5, "openings": 0.3, "bucket": 2}], ids=str)
+def test_resumes_at_any_batch_with_all_ranks_alike(folder, options):
+    straight = list(islice(buffer_of(folder, **options).batches(), 20))
+    resumed = islice(buffer_of(folder, **options).batches(9), 11)
+    ranks = [buffer_of(folder, **options | {"batch_size": 2}).batches(9, rank, 2) for rank in range(2)]
+    for expected, window, *parts in zip(straight[9:], resumed, *ranks, strict=False):
+        joined = torch.cat([part.frames for part in parts])
+        assert torch.equal(window.frames, expected.frames)
+        assert torch.equal(joined, expected.frames)
+        assert (window.present is None) == (expected.present is None)
+        if window.present is not None:
+            assert torch.equal(window.present, expected.present)
+            assert torch.equal(torch.cat([part.present for part in parts]), expected.present)
+
+
+def test_a_complete_trajectory_is_the_same_beside_others(folder):
+    recordings = recordings_of(folder)
+    alone = collate([recordings[3]], recordings.scene, 9)
+    beside = collate([recordings[0], recordings[3]], recordings.scene, 9)
+    count = alone.mask.shape[1]
+    assert alone.present is None
+    assert torch.equal(beside.frames[1, :, :count], alone.frames[0])
+    assert beside.present[1, :, :count].all()
+    ever = int((~np.isnan(recordings.split.read(0).position[..., 0])).any(axis=0).sum())
+    assert ever < 12
+    assert not beside.present[0, :, ever:].any()
+    assert beside.mask.sum(dim=1).tolist() == [ever, 15]
+
+
+def test_recordings_without_a_velocity_or_an_end_are_named(folder):
+    position = np.full((8, 3, 2), 0.5, np.float32)
+    write_split(folder / "train.h5", [made_up_trajectory(8, 3), Trajectory(position, np.array([7, 7, 3]))])
+    recordings = recordings_of(folder)
+    position[1::2] = np.nan
+    position[:, 2] = 0.5
+    write_split(folder / "train.h5", [made_up_trajectory(8, 3), Trajectory(position, np.array([7, 7, 3]))])
+    with pytest.raises(DataError, match="trajectory 00001: all positions are NaN from frame 7 on"):
+        recordings[1]
+    position[7, :2] = 0.5
+    write_split(
+        folder / "train.h5",
+        [made_up_trajectory(8, 3), Trajectory(position[[0, 1, 2, 3, 4, 5, 7]], np.array([7, 7, 3]))],
+    )
+    with pytest.raises(DataError, match="trajectory 00001: no particle is there in two successive frames"):
+        recordings[1]
+
+
+def test_fields_of_absent_particles_may_be_unknown(folder):
+    run = made_up_trajectory(8, 3, fields=("heat",))
+    position, heat = run.position.copy(), run.fields["heat"].copy()
+    position[2:4, 1] = heat[2:4, 1] = np.nan
+    write_split(folder / "train.h5", [Trajectory(position, run.particle_type, fields={"heat": heat})])
+    write_metadata(folder, made_up_metadata(fields=("heat",)))
+    recording = recordings_of(folder)[0]
+    expected = heat.astype(np.float32)
+    expected[2:4, 1] = expected[1, 1]
+    np.testing.assert_array_equal(recording.fields["heat"], expected)
+    heat[5, 1] = np.nan
+    write_split(folder / "train.h5", [Trajectory(position, run.particle_type, fields={"heat": heat})])
+    with pytest.raises(DataError, match="heat of particle 1 in frame 5 is nan"):
+        recordings_of(folder)[0]
