@@ -24,6 +24,7 @@ from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.rollout_pickle import RolloutPickle
+from nmpm.data.convert.vtk import Vtk
 from nmpm.data.format import METADATA_FILE
 from nmpm.data.gravity import check_gravity
 from nmpm.errors import ConfigError, DataError
@@ -38,6 +39,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     Dmcf(),
     RolloutPickle(),
     ArrayFiles(),
+    Vtk(),
 )
 
 

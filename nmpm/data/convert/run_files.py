@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,9 @@ class Run:
     frames: int
     split: str | None = None
     part: range | None = None
+
+
+SomeRun = TypeVar("SomeRun", bound=Run)
 
 
 class RunFiles(DatasetFormat):
@@ -95,7 +98,7 @@ class RunFiles(DatasetFormat):
                 yield trajectory if run.part is None else cut(trajectory, run.part)
 
 
-def divide(runs: Sequence[Run]) -> tuple[dict[str, Sequence[Run]], tuple[str, ...]]:
+def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple[str, ...]]:
     """Runs that no folder divides, by split; and notes on how they were divided."""
     named = {split: [run for run in runs if run.split == split] for split in SPLITS}
     if any(named.values()):

@@ -1,0 +1,118 @@
+"""A frame as its file has it, and its arrays sorted by their usual names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from nmpm.data.convert.named_arrays import USUAL_NAMES, plain_name
+from nmpm.scene import Boundary, Interval
+
+AXES = "xyz"
+"""Names of the axes."""
+
+_COMPONENTS = ("vx vy vz", "velocityx velocityy velocityz", "velx vely velz", "velocity0 velocity1 velocity2", "u v w")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame as its file has it.
+
+    Args:
+        position: (N, D), NaN in all coordinates of particles that are not there.
+        arrays: (N,) or (N, k) by the names in the file: ids, types, velocities and any others.
+        time: In the file's unit; None where the file does not state it.
+        step: Number of the simulator's step; None where the file does not state it.
+        box: (lower, upper) per axis, of the simulator; None where the file does not state it.
+        boundary: Of the box, per axis.
+    """
+
+    position: np.ndarray
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    time: float | None = None
+    step: int | None = None
+    box: tuple[Interval, ...] | None = None
+    boundary: tuple[Boundary, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ParticleArrays:
+    """The arrays of a frame by what they are."""
+
+    id: np.ndarray | None  # (N,) int64
+    type: np.ndarray | None  # (N,) int64
+    type_names: np.ndarray | None  # (N,) str
+    present: np.ndarray | None  # (N,) bool
+    velocity: np.ndarray | None  # (N, D) of the axes that are kept
+    scalars: Mapping[str, np.ndarray]  # (N,) each
+
+    @classmethod
+    def of(cls, frame: Frame, axes: Sequence[int]) -> ParticleArrays:
+        """Sorts arrays by their usual names; what has another name, or does not fit its name, is a field.
+
+        `axes` are those of the positions that are kept; a velocity has them, too.
+        """
+        left = {name: values for name, values in frame.arrays.items() if not _is_position(name, values)}
+        identity, present = _take(left, "id", _integers), _take(left, "active", _integers)
+        types, type_names = _take(left, "types", _integers), _take(left, "types", _strings)
+        velocity = _take(left, "velocity", partial(_vectors, axes=axes))
+        velocity = _take_components(left, axes) if velocity is None else velocity
+        scalars = {name: scalar for key, values in left.items() for name, scalar in _scalars(key, values)}
+        return cls(identity, types, type_names, None if present is None else present != 0, velocity, scalars)
+
+
+def _is_position(name: str, values: np.ndarray) -> bool:
+    return plain_name(name) in (AXES if values.ndim == 1 else USUAL_NAMES["position"])
+
+
+def _take(
+    arrays: dict[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
+) -> np.ndarray | None:
+    """Removes the first array whose name has a meaning and that fits, and returns it; None if there is none."""
+    by_name = {plain_name(name): name for name in reversed(arrays)}
+    for name in USUAL_NAMES[meaning]:
+        if name in by_name and (values := convert(arrays[by_name[name]])) is not None:
+            del arrays[by_name[name]]
+            return values
+    return None
+
+
+def _integers(values: np.ndarray) -> np.ndarray | None:
+    if values.ndim != 1 or values.dtype.kind not in "biuf":
+        return None
+    if values.dtype.kind == "f" and not (np.isfinite(values).all() and (values == np.rint(values)).all()):
+        return None
+    return values.astype(np.int64)
+
+
+def _strings(values: np.ndarray) -> np.ndarray | None:
+    return values.astype(str) if values.ndim == 1 and values.dtype.kind in "SU" else None
+
+
+def _vectors(values: np.ndarray, axes: Sequence[int]) -> np.ndarray | None:
+    fits = values.ndim == 2 and max(axes) < values.shape[1] <= len(AXES) and values.dtype.kind in "iuf"
+    return values[:, axes] if fits else None
+
+
+def _take_components(arrays: dict[str, np.ndarray], axes: Sequence[int]) -> np.ndarray | None:
+    """Removes a velocity that is stored as an array per axis, and returns it (N, D)."""
+    scalars = {plain_name(name): name for name, values in arrays.items() if values.ndim == 1}
+    for components in map(str.split, _COMPONENTS):
+        if all(components[axis] in scalars for axis in axes):
+            columns = {axis: arrays.pop(scalars[name]) for axis, name in enumerate(components) if name in scalars}
+            return np.stack([columns[axis] for axis in axes], axis=1)
+    return None
+
+
+def _scalars(name: str, values: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
+    """Names and (N,) values of an array's components; nothing for strings."""
+    if values.dtype.kind not in "biuf":
+        return []
+    name = name.replace("/", "_")
+    if values.ndim == 1 or values.shape[1] == 1:
+        return [(name, values.reshape(-1))]
+    ends = AXES if values.shape[1] <= len(AXES) else range(values.shape[1])
+    return [(f"{name}_{end}", column) for end, column in zip(ends, values.T, strict=False)]

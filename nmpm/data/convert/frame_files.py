@@ -1,0 +1,295 @@
+"""Formats with a file per frame, in a folder per run, or with a file of many frames per run.
+
+A reader is one subclass of `FrameFormat` with a function that yields the frames of a file. Files lie as
+
+    data/train/run00/frame_000.vtk     splits of runs
+    data/run00/frame_000.vtk           runs
+    data/frame_000.vtk                 one run
+    data/train/run00.lammpstrj         splits of files with many frames
+
+Frames are in the order of the last numbers in their files' names, runs in the order of all numbers in theirs.
+"""
+
+from __future__ import annotations
+
+import abc
+import fnmatch
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from nmpm._support.messages import counted
+from nmpm._support.progress import progress_bar
+from nmpm.data.convert.base import (
+    UNKNOWN_LENGTH,
+    DatasetFormat,
+    ForeignDataset,
+    Options,
+    find_split_name,
+    number_order,
+)
+from nmpm.data.convert.frame import AXES, Frame, ParticleArrays
+from nmpm.data.convert.frame_stack import FrameStack
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, divide
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.errors import DataError
+
+_DEPTH = 4  # of folders
+_FIRST_FRAMES = 10  # of a file with many, from which the layout is taken
+_MISSING = 0.1  # part of a run's frames that may be missing
+_NUMBER = re.compile(r"\d{1,18}(?!.*\d)")
+
+
+@dataclass(frozen=True)
+class FrameRun(Run):
+    """A run in a file with many frames, or in a file per frame (None where one is missing)."""
+
+    files: tuple[Path | None, ...] = ()
+
+    @property
+    def present(self) -> tuple[Path, ...]:
+        """The files that are there."""
+        return tuple(file for file in self.files if file is not None)
+
+    @property
+    def frame_files(self) -> tuple[Path | None, ...]:
+        """The files of the frames to take."""
+        return self.files if self.part is None else self.files[self.part.start : self.part.stop]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the first frames tell about all: the axes that are kept, and the type ids of names of types."""
+
+    axes: tuple[int, ...]
+    constant: dict[int, float]
+    type_ids: dict[str, int]
+    first: tuple[Frame, ...]
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], names: frozenset[str]) -> Layout:
+        """The layout of frames; an axis in which nothing has an extent is left out."""
+        dim = frames[0].position.shape[1]
+        position = np.concatenate([frame.position for frame in frames if frame.position.shape[1] == dim])
+        position = position[~np.isnan(position).any(axis=1)]
+        flat = [axis for axis in range(dim) if dim == 3 and len(position) > 1 and np.ptp(position[:, axis]) == 0]
+        constant = {axis: float(position[0, axis]) for axis in flat} if len(flat) == 1 else {}
+        axes = tuple(axis for axis in range(dim) if axis not in constant)
+        return cls(axes, constant, {name: index for index, name in enumerate(sorted(names))}, tuple(frames))
+
+    def notes(self) -> tuple[str, ...]:
+        """For the user."""
+        return tuple(
+            f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {' and '.join(AXES[i] for i in self.axes)}."
+            for axis, value in self.constant.items()
+        )
+
+
+class FrameFormat(DatasetFormat):
+    """Abstract reader of a format whose files contain one frame, or many, one subclass per format.
+
+    Attributes:
+        patterns: Of the files' names.
+        listing: Of the names of files that list the frames of a run; where there is one, others are only read by it.
+    """
+
+    patterns: ClassVar[tuple[str, ...]]
+    listing: ClassVar[str] = ""
+
+    @abc.abstractmethod
+    def frames(self, file: Path) -> Iterator[Frame]:
+        """Yields the frames of a file in order; raises a DataError that names it if it is damaged."""
+
+    def count(self, file: Path) -> int:
+        """Number of frames of a file with many."""
+        return sum(1 for _ in self.frames(file))
+
+    def notes(self, frames: Sequence[Frame], options: Options) -> tuple[str, ...]:  # noqa: ARG002 (for subclasses)
+        """For the user, on the first frames of a run."""
+        return ()
+
+    def recognises(self, path: Path) -> bool:
+        return next(self._folders(path), None) is not None
+
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        runs, gaps = self._runs(path)
+        splits, divided = divide(runs)
+        first = self._first_frames(next(iter(splits.values()))[0])
+        layout = Layout.of(first, self._type_names(first, runs))
+        metadata = _metadata(layout)
+        unknown = EVERYTHING_UNKNOWN - {name for name in ("bounds", "boundary") if first[0].box is not None}
+        return ForeignDataset(
+            options.apply_to(metadata),
+            {split: partial(self._read_all, each, layout) for split, each in splits.items()},
+            (*layout.notes(), *gaps, *divided, *self.notes(first, options)),
+            {split: len(each) for split, each in splits.items()},
+            unknown=unknown - ({"particle_types"} if layout.type_ids else set()),
+        )
+
+    def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
+        """Yields folders with files of this format and these files; of a file its own."""
+        if path.is_file():
+            if self._matching([path.name]):
+                yield path.parent, [path]
+            return
+        for folder, inner, names in os.walk(path):
+            lists = fnmatch.filter(names, self.listing)
+            inner.sort(key=lambda name: number_order(Path(name)))
+            inner[:] = [name for name in inner if not name.startswith(".") and not lists]
+            if len(Path(folder).relative_to(path).parts) >= _DEPTH:
+                inner.clear()
+            if files := [Path(folder, name) for name in lists or self._matching(names)]:
+                yield Path(folder), sorted(files, key=number_order)
+
+    def _matching(self, names: Sequence[str]) -> list[str]:
+        return [name for name in names if any(fnmatch.fnmatch(name.lower(), pattern) for pattern in self.patterns)]
+
+    def _runs(self, path: Path) -> tuple[list[FrameRun], list[str]]:
+        """The runs in order, and notes on missing frames."""
+        folders = list(self._folders(path))
+        if not folders:
+            raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
+        many = len(list(islice(self.frames(folders[0][1][0]), 2))) > 1
+        runs: list[FrameRun] = []
+        gaps: list[str] = []
+        for folder, files in folders:
+            if many:
+                runs += [FrameRun(file, 0, 0, _split_of(file, path), None, (file,)) for file in files]
+            else:
+                series = _series(folder, files, gaps)
+                runs.append(FrameRun(folder, 0, len(series), _split_of(folder, path), None, series))
+        if path.is_file() and not many:
+            raise DataError(f"{path}: there is one frame in it. Give the folder of the frames.")
+        if many and len(runs) < 3:
+            runs = [replace(run, frames=self.count(run.file)) for run in runs]
+        rest = f" The same in {counted(len(gaps) - 1, 'more run')}." if gaps[1:] else ""
+        return runs, [f"{gap}{rest}" for gap in gaps[:1]]
+
+    def _first_frames(self, run: FrameRun) -> list[Frame]:
+        """A few frames of a run with particles: the first of a file with many, else those of a few files."""
+        files = run.present
+        if len(files) == 1:
+            frames = list(islice(self.frames(files[0]), _FIRST_FRAMES))
+        else:
+            frames = [self._only_frame(file, run) for file in (files[0], files[len(files) // 2], files[-1])]
+        inhabited = [frame for frame in frames if len(frame.position)]
+        if not inhabited:
+            raise DataError(f"{run.file}: there are no particles in its first frames.")
+        return inhabited
+
+    def _type_names(self, first: Sequence[Frame], runs: Sequence[FrameRun]) -> frozenset[str]:
+        """Names of types in the first frame of all runs; none where types are numbers."""
+
+        def names(frame: Frame) -> set[str]:
+            arrays = ParticleArrays.of(frame, range(frame.position.shape[1]))
+            return set() if arrays.type_names is None else set(np.unique(arrays.type_names).tolist())
+
+        if not names(first[0]):
+            return frozenset()
+        others = (frame for run in runs for frame in islice(self.frames(run.present[0]), 1))
+        return frozenset().union(*map(names, first), *map(names, others))
+
+    def _read_all(self, runs: Sequence[FrameRun], layout: Layout) -> Iterator[Trajectory]:
+        for run in runs:
+            yield self._read(run, layout)
+
+    def _read(self, run: FrameRun, layout: Layout) -> Trajectory:
+        many = len(run.files) == 1
+        total = (run.frames if run.part is None else len(run.part)) or None
+        stack = FrameStack(layout.axes, layout.constant, layout.type_ids, total)
+        with progress_bar(f"Reading {run.file.name}", total) as advance:
+            for frame, where in self._frames_of_many(run) if many else self._frames_of_files(run):
+                if frame is None:
+                    stack.add_absent()
+                else:
+                    stack.add(frame, where)
+                advance()
+        return stack.trajectory(str(run.file))
+
+    def _frames_of_many(self, run: FrameRun) -> Iterator[tuple[Frame, str]]:
+        part = (0, None) if run.part is None else (run.part.start, run.part.stop)
+        for number, frame in islice(enumerate(self.frames(run.file)), *part):
+            yield frame, f"{run.file}, frame {number}"
+
+    def _frames_of_files(self, run: FrameRun) -> Iterator[tuple[Frame | None, str]]:
+        for file in run.frame_files:
+            yield (None, "") if file is None else (self._only_frame(file, run), str(file))
+
+    def _only_frame(self, file: Path, run: FrameRun) -> Frame:
+        try:
+            frames = list(islice(self.frames(file), 2))
+        except DataError as error:
+            if file != run.files[-1]:
+                raise
+            raise DataError(
+                f"{error} It is the last file of its run: if it is still being written, leave it out."
+            ) from error
+        if len(frames) != 1:
+            number = "more than one frame" if frames else "no frame"
+            raise DataError(f"{file}: there is {number} in it, but one in the first file.")
+        return frames[0]
+
+
+def _series(folder: Path, files: Sequence[Path], gaps: list[str]) -> tuple[Path | None, ...]:
+    """The files of a folder in the order of their numbers, None where one is missing; adds a note on such gaps.
+
+    Raises:
+        DataError: if the names differ in more than their last number.
+    """
+    names = [_NUMBER.sub("*", _stem(file)) + file.suffix for file in files]
+    if len(set(names)) > 1:
+        kinds = ", ".join(f"{name} ({names.count(name)})" for name in list(dict.fromkeys(names))[:4])
+        raise DataError(
+            f"{folder}: files of {len(set(names))} kinds: {kinds}. Their names should differ in their last number only,"
+            " that of the frame: give each run a folder of its own, and remove other files."
+        )
+    found = [_NUMBER.search(_stem(file)) for file in files]
+    numbers = np.array([int(match.group()) if match else 0 for match in found])
+    steps = np.diff(numbers)
+    if len(files) < 3 or (steps == steps[0]).all():
+        return tuple(files)
+    step, after = int(np.median(steps)), files[int(np.argmax(steps != np.median(steps)))].name
+    places = (numbers - numbers[0]) // max(step, 1)
+    missing = int(places[-1]) + 1 - len(files)
+    if steps.min() < 1 or (steps % step).any() or missing > _MISSING * len(files):
+        gaps.append(f"{folder}: the numbers of files are uneven (first after {after}); their order counts.")
+        return tuple(files)
+    gaps.append(
+        f"{folder}: {missing} of {len(files) + missing} frames are missing (first after {after}); no particle is there"
+        " in these."
+    )
+    present = dict(zip(places.tolist(), files, strict=True))
+    return tuple(present.get(place) for place in range(len(files) + missing))
+
+
+def _stem(file: Path) -> str:
+    """The name without its suffixes: `vtk`, `lammpstrj.gz`."""
+    return re.sub(r"(\.[A-Za-z]\w*){1,2}$", "", file.name)
+
+
+def _split_of(file: Path, path: Path) -> str | None:
+    """The split that the name of the outermost folder, or of a file in it, begins with."""
+    if file == path:
+        return None
+    words = re.findall(r"[a-z]+", file.relative_to(path).parts[0].lower())
+    return find_split_name(*words[:1])
+
+
+def _metadata(layout: Layout) -> Metadata:
+    """What the first frames state; the rest is unknown."""
+    frame, dim = layout.first[0], len(layout.axes)
+    return Metadata(
+        bounds=tuple((0.0, 1.0) if frame.box is None else frame.box[axis] for axis in layout.axes),
+        dt=1.0,
+        dim=dim,
+        sequence_length=UNKNOWN_LENGTH,
+        particle_types={index: name for name, index in layout.type_ids.items()},
+        boundary=() if frame.boundary is None else tuple(frame.boundary[axis] for axis in layout.axes),
+    )

@@ -1,0 +1,230 @@
+"""Builds a trajectory from its frames, one after the other, whatever the names and the order of the arrays in them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from nmpm._support.messages import one_line
+from nmpm.data.convert.frame import AXES, Frame, ParticleArrays
+from nmpm.data.format import Trajectory
+from nmpm.errors import DataError
+
+_log = logging.getLogger(__name__)
+
+_ABSENT_TYPE = -1
+_FRAMES = 64
+
+
+class FrameStack:
+    """Collects the frames of one run in order, in arrays (T, N, …) that hold nothing twice.
+
+    Particles are matched by their ids, where the frames have ids: those that a frame lacks are absent in it (NaN).
+
+    Args:
+        axes: The axes of the files that are kept.
+        constant: Values of the axes that are left out, which are the same for all particles.
+        type_ids: Type ids by the names in the files, where types are names.
+        frames: Number of frames, None where it is unknown.
+    """
+
+    def __init__(
+        self, axes: Sequence[int], constant: Mapping[int, float], type_ids: Mapping[str, int], frames: int | None = None
+    ) -> None:
+        self._axes, self._constant, self._type_ids = list(axes), constant, type_ids
+        self._frames, self._count = frames or _FRAMES, 0
+        self._values: dict[str, np.ndarray] = {}  # (frames, particles, …), with room for more
+        self._particles = self._room = 0
+        self._types = np.zeros(0, np.int64)
+        self._has_ids = self._has_types = False
+        self._ids = np.zeros(0, np.int64)  # of the slots
+        self._last: tuple[np.ndarray, np.ndarray] | None = None  # ids of the last frame, and their slots
+        self._times: list[float] = []
+        self._first = ""  # the first frame with particles
+        self._empty = ""
+
+    def add_absent(self) -> None:
+        """Adds a frame in which there is no particle, at an unknown time."""
+        self._reserve(self._count + 1, self._particles)
+        self._times.append(np.nan)
+        self._count += 1
+
+    def add(self, frame: Frame, where: str) -> None:
+        """Adds a frame; errors name it by `where`.
+
+        Raises:
+            DataError: if its particles cannot be matched with those of the frames before.
+        """
+        if not len(frame.position):
+            self._empty = self._empty or where
+            self.add_absent()
+        else:
+            self._add_particles(frame, where)
+        self._times[-1] = np.nan if frame.time is None else frame.time
+
+    def _add_particles(self, frame: Frame, where: str) -> None:
+        arrays = ParticleArrays.of(frame, self._axes)
+        position = self._position(frame.position, where)
+        first = not self._first
+        if first:
+            self._first, self._has_ids = where, arrays.id is not None
+            self._has_types = arrays.type is not None or arrays.type_names is not None
+        slots = self._slots(arrays.id, len(position), where)
+        self.add_absent()
+        t = self._count - 1
+        types = self._frame_types(arrays, where)
+        absent = np.zeros(len(position), bool)
+        if types is not None:
+            self._merge_types(types, slots, where)
+            absent |= types == _ABSENT_TYPE
+        if arrays.present is not None:
+            absent |= ~arrays.present
+        position[absent] = np.nan
+        self._set("position", t, slots, position, first)
+        if arrays.velocity is not None:
+            self._set("velocity", t, slots, arrays.velocity, first)
+        for name, values in arrays.scalars.items():
+            self._set(name, t, slots, values, first)
+        self._drop_incomplete({"position", "velocity", *arrays.scalars}, arrays.velocity is not None, where)
+
+    def _position(self, values: np.ndarray, where: str) -> np.ndarray:
+        """(N, D) float32 of the axes that are kept."""
+        if values.shape[1] != len(self._axes) + len(self._constant):
+            raise DataError(f"{where}: {values.shape[1]} axes, unlike the first frame.")
+        for axis, value in self._constant.items():
+            other = values[:, axis][(values[:, axis] != value) & ~np.isnan(values[:, axis])]
+            if len(other):
+                raise DataError(
+                    f"{where}: {AXES[axis]} = {other[0]:g}, but {value:g} for all particles of the first frames: the"
+                    " data were taken as two-dimensional. Begin the run with a frame that is not flat."
+                )
+        with np.errstate(over="ignore"):
+            position = values[:, self._axes].astype(np.float32)
+        wrong = ~np.isfinite(position).all(axis=1) & ~np.isnan(position).all(axis=1)
+        if wrong.any():
+            particle = int(np.flatnonzero(wrong)[0])
+            raise DataError(
+                f"{where}: position of particle {particle} is {values[particle].tolist()}; it must be finite, or NaN"
+                " in all coordinates where the particle is not there."
+            )
+        return position
+
+    def _slots(self, ids: np.ndarray | None, count: int, where: str) -> np.ndarray | slice:
+        """Indices of a frame's particles in the trajectory; makes room for those that are new."""
+        if (ids is not None) != self._has_ids:
+            raise DataError(f"{where}: only some frames have ids of particles ({self._first} differs).")
+        if ids is None:
+            if self._empty or self._particles not in (0, count):
+                other = f"{self._particles} in {self._first}" if self._particles else f"none in {self._empty}"
+                raise DataError(
+                    f"{where}: {count} particles, but {other}. Where particles come and go,"
+                    " give the particles an id array."
+                )
+            self._reserve(self._count, count)
+            return slice(None, count)
+        if self._last is not None and np.array_equal(ids, self._last[0]):
+            return self._last[1]
+        unique = np.unique(ids)
+        if len(unique) < len(ids):
+            values, counts = np.unique(ids, return_counts=True)
+            raise DataError(f"{where}: {counts.max()} particles have the id {values[counts.argmax()]}.")
+        new = np.setdiff1d(unique, self._ids, assume_unique=True)
+        self._reserve(self._count, self._particles + len(new))
+        self._ids = np.concatenate([self._ids, new])
+        order = np.argsort(self._ids)
+        slots = order[np.searchsorted(self._ids, ids, sorter=order)]
+        self._last = ids, slots
+        return slots
+
+    def _reserve(self, frames: int, particles: int) -> None:
+        """Makes room for so many frames and particles, at least for half as many more where the room is too small."""
+        if frames > self._frames or particles > self._room:
+            self._frames = self._frames if frames <= self._frames else 2 * self._frames
+            if particles > self._room:
+                self._room = particles + (particles // 2 if self._room else 0)
+            for name, old in self._values.items():
+                self._values[name] = np.full((self._frames, self._room, *old.shape[2:]), np.nan, old.dtype)
+                self._values[name][: self._count, : old.shape[1]] = old[: self._count]
+        if particles > self._particles:
+            self._types = np.concatenate([self._types, np.full(particles - self._particles, _ABSENT_TYPE)])
+            self._particles = particles
+
+    def _set(self, name: str, t: int, slots: np.ndarray | slice, values: np.ndarray, first: bool) -> None:
+        """Sets a frame's values; arrays that only later frames have are left out."""
+        if first:
+            exact = values.dtype.kind in "iu" and values.dtype.itemsize > 2
+            shape = (self._frames, self._room, *values.shape[1:])
+            self._values[name] = np.full(shape, np.nan, np.float64 if exact else np.float32)
+        if name in self._values:
+            self._values[name][t, slots] = values
+
+    def _drop_incomplete(self, names: set[str], velocity: bool, where: str) -> None:
+        for name in set(self._values) - (names if velocity else names - {"velocity"}):
+            _log.warning(
+                "%s: there is no array %r, which the first frame has; it is left out.", where, one_line(name, 60)
+            )
+            del self._values[name]
+
+    def _frame_types(self, arrays: ParticleArrays, where: str) -> np.ndarray | None:
+        """(N,) type ids of a frame."""
+        if (arrays.type is not None or arrays.type_names is not None) != self._has_types:
+            raise DataError(f"{where}: only some frames have types of particles ({self._first} differs).")
+        if arrays.type is not None or arrays.type_names is None:
+            return arrays.type
+        names, index = np.unique(arrays.type_names, return_inverse=True)
+        unknown = sorted(set(names.tolist()) - set(self._type_ids))
+        if unknown:
+            raise DataError(
+                f"{where}: the type {one_line(unknown[0], 40)!r} is not in the first frame of any run"
+                f" ({', '.join(self._type_ids)})."
+            )
+        return np.array([self._type_ids[name] for name in names.tolist()])[index]
+
+    def _merge_types(self, types: np.ndarray, slots: np.ndarray | slice, where: str) -> None:
+        """Notes the types of particles that are there for the first time, and checks the others."""
+        before = self._types[slots]
+        changed = (types != before) & (types != _ABSENT_TYPE)
+        if not changed.any():
+            return
+        wrong = np.flatnonzero(changed & (before != _ABSENT_TYPE))
+        if len(wrong):
+            slot = int(np.arange(self._particles)[slots][wrong[0]])
+            particle = f"with id {self._ids[slot]}" if self._has_ids else str(slot)
+            raise DataError(
+                f"{where}: particle {particle} has type {types[wrong[0]]}, but {before[wrong[0]]} in frames before."
+                " Types must not change; store what changes under another name, as a field."
+            )
+        self._types[slots] = np.where(changed, types, before)
+
+    def trajectory(self, where: str) -> Trajectory:
+        """The frames as a trajectory, particles ordered by their ids.
+
+        Raises:
+            DataError: if there are no particles; names the run by `where`.
+        """
+        values = {name: array[: self._count, : self._particles] for name, array in self._values.items()}
+        types = self._types if self._has_types else np.zeros(self._particles, np.int64)
+        order = np.argsort(self._ids) if self._has_ids else np.arange(self._particles)
+        never = int((types == _ABSENT_TYPE).sum())
+        if never:
+            _log.warning("%s: %d particles have type %d in all frames and are left out.", where, never, _ABSENT_TYPE)
+            order = order[types[order] != _ABSENT_TYPE]
+        if not len(order):
+            raise DataError(f"{where}: there are no particles.")
+        if not np.array_equal(order, np.arange(self._particles)):
+            for array in values.values():
+                for row in array:  # in place: no second copy of the run
+                    row[: len(order)] = row[order]
+        values = {name: array[:, : len(order)] for name, array in values.items()}
+        position = values.pop("position")
+        return Trajectory(position, types[order], {}, values | self._time())
+
+    def _time(self) -> dict[str, np.ndarray]:
+        """The field `time` (T,), where at least two frames state it; the others are interpolated."""
+        times = np.array(self._times)
+        stated = np.flatnonzero(~np.isnan(times))
+        if len(stated) < max(2, len(times) // 2) or np.ptp(times[stated]) == 0:
+            return {}
+        return {"time": np.interp(np.arange(len(times)), stated, times[stated])}

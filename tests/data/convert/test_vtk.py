@@ -1,0 +1,131 @@
+"""Files that vtk writes, by pyvista."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmpm.data.convert import convert
+from nmpm.data.format import Split, read_metadata
+from nmpm.errors import ConfigError, DataError
+
+pyvista = pytest.importorskip("pyvista", reason="the extra `vtk` is not installed")
+
+T, N = 5, 7
+
+
+def positions(frames: int = T) -> np.ndarray:
+    return np.random.default_rng(0).random((frames, N, 3)).astype("f4")
+
+
+def cloud(position: np.ndarray, **arrays: np.ndarray) -> "pyvista.PolyData":
+    points = pyvista.PolyData(np.asarray(position))
+    for name, values in arrays.items():
+        points.point_data[name] = values
+    return points
+
+
+def write_run(folder: Path, suffix: str = ".vtp", binary: bool = True) -> np.ndarray:
+    folder.mkdir(parents=True)
+    position = positions()
+    for t, frame in enumerate(position):
+        mesh = cloud(frame, velocity=2 * frame, pressure=frame[:, 0].astype("f8"), type=np.arange(N) % 2)
+        mesh.field_data["TimeValue"] = [0.5 * t]
+        mesh = mesh.cast_to_unstructured_grid() if suffix == ".vtu" else mesh
+        mesh.save(folder / f"frame_{t}{suffix}", binary=binary)
+    return position
+
+
+@pytest.mark.parametrize(("suffix", "binary"), [(".vtk", True), (".vtk", False), (".vtp", True), (".vtu", True)])
+def test_points_arrays_and_times_are_read(tmp_path, suffix, binary):
+    position = write_run(tmp_path / "data" / "train" / "run0", suffix, binary)
+    convert(tmp_path / "data", tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
+    np.testing.assert_allclose(trajectory.position, position, rtol=1e-5)
+    np.testing.assert_allclose(trajectory.fields["velocity"], 2 * position, rtol=1e-5)
+    np.testing.assert_allclose(trajectory.fields["pressure"], position[..., 0], rtol=1e-5)
+    assert trajectory.particle_type.tolist() == [0, 1, 0, 1, 0, 1, 0]
+    assert trajectory.fields["time"].tolist() == [0, 0.5, 1, 1.5, 2]
+    assert read_metadata(tmp_path / "out").dt == 0.5
+
+
+def write_list(folder: Path, names: list[str], times: list[float]) -> Path:
+    sets = "".join(f'<DataSet timestep="{t}" part="0" file="{name}"/>' for t, name in zip(times, names, strict=True))
+    path = folder / "run.pvd"
+    path.write_text(f'<?xml version="1.0"?><VTKFile type="Collection"><Collection>{sets}</Collection></VTKFile>')
+    return path
+
+
+def test_a_list_gives_order_and_times(tmp_path):
+    position = write_run(tmp_path / "run" / "frames")
+    write_list(tmp_path / "run", [f"frames/frame_{t}.vtp" for t in (3, 0, 2)], [0.3, 0.1, 0.2])
+    for source in (tmp_path / "run", tmp_path / "run" / "run.pvd"):
+        convert(source, tmp_path / source.name / "out")
+        trajectory = Split(tmp_path / source.name / "out" / "train.h5").read_with_fields(0)
+        np.testing.assert_array_equal(trajectory.position, position[[0, 2, 3]])
+        assert trajectory.fields["time"].tolist() == [0.1, 0.2, 0.3]
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def replace_by_grid(path: Path) -> None:
+    pyvista.ImageData(dimensions=(2, 2, 2)).save(path)
+
+
+def declare_more(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"POINTS 7", b"POINTS 700000000"))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "damage", "message"),
+    [
+        (".vtp", cut, r"cannot be read as VTK \(.*\). Is it complete\?"),
+        (".vtk", cut, r"cannot be read as VTK \(.*\). Is it complete\?"),
+        (".vtu", lambda path: path.write_bytes(b""), r"cannot be read as VTK \(.*\). Is it complete\?"),
+        (".vtk", replace_by_grid, "it has a StructuredPoints; particles are points"),
+        (".vtk", declare_more, "it declares 700,000,000 points but has only"),
+    ],
+    ids=["vtp", "vtk", "empty", "grid", "size"],
+)
+@pytest.mark.parametrize("frame", [1, T - 1])
+def test_damaged_files_are_named(tmp_path, capfd, suffix, damage, message, frame):
+    write_run(tmp_path / "run", suffix)
+    damage(tmp_path / "run" / f"frame_{frame}{suffix}")
+    last = "leave it out" if frame == T - 1 else ""
+    with pytest.raises(DataError, match=rf"frame_{frame}\{suffix}: {message}.*{last}"):
+        convert(tmp_path / "run", tmp_path / "out")
+    assert "ERR" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["../other.vtp"], "lists .*other.vtp, which is not in its folder"),
+        (["frame_0.vtp", "frame_9.vtp"], "frame_9.vtp cannot be read: No such file"),
+        ([], "it lists no file"),
+    ],
+    ids=["outside", "missing", "none"],
+)
+def test_wrong_lists(tmp_path, names, message):
+    write_run(tmp_path / "run")
+    with pytest.raises(DataError, match=message):
+        convert(write_list(tmp_path / "run", names, list(range(len(names)))), tmp_path / "out")
+
+
+def test_a_missing_library_gives_the_install_command(tmp_path, monkeypatch):
+    write_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
+    with pytest.raises(ConfigError, match=re.escape('reading VTK needs pyvista: pip install "nmpm[vtk]".')):
+        convert(tmp_path / "run", tmp_path / "out")
+
+
+def test_recorded_sph(recorded, tmp_path):
+    convert(recorded / "third-party" / "warp-sph-vtk", tmp_path / "out")
+    counts = {name: len(Split(tmp_path / "out" / f"{name}.h5")) for name in ("train", "valid", "test")}
+    assert counts == {"train": 3, "valid": 1, "test": 1}
+    trajectory = Split(tmp_path / "out" / "test.h5").read_with_fields(0)
+    assert trajectory.position.shape == trajectory.fields["velocity"].shape == (60, 2048, 3)
