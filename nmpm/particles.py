@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 
-class _Batched:
+class Batched:
     """Dataclasses of tensors (B, …) of the same B scenes, which are moved, converted and picked together."""
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
@@ -44,7 +44,7 @@ class _Batched:
 
 
 @dataclass(frozen=True)
-class Particles(_Batched):
+class Particles(Batched):
     """The state of B scenes at one frame.
 
     Args:
@@ -84,6 +84,11 @@ class Particles(_Batched):
         if self.obstacle_velocity is not None:
             _check_shape("Particles.obstacle_velocity", self.obstacle_velocity, [tuple(self.obstacle.shape)])
 
+    @property
+    def present_volume(self) -> Tensor:
+        """(B, N) volume of each particle as a multiple of the scene's, 0 for padding; the mask where all are alike."""
+        return self.mask if self.volume is None else self.volume * self.mask
+
     def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
         """The same particles elsewhere: (B, N, D) positions and velocities."""
         return dataclasses.replace(self, position=position, velocity=velocity)
@@ -94,7 +99,7 @@ class Particles(_Batched):
 
 
 @dataclass  # (not frozen: Lightning assigns the tensors that it has converted to another precision)
-class Window(_Batched):
+class Window(Batched):
     """Consecutive recorded frames of B scenes: two to start from, the rest to predict.
 
     Args:
@@ -164,6 +169,15 @@ class Window(_Batched):
             obstacle_velocity=None if moved is None else moved[:, 1] - moved[:, 0],
             volume=self.volume,
         )
+
+    def mask_at(self, frame: int) -> Tensor:
+        """(B, N) bool, which particles are there in a frame."""
+        return self.mask if self.present is None else self.mask & self.present[:, frame]
+
+    def volume_at(self, frame: int) -> Tensor:
+        """(B, N) volume of each particle in a frame, as `Particles.present_volume`."""
+        there = self.mask_at(frame)
+        return there if self.volume is None else self.volume * there
 
     def first(self, frames: int) -> Self:
         """The first frames, two or more."""

@@ -116,9 +116,20 @@ class Scene:
         return tuple(kind == "periodic" for kind in self.boundary)
 
     @property
+    def confined(self) -> tuple[bool, ...]:
+        """Whether each axis ends at walls."""
+        return tuple(kind == "wall" for kind in self.boundary)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing leaves or brings energy in: no axis is open and no obstacle moves."""
+        return "open" not in self.boundary and not self.moving_obstacles
+
+    @property
     def walled(self) -> bool:
         """Whether the grid has a solid channel: for a wall layer or obstacles."""
-        return self.obstacles or self.bounds != self.domain
+        sides = zip(self.bounds, self.domain, self.boundary, strict=True)
+        return self.obstacles or any(inner != outer and kind != "open" for inner, outer, kind in sides)
 
     @property
     def gravity_known(self) -> bool:

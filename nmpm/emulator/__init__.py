@@ -2,6 +2,7 @@
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.model import NETWORK_PRECISIONS, Emulator
+from nmpm.emulator.prescribed import Prescribed
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.rollouts import (
     Rollout,
@@ -19,6 +20,7 @@ __all__ = [
     "Bundle",
     "Emulator",
     "EmulatorRecipe",
+    "Prescribed",
     "Rollout",
     "RolloutContext",
     "Windows",

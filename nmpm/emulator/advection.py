@@ -68,18 +68,31 @@ class Advection:
         moving = self._take_off(start)
         path = self._free_path(moving) if budget is None else self._within_energy(moving, budget)
         if self.emulator.constraints.solids and self.emulator.scene.obstacles:
-            contact = Contact(obstacle_share(solid, self.emulator.walls), self.emulator.grid)
-            path = self._confine(contact.hold(start.cells, path, start.mask))
+            path = self._keep_clear(start, path, solid)
         if self.emulator.constraints.rest_speed:
             path = self._bring_to_rest(start, path, solid)
         return self._check_bounds(start, path)
 
+    def _keep_clear(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
+        """The path (B, m, N, D) outside of obstacles; of those that move, where they are in each frame."""
+        if start.solids is None:
+            contact = Contact(obstacle_share(solid, self.emulator.walls), self.emulator.grid)
+            return self._confine(contact.hold(start.cells, path, start.mask))
+        cells, held = start.cells, []
+        steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
+        for step, there in zip(steps.unbind(1), start.solids.unsqueeze(2).unbind(1), strict=True):
+            contact = Contact(obstacle_share(there, self.emulator.walls), self.emulator.grid)
+            cells = self._confine(contact.hold(cells, (cells + step).unsqueeze(1), start.mask)).squeeze(1)
+            held.append(cells)
+        return torch.stack(held, dim=1)
+
     def uncrowded_path(self, start: BundleStart, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """A path (B, m, N, D) of `constrained_path` with overfull cells at its end spread, evenly over its frames."""
         volume = self.emulator.scene.particle_volume / self.emulator.grid.cell_volume
+        solid = solid if start.solids is None else start.solids[:, -1:]
         taken = solid if solid.shape[1] else self.emulator.walls.expand(1, 1, *self.emulator.grid.shape)
         crowding = Crowding(self.emulator.constraints.density_cap, volume, 1 - taken, self.emulator.grid)
-        shift = crowding.shift(path[:, -1], start.mask.unsqueeze(-1))
+        shift = crowding.shift(path[:, -1], start.volume.unsqueeze(-1))
         if shift is None:
             return path
         frames = path.shape[1]
@@ -108,7 +121,7 @@ class Advection:
         fields = start.fields
         smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
         carried = self.emulator.decoder.carried_velocity(start.velocity, smoothed)
-        share = mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
+        share = mass_shares(self.emulator.scene, start.material, start.volume, start.cells.dtype)
         return MovingParticles(start, carried, fields, share)
 
     def _free_path(self, moving: MovingParticles) -> Tensor:
@@ -187,26 +200,27 @@ class Advection:
 
     def _spread_energies(self, start: BundleStart, path: Tensor, spread: Tensor) -> Tensor:
         """(B, m + 1) energies of the frames of a spread path, and of its end with the velocity of the path's end."""
-        share = mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
+        share = mass_shares(self.emulator.scene, start.material, start.volume, start.cells.dtype)
         before = path[:, -2] if path.shape[1] > 1 else start.cells
         cells, step, gravity = self.emulator.grid.isotropic_units(spread[:, -1], path[:, -1] - before, start.gravity)
         end = energy(cells, step, gravity, share)
         return torch.cat([self._energies(start.cells, start.gravity, share, spread), end.unsqueeze(1)], dim=1)
 
     def _confine(self, cells: Tensor) -> Tensor:
-        """Positions (..., D) within the bounds; periodic axes are unwrapped and have none (transfers wrap)."""
+        """Positions (..., D) within the walls; other axes have none (periodic ones are unwrapped: transfers wrap)."""
         rule, (low, high) = BOUNDS[self.emulator.constraints.bounds], self.emulator.bounds.unbind(0)
-        if all(self.emulator.scene.periodic):
+        confined = self.emulator.scene.confined
+        if not any(confined):
             return cells
-        if not any(self.emulator.scene.periodic):
+        if all(confined):
             return rule(cells, low, high)
         columns = [
-            column if wraps else rule(column, low[axis], high[axis])
-            for axis, (column, wraps) in enumerate(zip(cells.unbind(-1), self.emulator.scene.periodic, strict=True))
+            rule(column, low[axis], high[axis]) if walls else column
+            for axis, (column, walls) in enumerate(zip(cells.unbind(-1), confined, strict=True))
         ]
         return torch.stack(columns, dim=-1)
 
     def _check_bounds(self, start: BundleStart, path: Tensor) -> Tensor:
         if self.emulator.constraints.bounds == "error":
-            check_within_bounds(path, start.mask, self.emulator.bounds, self.emulator.scene.periodic)
+            check_within_bounds(path, start.mask, self.emulator.bounds, self.emulator.scene.confined)
         return path

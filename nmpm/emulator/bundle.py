@@ -25,20 +25,24 @@ class BundleStart:
         velocity: (B, N, D) the particles' own velocities.
         gravity: (B, 1, D), what a frame adds to a velocity.
         material: (B, N) indices into the scene's materials.
+        volume: (B, N) as `Particles.present_volume`.
         mask: (B, N) bool, False for padding.
         state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
         output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
         scale: (m, C, 1, ...), by which it is multiplied.
+        solids: (B, m, *S) solid fraction at each of the frames, where obstacles move; None where they do not.
     """
 
     cells: Tensor
     velocity: Tensor
     gravity: Tensor
     material: Tensor
+    volume: Tensor
     mask: Tensor
     state: Tensor
     output: Tensor
     scale: Tensor
+    solids: Tensor | None = None
 
     @property
     def fields(self) -> Tensor:
@@ -66,6 +70,13 @@ class Bundle:
     position: Tensor
     velocity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def without_absent(self, mask: Tensor) -> Bundle:
+        """The same with NaN for the positions and fields of particles that are not there, False in `mask` (B, N)."""
+        there = mask.unsqueeze(1)
+        position = torch.where(there.unsqueeze(-1), self.position, torch.nan)
+        fields = {name: torch.where(there, values, torch.nan) for name, values in self.fields.items()}
+        return Bundle(position, self.velocity, fields)
 
     def state_after(self, particles: Particles) -> Particles:
         """The state at the bundle's last frame, of the particles that it started from."""

@@ -14,6 +14,7 @@ from nmpm._support.collectives import all_gather, rank_and_world_size
 from nmpm.emulator.fields import calibrate_fields, true_rates
 from nmpm.emulator.model import UNLIMITED, Emulator
 from nmpm.emulator.prediction import TensorSteps
+from nmpm.emulator.prescribed import start_of
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
@@ -98,7 +99,8 @@ def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
         start, grid = window.initial, emulator.grid
         taken = emulator.solid(start)
         room = 1 - (taken if taken.shape[1] else emulator.walls)
-        full = volume_fraction(emulator.scene, grid, Linear(), window.mask, grid.to_cells(window.target[:, -1]))
+        volume, cells = window.volume_at(-1), grid.to_cells(window.target[:, -1])
+        full = volume_fraction(emulator.scene, grid, Linear(), volume, cells)
         fractions.append((full / room.clamp(min=0.5))[(full > 0.5) & (room > 0.5)])
     filled = torch.cat(fractions).sort().values
     if not len(filled):
@@ -107,7 +109,7 @@ def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
 
 
 def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:
-    starts = [window.initial for window in windows]
+    starts = [start_of(window, emulator.frames) for window in windows]
     state = torch.cat([TensorSteps(emulator).rasterise(start, emulator.solid(start))[-1] for start in starts])
     axes = (0, *range(2, state.dim()))
     cells = state.numel() // state.shape[1]
@@ -145,10 +147,15 @@ def _unknowns(emulator: Emulator, windows: Sequence[Window]) -> list[_Unknowns]:
     result = []
     for parts in unknown:  # (B, m, N, V) in each window
         for index in range(len(emulator.scene.materials)):
-            of_material = [window.mask & (window.material == index) for window in windows]
+            of_material = [_stay(window, emulator.frames) & (window.material == index) for window in windows]
             values = torch.cat([part.transpose(1, 2)[real] for part, real in zip(parts, of_material, strict=True)])
             result.append(_Unknowns(len(values), _shareable(values.square().mean(0))))
     return result
+
+
+def _stay(window: Window, frames: int) -> Tensor:
+    """(B, N) bool: the particles that are there at the start and in the first frames to predict."""
+    return window.mask if window.present is None else window.mask & window.present[:, : frames + 2].all(1)
 
 
 def _borrowed(values: Tensor, scene: Scene, absent: Sequence[int]) -> Tensor:

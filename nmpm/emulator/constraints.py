@@ -52,15 +52,15 @@ BOUNDS: Mapping[str, BoundsRule] = MappingProxyType({"stop": stop, "reflect": re
 """Rules for positions beyond the bounds, by name. With "error", `check_within_bounds` is called once per bundle."""
 
 
-def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, periodic: Sequence[bool]) -> None:
+def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, confined: Sequence[bool]) -> None:
     """Reject paths (B, m, N, D) of real particles (B, N), in cells, more than a cell beyond the bounds (2, D).
 
-    Axes that wrap have none. One value is read back.
+    Only of axes that are `confined` by walls. One value is read back.
 
     Raises DataError naming scene, particle and frame of the first such position.
     """
     low, high = bounds.unbind(0)
-    walls = [axis for axis, wraps in enumerate(periodic) if not wraps]
+    walls = [axis for axis, ends in enumerate(confined) if ends]
     sides = [(path[..., axis] < low[axis] - 1) | (path[..., axis] > high[axis] + 1) for axis in walls]
     beyond = torch.stack(sides).any(0) & mask.unsqueeze(1) if sides else None
     if beyond is None or not bool(beyond.any()):
@@ -79,7 +79,7 @@ class Constraints:
 
     Args:
         energy: Kinetic and potential energy never exceed those of the rollout's first state: for scenes of known
-            gravity that nothing feeds, neither moving walls nor inlets.
+            gravity that nothing feeds. It does not act where obstacles move, axes are open or particles enter.
         rest_speed: Particles that move fewer cells per frame than this, on average over a bundle, and do not fall
             freely, stay where they are if something holds them up (`nmpm.emulator.support`), and fall otherwise. Set it
             to the speed that the model predicts in material that is at rest.
@@ -118,12 +118,12 @@ def energy(cells: Tensor, velocity: Tensor, gravity: Tensor, share: Tensor) -> T
     return (each * share.reshape(batch, *extra, count, 1)).sum((-2, -1))
 
 
-def mass_shares(scene: Scene, material: Tensor, mask: Tensor, dtype: torch.dtype) -> Tensor:
+def mass_shares(scene: Scene, material: Tensor, volume: Tensor, dtype: torch.dtype) -> Tensor:
     """(B, N, 1) each particle's share of its scene's mass, zero for padding; sums to one in scenes with particles.
 
-    All particles have the same volume; where the scene has no densities, the same mass. `material` and `mask` (B, N).
+    Of `material` and `volume` (B, N), see `Particles.present_volume`. Where the scene has no densities, they are equal.
     """
-    mass = mask.to(dtype)
+    mass = volume.to(dtype)
     if len(set(scene.densities)) > 1:
         for index, density in enumerate(scene.densities):
             mass = torch.where(material == index, mass * (density / max(scene.densities)), mass)

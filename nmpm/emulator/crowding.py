@@ -51,19 +51,19 @@ class Crowding:
     free: Tensor
     grid: Grid
 
-    def shift(self, cells: Tensor, real: Tensor) -> Tensor | None:
+    def shift(self, cells: Tensor, volume: Tensor) -> Tensor | None:
         """(B, N, D) displacements that spread overfull cells; None, on a CPU only, if there are none.
 
-        Of positions (B, N, D) of which some are real (B, N, 1), not padding. At most `MAX_SHIFT` along each axis,
-        exactly zero away from overfull cells and for padding.
+        Of positions (B, N, D) and volumes (B, N, 1), as `Particles.present_volume`. At most `MAX_SHIFT` along each
+        axis, exactly zero away from overfull cells and for padding.
         """
-        full = Linear().p2g(real.to(cells.dtype), cells, self.grid) * (self.particle / self.cap)
+        full = Linear().p2g(volume.to(cells.dtype), cells, self.grid) * (self.particle / self.cap)
         excess = full - self.free
         if is_eager_cpu(excess) and not bool((excess > 0).any()):
             return None
         flow = torch.cat(self._flow(excess), dim=1)
         shift = linear_g2p(flow, cells, self.grid)
-        return torch.where(real, shift.clamp(-MAX_SHIFT, MAX_SHIFT), 0.0)
+        return torch.where(volume > 0, shift.clamp(-MAX_SHIFT, MAX_SHIFT), 0.0)
 
     def _flow(self, excess: Tensor) -> list[Tensor]:
         """Displacement at the nodes along each axis, D tensors (B, 1, *S), for their excess (B, 1, *S)."""

@@ -126,7 +126,10 @@ def _values(window: Window, name: str) -> Tensor:
     values = window.fields[name].cpu().double()
     if values.shape[2] == 1:
         return values.flatten()
-    return values[window.mask.cpu().unsqueeze(1).expand_as(values)]
+    real = window.mask.unsqueeze(1)
+    if window.present is not None and values.shape[1] > 1:
+        real = real & window.present
+    return values[real.cpu().expand_as(values)]
 
 
 def true_rates(scales: FieldScales, window: Window, frames: int) -> Tensor:

@@ -100,8 +100,8 @@ def warn_of_start_outside(emulator: Emulator, particles: Particles) -> None:
     """Warn of particles that start outside of the bounds by more than rounding: the first frame moves them in."""
     scene = emulator.scene
     sides = [
-        torch.zeros_like(column) if wraps else torch.maximum(low - column, column - high)
-        for column, (low, high), wraps in zip(particles.position.unbind(-1), scene.bounds, scene.periodic, strict=True)
+        torch.maximum(low - column, column - high) if walls else torch.zeros_like(column)
+        for column, (low, high), walls in zip(particles.position.unbind(-1), scene.bounds, scene.confined, strict=True)
     ]
     apart = torch.stack(sides).amax(0).masked_fill(~particles.mask, 0.0)
     outside = apart > ROUNDING * min(emulator.grid.spacing)

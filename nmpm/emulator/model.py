@@ -197,8 +197,12 @@ class Emulator(nn.Module):
     def context(self, particles: Particles) -> RolloutContext:
         """The context of a rollout from this state; warns of fields that the state lacks."""
         self.field_scales.warn_of_missing(particles)
+        return self.surroundings(particles, self.budget(particles))
+
+    def surroundings(self, particles: Particles, budget: Tensor | None) -> RolloutContext:
+        """The context of calls among the obstacles of a state, within an energy if there is one."""
         solid = self.solid(particles)
-        return steps_for(self, particles, solid).prepare_rollout(solid, self.budget(particles))
+        return steps_for(self, particles, solid).prepare_rollout(solid, budget)
 
     def solid(self, particles: Particles) -> Tensor:
         """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
@@ -209,7 +213,7 @@ class Emulator(nn.Module):
         if not self.constraints.energy or self.training:
             return None
         cells, velocity, gravity = self.grid.isotropic_units(*self.in_cells(particles))
-        share = mass_shares(self.scene, particles.material, particles.mask, cells.dtype)
+        share = mass_shares(self.scene, particles.material, particles.present_volume, cells.dtype)
         return energy(cells, velocity, gravity, share)
 
     def normalise(self, state: Tensor) -> Tensor:

@@ -60,14 +60,15 @@ class Monitor:
     Args:
         policy: To warn, once for each kind of incident, to stop, or only to record.
         speed: Largest step of a particle along an axis, in the last frame of a bundle, in the narrowest cells.
-        energy_gain: Largest share of the first state's energy that may be gained; not watched where gravity is unknown.
+        energy_gain: Largest share of the first state's energy that may be gained; not watched where gravity is unknown,
+            obstacles move, axes are open, or particles enter.
         crowding: Largest volume fraction of a cell, measured every 16th bundle; the largest that the network is shown
             when left out.
 
     Attributes:
         incidents: The first of each kind in this rollout.
         peaks: The largest value of each measure in this rollout, by the names that incidents have.
-        at_walls: Particles at the scene's bounds or beyond, when crowding was last measured; periodic axes have none.
+        at_walls: Particles at the scene's walls or beyond, when crowding was last measured.
         rest_share: Mean share of the particles that a bundle leaves where they were, as `rest_speed` does.
     """
 
@@ -95,13 +96,17 @@ class Monitor:
         self.rest_share, self._judged = 0.0, 0
         self._unread = []
         self._padded = not is_eager_cpu(particles.mask) or not bool(particles.mask.all())
-        if not emulator.scene.gravity_known:
+        if not emulator.scene.gravity_known or not emulator.scene.is_closed:
             self._reference = None
             return
-        share = mass_shares(emulator.scene, particles.material, particles.mask, particles.position.dtype)
+        share = mass_shares(emulator.scene, particles.material, particles.present_volume, particles.position.dtype)
         begun = energy(particles.position, particles.velocity, particles.gravity.unsqueeze(1), share)
         above = begun - lowest_potential(emulator.scene, particles.gravity)
         self._reference = begun, above.clamp(min=torch.finfo(begun.dtype).tiny), share
+
+    def ignore_energy(self) -> None:
+        """Of the rollout that starts, do not watch the energy: particles enter or leave, or obstacles move."""
+        self._reference, self._padded = None, True
 
     def see(self, emulator: Emulator, particles: Particles, bundle: Bundle) -> None:
         """Measure a bundle that the emulator predicted from a state; raises RolloutStoppedError, see `Policy`."""
@@ -144,10 +149,11 @@ class Monitor:
     def _crowding_and_walls(self, emulator: Emulator, particles: Particles, last: Tensor) -> dict[str, Tensor]:
         """(B,) measures of positions (B, N, D) by name."""
         grid, scene = emulator.grid, emulator.scene
-        fraction = volume_fraction(scene, grid, emulator.transfer, particles.mask, grid.to_cells(last.nan_to_num()))
+        volume, cells = particles.present_volume, grid.to_cells(last.nan_to_num())
+        fraction = volume_fraction(scene, grid, emulator.transfer, volume, cells)
         sides = [
-            torch.zeros_like(particles.mask) if wraps else (column <= low) | (column >= high)
-            for column, (low, high), wraps in zip(last.unbind(-1), scene.bounds, scene.periodic, strict=True)
+            (column <= low) | (column >= high) if walls else torch.zeros_like(particles.mask)
+            for column, (low, high), walls in zip(last.unbind(-1), scene.bounds, scene.confined, strict=True)
         ]
         at_walls = torch.stack(sides).any(0) & particles.mask
         measures = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}

@@ -36,6 +36,10 @@ class Periods:
             self._turns[axis] = self._turns[axis] + turns if axis in self._turns else turns
         return particles.with_motion(torch.stack(columns, dim=-1), particles.velocity)
 
+    def forget(self, particles: Tensor) -> None:
+        """Count from zero for some particles, True in (B, N): they are at another place."""
+        self._turns = {axis: turns.masked_fill(particles, 0.0) for axis, turns in self._turns.items()}
+
     def unwrapped_state(self, particles: Particles) -> Particles:
         """Wrapped particles with the periods counted so far."""
         if not self._axes:

@@ -6,6 +6,7 @@ kernels of `nmpm.emulator.fused`. `steps_for` chooses. Only the network is compu
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -58,7 +59,10 @@ class TensorSteps(Steps):
         with _full_precision(device):
             velocities = len(emulator.scene.materials) * emulator.scene.dim  # channels; then rates of fields
             predicted, scale = output[:, :, :velocities], emulator.output_scale[:, :velocities]
-            start = BundleStart(cells, velocity, gravity, particles.material, particles.mask, state, predicted, scale)
+            start = BundleStart(
+                cells, velocity, gravity, particles.material, particles.present_volume, particles.mask, state,
+                predicted, scale, self._solids_ahead(particles),
+            )  # fmt: skip
             path = self.path(start, context)
             fields: Mapping[str, Tensor] = {}
             if emulator.scene.evolving:
@@ -73,6 +77,17 @@ class TensorSteps(Steps):
             precision = particles.position.dtype
             last_velocity = emulator.grid.to_displacement(step.to(precision))
             return Bundle(emulator.grid.to_length(path.to(precision)), last_velocity, fields)
+
+    def _solids_ahead(self, particles: Particles) -> Tensor | None:
+        """(B, m, *S) solid fraction at each frame, of obstacles that keep their velocity; None where none moves."""
+        model, velocity = self.emulator, particles.obstacle_velocity
+        if not (model.scene.moving_obstacles and model.constraints.solids) or model.training or velocity is None:
+            return None
+        at_frames = (
+            dataclasses.replace(particles, obstacle=particles.obstacle + frame * velocity)
+            for frame in range(1, model.frames + 1)
+        )
+        return torch.cat([model.solid(there) for there in at_frames], dim=1)
 
     def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in cells; grid state (B, C_in, *S)."""
@@ -144,14 +159,15 @@ class TrainingSteps(TensorSteps):
 def steps_for(emulator: Emulator, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
-    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`) and outside of
-    `without_kernels`: in training mode those with gradients, if neither obstacles nor gravity need any; in evaluation
-    mode those without.
-    Graphs that `torch.compile` traces take tensor operations.
+    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`), particles of one size, and
+    outside of `without_kernels`: in training mode those with gradients, if neither obstacles nor gravity need any; in
+    evaluation mode those without. Graphs that `torch.compile` traces take tensor operations.
     """
     motion, fixed = (particles.position, particles.velocity), (particles.gravity, solid)
     parameters, is_float32 = emulator.kernel_parameters, emulator.precision == torch.float32
     if parameters is None or not is_float32 or not kernels_take(*motion, particles.gravity):
+        return TensorSteps(emulator)
+    if particles.volume is not None:
         return TensorSteps(emulator)
     if torch.compiler.is_compiling() or _need_gradients(fixed):
         return TensorSteps(emulator)

@@ -21,14 +21,18 @@ def grid_state(
     """The grid state in grid units, (B, C_in, *S).
 
     Particles are at `cells` (B, N, D) with `velocity` (B, N, D) in cells per frame, among `solid` (B, C_solid, *S).
-    Scenes with fields need their scales.
+    They weigh by their volumes. Scenes with fields need their scales.
     """
     index = torch.arange(len(scene.materials), device=particles.material.device)
     membership = ((particles.material.unsqueeze(-1) == index) & particles.mask.unsqueeze(-1)).float()
+    if particles.volume is not None:
+        membership = membership * particles.volume.to(cells.dtype).unsqueeze(-1)
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
     mean = momentum / _positive(count).repeat_interleave(scene.dim, dim=1)
     volume = count * (scene.particle_volume / grid.cell_volume)
     parts = [mean, volume, solid]
+    if scene.moving_obstacles:
+        parts.append(solid_velocity(grid, transfer, particles, cells.dtype))
     if scene.gravity_varies:
         parts.append(_constant(grid.to_cell_displacement(particles.gravity, cells.dtype), grid))
     if scales is not None and scene.particle_fields:
@@ -54,23 +58,37 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
         return walls.expand(batch, 1, *grid.shape)
     precision = torch.promote_types(walls.dtype, torch.float32)
     cells = grid.to_cells(particles.obstacle, precision)
-    volume: Tensor = particles.obstacle_mask.to(precision)
-    if particles.obstacle_share is not None:
-        volume = volume * particles.obstacle_share.to(precision)
+    volume = _obstacle_volumes(particles, precision)
     return (walls + volume_fraction(scene, grid, transfer, volume, cells)).clamp(max=1.0)
+
+
+def solid_velocity(grid: Grid, transfer: Transfer, particles: Particles, dtype: torch.dtype) -> Tensor:
+    """The mean velocity of the obstacles in each cell, by volume, (B, D, *S) in cells per frame; 0 where none is."""
+    cells, volume = grid.to_cells(particles.obstacle, dtype), _obstacle_volumes(particles, dtype).unsqueeze(-1)
+    if particles.obstacle_velocity is None:
+        return cells.new_zeros(len(cells), grid.dim, *grid.shape)
+    velocity = grid.to_cell_displacement(particles.obstacle_velocity, dtype)
+    sums = transfer.p2g(torch.cat([velocity * volume, volume], dim=-1), cells, grid)
+    return sums[:, :-1] / _positive(sums[:, -1:])
+
+
+def _obstacle_volumes(particles: Particles, dtype: torch.dtype) -> Tensor:
+    """(B, M) volumes of the obstacles' particles, as multiples of a particle's; 0 for padding."""
+    real = particles.obstacle_mask.to(dtype)
+    return real if particles.obstacle_share is None else real * particles.obstacle_share.to(dtype)
 
 
 def volume_fraction(scene: Scene, grid: Grid, transfer: Transfer, volume: Tensor, cells: Tensor) -> Tensor:
     """The share of each cell taken by particles at `cells` (B, N, D), (B, 1, *S); above 1 where they are crowded.
 
-    `volume` (B, N) is how much of a particle's volume each stands for: a mask, or shares in the precision of `cells`.
+    `volume` (B, N) is how much of the scene's particle volume each stands for: a mask, shares or `present_volume`.
     """
     count = transfer.p2g(volume.to(cells.dtype).unsqueeze(-1), cells, grid)
     return count * (scene.particle_volume / grid.cell_volume)
 
 
 def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
-    """The share of each cell beyond the scene's bounds, (*S), exact for the box; on torch's default device.
+    """The share of each cell beyond the scene's walls, (*S), exact for the box; on torch's default device.
 
     Computed in float64, which not every device has, on the CPU.
     """
@@ -79,7 +97,7 @@ def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
         centre = grid.centres(axis)
         half = grid.spacing[axis] / 2
         overlap = (centre + half).clamp(max=high) - (centre - half).clamp(min=low)
-        share = (overlap / grid.spacing[axis]).clamp(0, 1)
+        share = (overlap / grid.spacing[axis]).clamp(0, 1) if scene.confined[axis] else torch.ones_like(overlap)
         free = free.unsqueeze(-1) * share
     return (1 - free).float().to(torch.get_default_device())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
@@ -68,6 +69,9 @@ class EmulatorRecipe:
             raise ConfigError(
                 "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
             )
+        if self.constraints.energy and not self.scene.is_closed:
+            warnings.warn("constraints.energy is off: moving obstacles and open axes bring energy in.", stacklevel=3)
+            object.__setattr__(self, "constraints", dataclasses.replace(self.constraints, energy=False))
         self.processor.check_grid(self.grid)
 
     @property

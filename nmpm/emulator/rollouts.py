@@ -15,6 +15,7 @@ from nmpm.emulator.input_checks import check_inputs, warn_of_training_mode
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.periods import Periods
+from nmpm.emulator.prescribed import Exchange, Prescribed
 from nmpm.particles import Particles
 from nmpm.transfer.execution import is_eager_cpu
 
@@ -22,37 +23,52 @@ Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
 
 
 def unroll(
-    emulator: Emulator, particles: Particles, bundles: int, monitor: Monitor | None = None, frames: int | None = None
+    emulator: Emulator,
+    particles: Particles,
+    bundles: int,
+    monitor: Monitor | None = None,
+    frames: int | None = None,
+    prescribed: Prescribed | None = None,
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
+
+    Particles beyond the bounds of an open axis leave after the bundle, unless those that leave are prescribed. Where
+    particles enter or leave, positions and fields of those that are not there are NaN.
 
     On a CPU, scenes whose state no longer changes are repeated without a call. The monitor measures each bundle before
     it is yielded, and names no frame beyond the number that is used, `frames`; all if that is left out.
     """
+    exchange = Exchange(emulator, prescribed)
+    particles = exchange.start(particles)
     if monitor is not None:
         monitor.start(emulator, particles, frames)
+        if prescribed is not None or exchange.varies:
+            monitor.ignore_energy()
     periods = Periods(emulator)
     particles = periods.wrap(particles)
-    calls = _Calls(emulator, particles)
-    for remaining in reversed(range(bundles)):
+    calls = _Calls(emulator, particles, exchange)
+    for index in range(bundles):
         bundle = calls.predict(particles)
         travelled = periods.unwrapped(bundle)
         if monitor is not None:
             monitor.see(emulator, periods.unwrapped_state(particles), travelled)
-            if not remaining:
+            if index == bundles - 1:
                 monitor.read()
-        yield travelled
-        after = periods.wrap(bundle.state_after(particles))
-        calls.leave_out_resting(particles, after)
+        yield travelled.without_absent(particles.mask) if exchange.varies else travelled
+        after = exchange.after(bundle.state_after(particles), (index + 1) * emulator.frames)
+        if exchange.varies:
+            periods.forget(~(particles.mask & after.mask))
+        after = periods.wrap(after)
+        calls.prepare(particles, after)
         particles = after
 
 
 class _Calls:
     """The calls of a rollout, of the scenes that are not at rest."""
 
-    def __init__(self, emulator: Emulator, particles: Particles) -> None:
-        self._emulator, self._count = emulator, len(particles.position)
-        self._context = self._moving_context = emulator.context(particles)
+    def __init__(self, emulator: Emulator, particles: Particles, exchange: Exchange) -> None:
+        self._emulator, self._count, self._exchange = emulator, len(particles.position), exchange
+        self._context = self._moving_context = exchange.first_context(particles)
         self._moving, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
 
     def predict(self, particles: Particles) -> Bundle:
@@ -72,7 +88,14 @@ class _Calls:
         values[self._moving] = moving
         return values
 
-    def leave_out_resting(self, before: Particles, after: Particles) -> None:
+    def prepare(self, before: Particles, after: Particles) -> None:
+        """Prepare the call from the state `after`, whose bundle before started from `before`."""
+        if self._exchange.prescribed is None:
+            self._leave_out_resting(before, after)
+        else:
+            self._context = self._moving_context = self._exchange.next_context(self._context, after)
+
+    def _leave_out_resting(self, before: Particles, after: Particles) -> None:
         """Stop predicting scenes whose state no longer changes; all or none where a smaller batch would be compiled."""
         if self._emulator.training or not is_eager_cpu(after.position) or after.position.requires_grad:
             return
@@ -127,21 +150,29 @@ def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monit
 
 
 def stream_rollout(
-    emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None
+    emulator: Emulator,
+    particles: Particles,
+    frames: int,
+    monitor: Monitor | None = None,
+    prescribed: Prescribed | None = None,
 ) -> Iterator[Rollout]:
     """Predict `frames` frames of positions and evolving fields without gradients, yielding up to m as they are made.
+
+    With particles that enter and leave, and obstacles that move, as `prescribed`. Positions of particles that are not
+    there, which have left through an open axis or as prescribed, or are yet to enter, are NaN.
 
     Warns if the emulator is in training mode, in which constraints do not act.
 
     Raises:
         ConfigError: if `frames` is negative, or no whole number.
-        DataError: if the state or a weight is not finite, or a particle is outside of the domain.
+        DataError: if the state or a weight is not finite, a particle is outside of the domain, or what is prescribed
+            are other particles than the state's.
         RolloutStoppedError: if the monitor stops the rollout.
     """
     frames = check_whole("frames", frames, 0)
     warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
-    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames)
+    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames, prescribed)
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode
@@ -153,15 +184,27 @@ def stream_rollout(
         yield part
 
 
-def rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Tensor:
-    """(B, frames, N, D) positions in domain length, predicted without gradients; raises as `stream_rollout`."""
-    return predict_rollout(emulator, particles, frames, monitor).position
+def rollout(
+    emulator: Emulator,
+    particles: Particles,
+    frames: int,
+    monitor: Monitor | None = None,
+    prescribed: Prescribed | None = None,
+) -> Tensor:
+    """(B, frames, N, D) positions in domain length, predicted without gradients, as `stream_rollout`."""
+    return predict_rollout(emulator, particles, frames, monitor, prescribed).position
 
 
-def predict_rollout(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Rollout:
-    """Predict `frames` frames of positions and evolving fields without gradients; raises as `stream_rollout`."""
+def predict_rollout(
+    emulator: Emulator,
+    particles: Particles,
+    frames: int,
+    monitor: Monitor | None = None,
+    prescribed: Prescribed | None = None,
+) -> Rollout:
+    """Predict `frames` frames of positions and evolving fields without gradients, as `stream_rollout`."""
     batch, *rest = particles.position.shape
-    parts = list(stream_rollout(emulator, particles, frames, monitor)) if batch else []
+    parts = list(stream_rollout(emulator, particles, frames, monitor, prescribed)) if batch else []
     if parts:
         return Rollout.join(parts)
     none = particles.position.new_zeros(batch, frames, *rest)  # of no scene, or of no frame
@@ -174,16 +217,21 @@ def unroll_with_gradients(
     bundles: int,
     call: Call,
     state_after: Callable[[Bundle, Particles], Particles] = Bundle.state_after,
+    prescribed: Prescribed | None = None,
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle with gradients, each by a `call` such as `recomputed`.
 
-    The next bundle starts from the `state_after` a bundle, of what that started from.
+    The next bundle starts from the `state_after` a bundle, of what that started from, with what is `prescribed`.
+    Positions of particles that are not there are finite, and mean nothing.
     """
-    context = emulator.context(particles)
-    for _ in range(bundles):
+    exchange = Exchange(emulator, prescribed)
+    particles = exchange.start(particles)
+    context = exchange.first_context(particles)
+    for index in range(bundles):
         bundle = call(emulator, particles, context)
         yield bundle
-        particles = state_after(bundle, particles)
+        particles = exchange.after(state_after(bundle, particles), (index + 1) * emulator.frames)
+        context = exchange.next_context(context, particles)
 
 
 def recomputed(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:

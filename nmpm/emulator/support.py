@@ -3,7 +3,8 @@
 Below a cell, along the axis on which gravity is largest, there must be bearing cells down to the floor or to an
 obstacle, with gaps of fewer than `REACH` cells. A cell bears if it, or a cell beside it, is filled to `ENOUGH`: small
 overhangs are held up, drops under a ceiling are not. Without gravity, or with gravity along a periodic axis, where
-there is no floor, everything is held. All in cells; nothing is read back from the device.
+there is no floor, everything is held; along an open axis obstacles alone hold. All in cells; nothing is read back from
+the device.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def drops(gravity: Tensor, frames: int) -> Tensor:
 
 
 def floor_rows(scene: Scene, grid: Grid) -> tuple[tuple[int, int], ...]:
-    """For each axis, how many rows of cells at its lower and at its upper end are at least half beyond the bounds."""
+    """For each axis, how many rows of cells at its lower and at its upper end are at least half beyond the walls."""
     rows = []
     for (low, high), first, width, extent in zip(scene.bounds, grid.lower, grid.spacing, grid.shape, strict=True):
         beyond = (low - first) / width, extent - (high - first) / width
@@ -105,17 +106,20 @@ class Support:
     def _supported_along(self, axis: int, upwards: bool) -> Tensor:
         """(B, *S) bool, where gravity points to the lower end of an axis, or upwards."""
         bears = _from_floor(self._bearing(axis), axis, upwards)
-        base = torch.arange(bears.shape[-1], device=bears.device) < floor_rows(self.scene, self.grid)[axis][upwards]
+        has_floor = self.scene.confined[axis]
+        rows = floor_rows(self.scene, self.grid)[axis][upwards] if has_floor else 0
+        base = torch.arange(bears.shape[-1], device=bears.device) < rows
         if self.obstacle is not None:
             base = base | _from_floor(self.obstacle[:, 0] >= SURFACE, axis, upwards)
         bears = near = bears | base
         for distance in range(1, REACH):
             near = near | _shift(bears, distance, fill=1)
         gaps = (~near).int().cumsum(-1)  # in and below each cell; their number never falls on the way up
-        last = torch.where(base, gaps, 0)
+        bottom = 0 if has_floor else -1  # beyond the lower end of an open axis nothing bears
+        last = torch.where(base, gaps, bottom)
         if self.obstacle is not None:
-            last = _running_max(last)  # the number in the highest floor or obstacle cell so far
-        held = _shift(gaps, 1, fill=0) == _shift(last, 1, fill=0)
+            last = _running_max(last, bottom)  # the number in the highest floor or obstacle cell so far
+        held = _shift(gaps, 1, fill=0) == _shift(last, 1, fill=bottom)
         return (held.flip(-1) if upwards else held).movedim(-1, axis + 1)
 
     def _bearing(self, axis: int) -> Tensor:
@@ -144,10 +148,10 @@ def _shift(values: Tensor, by: int, fill: int) -> Tensor:
     return torch.cat([torch.full_like(values[..., :by], fill), values[..., :-by]], dim=-1)
 
 
-def _running_max(values: Tensor) -> Tensor:
-    """(..., n): the largest so far of counts (..., n); `torch.cummax` cannot be exported to ONNX."""
+def _running_max(values: Tensor, least: int) -> Tensor:
+    """(..., n): the largest so far of counts (..., n) from `least` on; `torch.cummax` cannot be exported to ONNX."""
     by = 1
     while by < values.shape[-1]:
-        values = torch.maximum(values, _shift(values, by, fill=0))
+        values = torch.maximum(values, _shift(values, by, fill=least))
         by *= 2
     return values

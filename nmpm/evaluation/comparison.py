@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
+from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.errors import ConfigError
 from nmpm.evaluation.figures import PREDICTORS
 from nmpm.metrics import MSE, FieldMSE, RolloutMetric
@@ -30,7 +32,7 @@ def free_fall(scene: Scene, particles: Particles, frames: int) -> Tensor:
     gravity = particles.gravity[:, None, None]
     path = start + velocity * step + gravity * (step * (step + 1) / 2)
     columns = [
-        path[..., axis] if scene.periodic[axis] else _stop_at_walls(path[..., axis], *scene.bounds[axis])
+        _stop_at_walls(path[..., axis], *scene.bounds[axis]) if scene.confined[axis] else path[..., axis]
         for axis in range(scene.dim)
     ]
     return torch.stack(columns, dim=-1)
@@ -55,16 +57,17 @@ class Comparison(nn.Module):
     Args:
         scene: Gives gravity and walls for the free fall.
         metrics: What to compute, an `MSE` among them; copied, so that one list serves several comparisons.
+        bundle: Frames that the model predicts at once: particles that enter count from the start of the next bundle on.
 
     Raises:
         ConfigError: if there is not exactly one `MSE`, by which checkpoints are chosen.
     """
 
-    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric]) -> None:
+    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric], bundle: int = 1) -> None:
         super().__init__()
         if sum(isinstance(metric, MSE) for metric in metrics) != 1:
             raise ConfigError("model.metrics needs nmpm.metrics.MSE once: the best checkpoint is chosen by it.")
-        self.scene = scene
+        self.scene, self.bundle = scene, bundle
         self.field_errors = FieldMSE(scene.evolving)
         self.metrics = nn.ModuleDict(
             {
@@ -91,16 +94,16 @@ class Comparison(nn.Module):
 
         Args:
             window: The trajectories, of T frames.
-            predicted: (B, T - 2, N, D) positions.
-            fields: (B, T - 2, N) evolving fields by name.
+            predicted: (B, T - 2, N, D) positions; of any value where a particle does not count.
+            fields: (B, T - 2, N) evolving fields by name, likewise.
         """
-        self.field_errors.update(window, fields or {})
-        frames = window.target.shape[1]
         rollouts = {
             "model": predicted,
-            "still": still(window.initial, frames),
-            "free_fall": free_fall(self.scene, window.initial, frames),
+            "still": predict_from_entries(still, window, self.bundle),
+            "free_fall": predict_from_entries(partial(free_fall, self.scene), window, self.bundle),
         }
+        window = with_predicted(window, self.bundle)
+        self.field_errors.update(window, fields or {})
         for kind, metrics in self._by_predictor():
             for metric in metrics:
                 metric.update(window, rollouts[kind])

@@ -44,10 +44,12 @@ class EarthMover(RolloutMetric):
     def update(self, window: Window, predicted: Tensor) -> None:
         frames = slice(min(self.every, predicted.shape[1]) - 1, None, self.every)
         on_cpu = (v.cpu() for v in (predicted[:, frames], window.target[:, frames], window.mask, window.material))
-        means = [
-            earth_mover_of_materials(ours[:, real], theirs[:, real], kinds[real])
-            for ours, theirs, real, kinds in zip(*on_cpu, strict=True)
-        ]
+        present, volume = (None if v is None else v.cpu() for v in (window.present, window.volume))
+        means = []
+        for scene, (ours, theirs, real, kinds) in enumerate(zip(*on_cpu, strict=True)):
+            there = None if present is None else present[scene, 2:][frames][:, real]
+            sizes = None if volume is None else volume[scene, real]
+            means.append(earth_mover_of_materials(ours[:, real], theirs[:, real], kinds[real], None, there, sizes))
         distances = torch.tensor(means, dtype=torch.float32, device=predicted.device)
         self.distances.append(distances)  # type: ignore[union-attr]  # (a list until gathered)
 
@@ -58,29 +60,41 @@ class EarthMover(RolloutMetric):
         return {"emd": dim_zero_cat(self.distances).cpu().double().mean().float()}
 
 
-def earth_mover(ours: Tensor, theirs: Tensor) -> float:
+def earth_mover(ours: Tensor, theirs: Tensor, there: Tensor | None = None, volume: Tensor | None = None) -> float:
     """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size, in their length.
 
-    NaN where a position is not finite, as no match is the best then. Memory grows with N²: 3 GB for 9,000 particles.
+    Of the particles that are `there` (T, N), all when left out, by their volumes (N,), equal when left out. NaN where a
+    position is not finite, as no match is the best then, or nobody is there. Memory grows with N²: 3 GB for 9,000
+    particles.
     """
-    if not bool((ours.isfinite() & theirs.isfinite()).all()):
+    counts = torch.ones(ours.shape[:2], dtype=torch.bool) if there is None else there
+    if not bool((ours.isfinite() & theirs.isfinite())[counts].all()):
         return math.nan
-    frames = zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), strict=True)
-    return float(np.mean([_match(cdist(left, right)) for left, right in frames]))
+    weight = np.ones(ours.shape[1]) if volume is None else volume.double().numpy()
+    frames = zip(ours.cpu().double().numpy(), theirs.cpu().double().numpy(), counts.numpy(), strict=True)
+    costs = [_match(cdist(left[real], right[real]), weight[real]) for left, right, real in frames if real.any()]
+    return float(np.mean(costs)) if costs else math.nan
 
 
-def _match(cost: NDArray[np.float64]) -> float:
-    """The least mean cost of matching rows to columns of an (N, N) matrix one to one."""
+def _match(cost: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    """The least mean cost of moving weights (N,) from the rows to the columns of an (N, N) matrix."""
     from ot import emd2  # takes half a second to import
 
-    equal = np.full(len(cost), 1 / len(cost))
-    least, log = emd2(equal, equal, cost, numItermax=_MOST_PIVOTS, log=True)
+    share = weight / weight.sum()
+    least, log = emd2(share, share, cost, numItermax=_MOST_PIVOTS, log=True)
     if log["warning"] is not None:
         raise NmpmError(f"The earth mover's distance of {len(cost)} particles was not found: {log['warning']}.")
     return float(least)
 
 
-def earth_mover_of_materials(ours: Tensor, theirs: Tensor, material: Tensor, most: int | None = None) -> float:
+def earth_mover_of_materials(
+    ours: Tensor,
+    theirs: Tensor,
+    material: Tensor,
+    most: int | None = None,
+    there: Tensor | None = None,
+    volume: Tensor | None = None,
+) -> float:
     """The mean over materials of `earth_mover` of two clouds (T, N, D), as particles of one never match another's.
 
     Args:
@@ -88,11 +102,17 @@ def earth_mover_of_materials(ours: Tensor, theirs: Tensor, material: Tensor, mos
         theirs: (T, N, D).
         material: (N,) index of each particle's material.
         most: Particles of a material that are compared, the same random ones in both clouds; all when left out.
+        there: (T, N) bool, which particles are compared in each frame; all when left out. A material of which there is
+            none in any frame does not count.
+        volume: (N,) of each particle, in any unit; all the same when left out.
     """
     means = []
     for kind in material.unique():
         indices = (material == kind).nonzero().squeeze(1)
         if most is not None and len(indices) > most:
             indices = indices[torch.randperm(len(indices), generator=torch.Generator().manual_seed(0))[:most]]
-        means.append(earth_mover(ours[:, indices], theirs[:, indices]))
-    return float(np.mean(means))
+        if there is not None and not bool(there[:, indices].any()):
+            continue
+        counts, sizes = None if there is None else there[:, indices], None if volume is None else volume[indices]
+        means.append(earth_mover(ours[:, indices], theirs[:, indices], counts, sizes))
+    return float(np.mean(means)) if means else math.nan

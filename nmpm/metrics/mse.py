@@ -18,6 +18,9 @@ from torchmetrics.utilities import dim_zero_cat
 from nmpm.metrics.base import RolloutMetric
 from nmpm.particles import Window
 
+_EMPTY = -1.0
+"""Stands for the error of a frame in which there is no particle."""
+
 
 def overall_error(errors: Mapping[str, Tensor], horizon: int) -> Tensor:
     """Geometric mean of the MSE at the horizons of at least so many frames and over the full rollout, ().
@@ -52,15 +55,24 @@ class MSE(RolloutMetric):
     def update(self, window: Window, predicted: Tensor) -> None:
         mask = window.mask
         # Each frame in the positions' precision, as not every device has float64; sums over frames follow in `curves`.
-        squared = (predicted - window.target).square().mean(-1) * mask.unsqueeze(1)
-        per_frame = squared.sum(-1) / mask.sum(-1, keepdim=True)
+        squared = (predicted - window.target).square().mean(-1)
+        if window.present is None:
+            per_frame = (squared * mask.unsqueeze(1)).sum(-1) / mask.sum(-1, keepdim=True)
+        else:
+            there = window.present[:, 2:] & mask.unsqueeze(1)
+            number = there.sum(-1)
+            per_frame = torch.where(there, squared, 0.0).sum(-1) / number.clamp(min=1)
+            per_frame = torch.where(number > 0, per_frame, _EMPTY)
         self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
         self.lengths.append(  # type: ignore[union-attr]  # (likewise)
             torch.full((len(per_frame),), per_frame.shape[1], device=per_frame.device)
         )
 
     def curves(self) -> list[Tensor]:
-        """One (T,) curve of squared error against frame for each trajectory, on the CPU."""
+        """One (T,) curve of squared error against frame for each trajectory, on the CPU; NaN in frames without any."""
+        return [torch.where(curve == _EMPTY, torch.nan, curve) for curve in self._stored()]
+
+    def _stored(self) -> list[Tensor]:
         if not len(self.lengths):
             return []
         lengths: list[int] = dim_zero_cat(self.lengths).tolist()
@@ -68,7 +80,7 @@ class MSE(RolloutMetric):
 
     def per_trajectory(self) -> list[dict[str, float]]:
         """MSE at each horizon that the trajectory reaches, and over the full rollout ("mse")."""
-        return [self._at_horizons(curve.double()) for curve in self.curves()]
+        return [self._at_horizons(curve.double()) for curve in self._stored()]
 
     def compute(self) -> dict[str, Tensor]:
         """Means over trajectories, by the names "mse@h" and "mse"."""
@@ -78,8 +90,9 @@ class MSE(RolloutMetric):
         return {name: torch.tensor(value, dtype=torch.float32) for name, value in means.items()}
 
     def _at_horizons(self, curve: Tensor) -> dict[str, float]:
-        row = {f"mse@{h}": float(curve[:h].mean()) for h in self.horizons if h <= len(curve)}
-        return row | {"mse": float(curve.mean())}
+        reached = {f"mse@{h}": curve[:h] for h in self.horizons if h <= len(curve)} | {"mse": curve}
+        with_particles = {name: values[values != _EMPTY] for name, values in reached.items()}
+        return {name: float(values.mean()) for name, values in with_particles.items() if len(values)}
 
 
 class FieldMSE(Metric):
@@ -112,8 +125,8 @@ class FieldMSE(Metric):
         for index, name in enumerate(self.names):
             if name in predicted and name in window.fields:
                 target = window.field_target(name)
-                self.squared[index] += _squared(predicted[name] - target, window.mask)
-                self.constant[index] += _squared(start[name].unsqueeze(1) - target, window.mask)
+                self.squared[index] += _squared(predicted[name] - target, window)
+                self.constant[index] += _squared(start[name].unsqueeze(1) - target, window)
                 self.trajectories[index] += len(target)
 
     def compute(self) -> dict[str, Tensor]:
@@ -126,7 +139,11 @@ class FieldMSE(Metric):
         return errors
 
 
-def _squared(difference: Tensor, mask: Tensor) -> Tensor:
-    """Sum over trajectories of the mean square of (B, T, N) differences over frames and real particles."""
-    squared = difference.square() * mask.unsqueeze(1)
-    return (squared.sum((1, 2)) / (mask.sum(1) * difference.shape[1])).sum()
+def _squared(difference: Tensor, window: Window) -> Tensor:
+    """Sum over trajectories of the mean square of (B, T, N) differences over frames and the particles there."""
+    if window.present is None:
+        squared = difference.square() * window.mask.unsqueeze(1)
+        return (squared.sum((1, 2)) / (window.mask.sum(1) * difference.shape[1])).sum()
+    there = window.present[:, 2:] & window.mask.unsqueeze(1)
+    squared = torch.where(there, difference.square(), 0.0)
+    return (squared.sum((1, 2)) / there.sum((1, 2)).clamp(min=1)).sum()

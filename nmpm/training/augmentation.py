@@ -60,8 +60,10 @@ def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
 def mirror_windows(window: Window, scene: Scene, axis: int, mirrored: Tensor) -> Window:
     """Replace those of B windows where `mirrored` (B,) is True by their mirror image about the domain's middle."""
     middle = sum(scene.domain[axis]) / 2
+    moved = window.obstacle_frames
     return dataclasses.replace(
         window,
+        obstacle_frames=None if moved is None else _reflect(moved, axis, middle, mirrored),
         frames=_reflect(window.frames, axis, middle, mirrored),
         obstacle=_reflect(window.obstacle, axis, middle, mirrored),
         gravity=_reflect(window.gravity, axis, 0.0, mirrored),

@@ -101,14 +101,14 @@ def mean_over_parts(
 
     Args:
         error: The mean over the particles of a part, with gradients.
-        mask: (B, N) bool, True for particles.
+        mask: (B, N) or (B, T, N) bool, True for particles.
         rows: From `split_rows`.
         weights: Those that require gradients get them.
         threads: How many threads work at most.
     """
     if len(rows) == 1:
         return error(rows[0])
-    shares = [mask[part].sum() / mask.sum() for part in rows]
+    shares = [mask[part].sum() / mask.sum().clamp(min=1) for part in rows]
     trained = [weight for weight in weights if weight.requires_grad]
     mean: Tensor = _MeanOverParts.apply(error, shares, rows, threads, *trained)  # type: ignore[no-untyped-call]  # (torch's stubs)
     return mean

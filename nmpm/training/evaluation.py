@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
 
-from nmpm.emulator import Emulator, Rollout, predict_rollout
+from nmpm.emulator import Emulator, Prescribed, Rollout, predict_rollout
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric, overall_error
 from nmpm.particles import Window
@@ -38,8 +38,9 @@ class EvaluatedModule(LightningModule):
         self.threads: int | None = None
         self.compiled = False
         reported = [MSE()] if metrics is None else list(metrics)
-        self.valid_errors = Comparison(emulator.scene, [metric for metric in reported if metric.cheap])
-        self.test_errors = Comparison(emulator.scene, reported)
+        cheap = [metric for metric in reported if metric.cheap]
+        self.valid_errors = Comparison(emulator.scene, cheap, emulator.frames)
+        self.test_errors = Comparison(emulator.scene, reported, emulator.frames)
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         predicted = self._predict(batch)
@@ -58,12 +59,15 @@ class EvaluatedModule(LightningModule):
 
     def _predict(self, batch: Window) -> Rollout:
         start, frames, rows = batch.initial, batch.target.shape[1], self.rows(batch)
+        prescribed = Prescribed.of(batch)
         if len(rows) == 1:
-            return predict_rollout(self.emulator, start, frames)
-        parts = on_threads(
-            lambda part: predict_rollout(self.emulator, start.scenes(part), frames), rows, self.threads or len(rows)
-        )
-        return Rollout.stack(parts)
+            return predict_rollout(self.emulator, start, frames, prescribed=prescribed)
+
+        def predict(part: slice) -> Rollout:
+            given = prescribed and prescribed.scenes(part)
+            return predict_rollout(self.emulator, start.scenes(part), frames, prescribed=given)
+
+        return Rollout.stack(on_threads(predict, rows, self.threads or len(rows)))
 
     def rows(self, batch: Window) -> list[slice]:
         """The rows of the parts of a batch that a thread each computes, on a CPU.

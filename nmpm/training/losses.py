@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nmpm.emulator.prescribed import predicted_particles
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
@@ -48,15 +49,36 @@ class TrainingError:
         """
         target = window.target[:, : predicted.shape[1]]
         check_comparable(predicted, target, frames)
-        last = slice(frames - 1, None, frames)
-        if self.power == 1:
+        last, there = slice(frames - 1, None, frames), None
+        if window.present is not None:
+            counts = counted(window, predicted.shape[1], frames)
+            squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1)
+            error, there = _tempered_mean(squared, counts, frames, self.power), counts[:, last]
+        elif self.power == 1:
             error = position_error(predicted, target, window.mask, grid)
         else:
             errors = position_errors(predicted, target, window.mask, grid, frames)
             error = tempered_error(errors, window.mask, self.power)
         if not self.density_weight:
             return error
-        return error + self.density_weight * density_error(predicted[:, last], target[:, last], window, scene, grid)
+        density = density_error(predicted[:, last], target[:, last], window, scene, grid, there)
+        return error + self.density_weight * density
+
+
+def counted(window: Window, frames: int, bundle: int) -> Tensor:
+    """The particles whose errors count: `mask` (B, N); where some enter or leave (B, frames, N), by bundles of frames."""
+    if window.present is None:
+        return window.mask
+    return predicted_particles(window.present, bundle)[:, :frames] & window.mask.unsqueeze(1)
+
+
+def _tempered_mean(values: Tensor, counts: Tensor, frames: int, power: float) -> Tensor:
+    """`tempered_error` of the means over bundles of (B, T, N) values where `counts` (B, T, N); 0 if none does."""
+    number = counts.sum(-1).unflatten(1, (-1, frames)).sum(-1)
+    errors = (values * counts).sum(-1).unflatten(1, (-1, frames)).sum(-1) / number.clamp(min=1)
+    tempered = errors if power == 1 else (errors + _FLOOR).pow(power)
+    mean: Tensor = (tempered * number).sum() / number.sum().clamp(min=1)
+    return mean
 
 
 def field_error(
@@ -75,7 +97,11 @@ def field_error(
     for name, values in predicted.items():
         if name in window.fields:
             target = window.field_target(name)[:, : values.shape[1]]
-            errors = _bundle_means(((values - target) / spread[name]).square(), window.mask, frames)
+            squared = ((values - target) / spread[name]).square()
+            if window.present is not None:
+                total = total + _tempered_mean(squared, counted(window, values.shape[1], frames), frames, power)
+                continue
+            errors = _bundle_means(squared, window.mask, frames)
             total = total + tempered_error(errors, window.mask, power)
     return total
 
@@ -128,7 +154,9 @@ def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:
     return ((errors + _FLOOR).pow(power) * count).sum() / (count.sum() * errors.shape[1])
 
 
-def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
+def density_error(
+    predicted: Tensor, target: Tensor, window: Window, scene: Scene, grid: Grid, there: Tensor | None = None
+) -> Tensor:
     """Squared error of each material's volume fraction φ on the grid, Σ (φ' - φ)² / (2 Σ φ) over frames and cells.
 
     Position errors hardly notice a liquid that slowly loses its volume, as neighbours swap places all the time; its
@@ -137,28 +165,34 @@ def density_error(predicted: Tensor, target: Tensor, window: Window, scene: Scen
     Args:
         predicted: (B, F, N, D) positions in domain length, at F frames.
         target: (B, F, N, D), likewise.
-        window: Says which particles are real and of which material.
+        window: Says which particles are real, of which material and size.
         scene: Gives the materials and a particle's volume.
         grid: Where densities are compared, by linear weights.
+        there: (B, F, N) bool, which particles count in each frame; the real ones when left out.
     """
     fraction = scene.particle_volume / grid.cell_volume
-    count = _kernel_counts if _kernels_support(predicted, target, grid) else _counts
     cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
-    predicted_fraction, true_fraction = (fraction * count(of, window, scene, grid) for of in cells)
-    particles = window.mask.sum() * predicted.shape[1]
-    return (predicted_fraction - true_fraction).square().sum() / (2 * fraction * particles)
+    if there is None and window.volume is None and _kernels_support(predicted, target, grid):
+        predicted_fraction, true_fraction = (fraction * _kernel_counts(of, window, scene, grid) for of in cells)
+        total = window.mask.sum() * predicted.shape[1]
+    else:
+        volume = _volumes(window, predicted.shape[1], scene, there).to(predicted.dtype)
+        sums = (Linear().p2g(volume.flatten(0, 1), of.flatten(0, 1), grid) for of in cells)
+        predicted_fraction, true_fraction = (fraction * each for each in sums)
+        total = volume.sum().clamp(min=torch.finfo(volume.dtype).tiny)
+    return (predicted_fraction - true_fraction).square().sum() / (2 * fraction * total)
 
 
-def _counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
-    """The number of particles of each material on the nodes by linear weights, (B F, M, *S), at cells (B, F, N, D)."""
+def _volumes(window: Window, frames: int, scene: Scene, there: Tensor | None) -> Tensor:
+    """(B, F, N, M) volume of each particle, as a multiple of the scene's, at its material; 0 if it does not count."""
     kinds = torch.arange(len(scene.materials), device=window.material.device)
-    member = (window.material.unsqueeze(-1) == kinds) & window.mask.unsqueeze(-1)
-    weight = member.to(cells.dtype).repeat_interleave(cells.shape[1], dim=0)
-    return Linear().p2g(weight, cells.flatten(0, 1), grid)
+    there = window.mask.unsqueeze(1).expand(-1, frames, -1) if there is None else there
+    member = (window.material.unsqueeze(-1) == kinds).unsqueeze(1) & there.unsqueeze(-1)
+    return member if window.volume is None else member * window.volume[:, None, :, None]
 
 
 def _kernel_counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
-    """The same, (B, F, size, M)."""
+    """The number of particles of each material on the nodes by linear weights, (B, F, size, M)."""
     from nmpm.training.kernels import Counts
 
     counts: Tensor = Counts.apply(cells, window.material, window.mask, grid, len(scene.materials))  # type: ignore[no-untyped-call]

@@ -19,7 +19,7 @@ from nmpm._support.collectives import global_mean
 from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Rollout
+from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Prescribed, Rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import compile_network
@@ -34,7 +34,7 @@ from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half,
 from nmpm.training.backpropagation import direct, discount_gradients, mean_over_parts
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.evaluation import EvaluatedModule
-from nmpm.training.losses import TrainingError, field_error
+from nmpm.training.losses import TrainingError, counted, field_error
 from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 
 CALIBRATION_BATCHES = 4
@@ -230,15 +230,17 @@ class EmulatorModule(EvaluatedModule):
         batch = mirror_half(batch, self.emulator.scene, self.mirror)
         particles, emulator = noisy_start(batch, self.position_noise), with_jitter(self.emulator, self.jitter)
         count, call = self.bundles(self._progress()), recomputed if self.recompute else direct
+        prescribed = Prescribed.of(batch)
 
         def mean_error(rows: slice) -> Tensor:
-            bundles = unroll_with_gradients(emulator, particles.scenes(rows), count, call, self._discounted_state)
+            start, given = particles.scenes(rows), prescribed and prescribed.scenes(rows)
+            bundles = unroll_with_gradients(emulator, start, count, call, self._discounted_state, given)
             predicted = Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles])
             return self._error(predicted, batch.scenes(rows))
 
-        rows = self.rows(batch)
-        error = mean_over_parts(mean_error, batch.mask, rows, self.parameters(), self.threads or len(rows))
-        loss, logged = global_mean(error, batch.mask.sum())
+        rows, counts = self.rows(batch), counted(batch, count * emulator.frames, emulator.frames)
+        error = mean_over_parts(mean_error, counts, rows, self.parameters(), self.threads or len(rows))
+        loss, logged = global_mean(error, counts.sum() if counts.dim() == 2 else counts.sum() / counts.shape[1])
         self.log("train/loss", logged)
         return loss
 

@@ -92,13 +92,15 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
     """The parameters; None if the emulator has parts without kernels, or lies too far from the origin for float32."""
     scene, grid, constraints = recipe.scene, recipe.grid, recipe.constraints
     transfer, decoder = type(recipe.transfer), type(recipe.decoder)
-    if scene.dim == 1 or scene.fields or not grid.resolves(torch.float32):
+    if scene.dim == 1 or scene.fields or scene.moving_obstacles or not grid.resolves(torch.float32):
+        return None
+    if "open" in scene.boundary and constraints.rest_speed:
         return None
     if transfer not in _P2G_NODES or decoder not in _DECODERS or constraints.bounds not in ("stop", "reflect"):
         return None
     spacing = np.array(grid.spacing)
     low, high = (np.array(scene.bounds).T - np.array(grid.lower)) / spacing
-    low, high = np.where(grid.periodic, -np.inf, low), np.where(grid.periodic, np.inf, high)
+    low, high = np.where(scene.confined, low, -np.inf), np.where(scene.confined, high, np.inf)
     ratio = spacing / spacing[0]
     is_square = np.all(np.abs(ratio - 1) < 1e-6)
     volumes = len(scene.materials) * scene.dim, len(scene.materials) * (scene.dim + 1)

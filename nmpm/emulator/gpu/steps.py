@@ -90,7 +90,7 @@ class TritonSteps(TensorSteps):
 
     def _weight(self, start: BundleStart) -> Tensor:
         """(B, N, 1) each particle's share of its scene's mass, 0 for padding."""
-        return mass_shares(self.emulator.scene, start.material, start.mask, start.cells.dtype)
+        return mass_shares(self.emulator.scene, start.material, start.volume, start.cells.dtype)
 
     def _share(self, context: RolloutContext) -> Tensor:
         """(B, 1, *S) share of each cell's room that is obstacle; of no use where there are no obstacles."""

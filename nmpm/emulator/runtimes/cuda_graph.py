@@ -87,6 +87,8 @@ class Triton(CudaGraph):
         rules = {
             f"{scene.dim} dimensions": scene.dim != 2,
             f"fields ({', '.join(scene.fields)})": bool(scene.fields),
+            "obstacles that move": scene.moving_obstacles,
+            "constraints.rest_speed beside open axes": "open" in scene.boundary and emulator.constraints.rest_speed > 0,
             f"the transfer {type(emulator.transfer).__name__}": type(emulator.transfer) is not Linear,
             f"constraints.bounds {bounds}": bounds != "stop",
             f"the decoder {type(emulator.decoder).__name__}, or for bounds so far off": parameters is None,
@@ -107,6 +109,10 @@ class Triton(CudaGraph):
 
         if emulator.kernel_parameters is None:
             raise ConfigError(self.unsupported_reason(emulator))
+        if particles.volume is not None:
+            raise ConfigError(
+                "The runtime triton has no kernels for particles of several sizes: use cuda-graph or eager."
+            )
         steps = TritonSteps(emulator, emulator.kernel_parameters)
         return steps.predict(particles.map(Tensor.contiguous), context)
 

@@ -124,7 +124,7 @@ def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, veloci
     gravity = start.gravity[:, None, None]
     lowest = lowest_potential(scene, start.gravity)[:, None, None]
     each = velocity.square().sum(-1) / 2 - lowest - (position * gravity).sum(-1)
-    share = mass_shares(scene, start.material, start.mask, each.dtype).squeeze(-1).unsqueeze(1)
+    share = mass_shares(scene, start.material, start.present_volume, each.dtype).squeeze(-1).unsqueeze(1)
     return (torch.where(start.mask.unsqueeze(1), each, 0.0) * share).sum(-1)
 
 
@@ -156,6 +156,6 @@ def filled_volume(emulator: Emulator, start: Particles, position: Tensor) -> Ten
     """
     grid, scene = emulator.grid, emulator.scene
     cells = grid.to_cells(torch.where(start.mask.unsqueeze(-1), position, position.new_tensor(scene.domain).mean(1)))
-    fraction = volume_fraction(scene, grid, emulator.transfer, start.mask, cells)
-    volume = start.mask.sum(-1) * (scene.particle_volume / grid.cell_volume)
+    fraction = volume_fraction(scene, grid, emulator.transfer, start.present_volume, cells)
+    volume = start.present_volume.sum(-1) * (scene.particle_volume / grid.cell_volume)
     return fraction.clamp(max=1.0).flatten(1).sum(1) / volume

@@ -47,7 +47,7 @@ class Part(nn.Module, ABC):
         emulator: On any device; it is left there.
 
     Raises:
-        ConfigError: if the emulator has fields beside motion.
+        ConfigError: if the emulator has fields beside motion, obstacles that move, or open axes.
     """
 
     inputs: tuple[Value, ...]
@@ -60,6 +60,9 @@ class Part(nn.Module, ABC):
                 f"The model has fields beside motion ({', '.join(emulator.scene.fields)}), which exported files do not"
                 " carry: use the model in Python, or train one without them (data.fields=[])."
             )
+        if not emulator.scene.is_closed:
+            what = "obstacles that move" if emulator.scene.moving_obstacles else "open axes"
+            raise ConfigError(f"The model's scenes have {what}, which exported files do not carry: use it in Python.")
         self.emulator = copy.deepcopy(emulator.with_runtime("eager")).cpu().float().eval().requires_grad_(False)
 
     @property
