@@ -66,7 +66,7 @@ class TrainingError:
 
 
 def counted(window: Window, frames: int, bundle: int) -> Tensor:
-    """The particles whose errors count: `mask` (B, N); where some enter or leave (B, frames, N), by bundles of frames."""
+    """The particles whose errors count: `mask` (B, N), or (B, frames, N) of bundles where some enter or leave."""
     if window.present is None:
         return window.mask
     return predicted_particles(window.present, bundle)[:, :frames] & window.mask.unsqueeze(1)
