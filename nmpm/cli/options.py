@@ -80,6 +80,15 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_out_option(parser: argparse.ArgumentParser, default: Path) -> None:
+    """Add the option `--out` of a file for one trajectory."""
+    from nmpm.data.write import SUFFIXES
+
+    parser.add_argument(
+        "--out", type=Path, default=default, help=f"file to write, by its suffix: {SUFFIXES} (default: {default})"
+    )
+
+
 def check_device(name: str) -> None:
     """Raise ConfigError if a `--device` cannot run rollouts, as torch's "meta", or this machine does not have it."""
     from nmpm._support.devices import DEVICES, find_device

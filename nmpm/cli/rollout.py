@@ -11,15 +11,16 @@ from nmpm.cli.options import (
     HelpFormatter,
     add_device_option,
     add_model_options,
+    add_out_option,
     add_runtime_option,
     add_threads_option,
     check_at_least,
     check_device,
     check_input,
-    check_output,
     choose_threads,
     gravity_option,
 )
+from nmpm.data.write import find_writer, write_trajectory
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ examples:
   nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
   nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
   nmpm rollout runs/goop/checkpoints/last.ckpt
+  nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs
 """
 
@@ -53,10 +55,10 @@ def run(words: list[str]) -> None:
     state = _thrown_state(model, options) if window is None else window.initial
     warn_of_start_outside(model.emulator, state.to(model.emulator.device))
     rollout = _predict(model, state, options.frames or recorded or FRAMES, options)
-    _write(model, state, rollout, window if recorded else None, options)
+    hint = _write(model, state, rollout, window if recorded else None, options)
     if window is not None and recorded:
         _print_errors(model, window, rollout, options)
-    sys.stdout.write(f"to look at them: nmpm view {options.out}\n")
+    sys.stdout.write(f"to look at them: {hint}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -70,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     add_device_option(parser)
     add_threads_option(parser)
     parser.add_argument("--frames", type=int, help="frames to predict (default: 400; with --data, the recording's)")
-    parser.add_argument("--out", type=Path, default=Path("out.h5"), help="file to write (default: out.h5)")
+    add_out_option(parser, Path("out.h5"))
     parser.add_argument(
         "--data", type=Path, help="start from a trajectory of this HDF5 file (native layout), and print the error"
     )
@@ -108,7 +110,7 @@ def _check(options: argparse.Namespace) -> None:
         check_input("--data", options.data)
         if options.gravity is not None:
             raise ConfigError("--gravity is of thrown blocks: leave it out beside --data, which has its own.")
-    check_output("--out", options.out)
+    find_writer("--out", options.out)
     check_device(options.device)
 
 
@@ -155,18 +157,20 @@ def _predict(model: Pretrained, state: Particles, frames: int, options: argparse
 
 def _write(
     model: Pretrained, state: Particles, rollout: Rollout, window: Window | None, options: argparse.Namespace
-) -> None:
-    """Write the start and the prediction, beside what was recorded, with what is needed to draw them."""
+) -> str:
+    """Write the start and the prediction, beside what was recorded; return how to look at them."""
+    from nmpm.data.described import described_metadata
     from nmpm.data.predictions import predicted_trajectory
-    from nmpm.data.write.vtkhdf import write_viewable
 
     origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
     truth = None if window is None else window.frames[:, : rollout.position.shape[1] + 2]
     start = state.to("cpu")
     predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields, truth=truth)
-    write_viewable(options.out, [predicted], model.scene.dt)
+    metadata = described_metadata(predicted.attributes, options.out, len(predicted.position))
+    file = write_trajectory(options.out, predicted, metadata)
     frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
-    sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {options.out}\n")
+    sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {file}\n")
+    return find_writer("--out", options.out).hint(file)
 
 
 def _print_errors(model: Pretrained, window: Window, rollout: Rollout, options: argparse.Namespace) -> None:

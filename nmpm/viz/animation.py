@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from nmpm._support.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours
 from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
-from nmpm.viz.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import PanelRenderer, format_time
 from nmpm.viz.trajectories import LabelledTrajectories

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 
 from nmpm.data.convert import Options
+from nmpm.data.described import read_description
 from nmpm.data.fields import read_fields
 from nmpm.data.format import TRUTH, Metadata, Split, Trajectory, read_metadata
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
 from nmpm.data.scene_inference import infer_scene
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.viz.trajectories import LabelledTrajectories, material_names
 
@@ -135,21 +135,13 @@ def _describe(
 ) -> tuple[Scene, dict[int, str], frozenset[int], str]:
     """Scene, names of type ids, ids that do not move, and label, from metadata.json or a prediction's attributes.
 
-    `nmpm.data.predictions` stores these attributes.
+    `nmpm.data.predictions` and `nmpm.data.described` store these attributes.
     """
     attributes, path = trajectory.attributes, split.path
     if "scene" not in attributes:
         metadata = read_metadata(path.parent, family)
         label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
         return infer_scene(path.parent, Options(family)), dict(metadata.particle_types), metadata.static_types, label
-    texts = {key: attributes.get(key) for key in ("scene", "particle_types")}
-    if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
-        raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
-    plain, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
-    static = np.asarray(attributes.get("static_types")).tolist()
-    keys = JsonKeys(path, {"particle_types": names, "static_types": static})
-    try:
-        scene = Scene.from_dict(plain)
-    except ConfigError as error:
-        raise DataError(f"{path}: {error}") from error
-    return scene, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids), "prediction"
+    scene, names, static = read_description(attributes, path)
+    label = "prediction" if "predicted by" in str(attributes.get("generator")) else "recorded"
+    return scene, names, static, label

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from nmpm._support.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours, vary_brightness
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
-from nmpm.viz.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours, vary_brightness
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3

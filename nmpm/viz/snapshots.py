@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from nmpm._support.colours import FAINT_TEXT, TEXT, Rgb, hex_code, material_colours
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
-from nmpm.viz.colours import FAINT_TEXT, TEXT, Rgb, hex_code, material_colours
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import PanelRenderer, format_time
 from nmpm.viz.trajectories import LabelledTrajectories

@@ -14,6 +14,7 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 
+from nmpm._support.colours import BACKGROUND, INTERIOR, WALL, material_colours
 from nmpm.cli import main
 from nmpm.data.format import Split, Trajectory, write_split
 from nmpm.errors import ConfigError, DataError
@@ -22,7 +23,6 @@ from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.viz import write_animation, write_snapshots
 from nmpm.viz.animation import FrameRenderer, GifPalette
-from nmpm.viz.colours import BACKGROUND, INTERIOR, WALL, material_colours
 from nmpm.viz.panel import PanelRenderer
 
 needs_ffmpeg = pytest.mark.skipif(

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nmpm._support.colours import FALLBACK_COLOURS, INTERIOR, OBSTACLE, material_colours, vary_brightness
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.viz import LabelledTrajectories, material_names
-from nmpm.viz.colours import FALLBACK_COLOURS, INTERIOR, OBSTACLE, material_colours, vary_brightness
 
 
 @pytest.mark.parametrize(

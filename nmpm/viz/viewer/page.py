@@ -17,9 +17,9 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm._support.colours import hex_code, material_colours, vary_brightness
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
-from nmpm.viz.colours import hex_code, material_colours, vary_brightness
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import particle_spacing
 from nmpm.viz.trajectories import Floats, LabelledTrajectories

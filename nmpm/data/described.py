@@ -1,0 +1,73 @@
+"""Trajectories that bring the facts of their scene along, as attributes, where no `metadata.json` is beside them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
+from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Scene
+
+
+def description(trajectory: Trajectory, metadata: Metadata, particle_volume: float) -> dict[str, Any]:
+    """The attributes `scene` and `particle_types`, in JSON, and `static_types`, of a trajectory of a dataset."""
+    types = np.unique(trajectory.particle_type).tolist()
+    scene = Scene(
+        bounds=metadata.bounds,
+        domain=metadata.domain or metadata.bounds,
+        dt=metadata.dt,
+        materials=tuple(dict.fromkeys(metadata.particle_types[i] for i in metadata.moving_types if i in types)),
+        particle_volume=particle_volume,
+        boundary=metadata.boundary,
+        gravity=metadata.gravity,
+        gravity_varies="gravity" in trajectory.attributes,
+        obstacles=bool(metadata.obstacle_types & set(types)),
+    )
+    return {
+        "scene": json.dumps(scene.to_dict()),
+        "particle_types": json.dumps({i: name for i, name in metadata.particle_types.items() if i in types}),
+        "static_types": np.array(sorted(metadata.static_types), dtype=np.int64),
+    }
+
+
+def read_description(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[int, str], frozenset[int]]:
+    """The scene, the names of the type ids, and the ids that do not move, of a trajectory with a description.
+
+    Raises:
+        DataError: naming the file, if an attribute is missing or wrong.
+    """
+    texts = {key: attributes.get(key) for key in ("scene", "particle_types")}
+    if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
+        raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
+    plain, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
+    static = np.asarray(attributes.get("static_types")).tolist()
+    keys = JsonKeys(path, {"particle_types": names, "static_types": static})
+    try:
+        scene = Scene.from_dict(plain)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from error
+    return scene, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids)
+
+
+def described_metadata(attributes: Mapping[str, Any], path: Path, frames: int) -> Metadata:
+    """The metadata of a dataset of trajectories with this description, of so many frames; see `read_description`."""
+    scene, names, static = read_description(attributes, path)
+    return Metadata(
+        bounds=scene.bounds,
+        dt=scene.dt,
+        dim=scene.dim,
+        sequence_length=frames - 1,
+        particle_types=names,
+        static_types=static,
+        boundary=scene.boundary,
+        domain=scene.domain,
+        gravity=scene.gravity,
+        particle_volume=scene.particle_volume,
+        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
+    )

@@ -1,0 +1,48 @@
+"""The interface of writers: a writer is one subclass of `TrajectoryWriter` in one file, listed in `WRITERS`."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from pathlib import Path
+from typing import ClassVar
+
+from nmpm._support.atomic import file_obstacle
+from nmpm.data.format import Metadata, Trajectory
+
+
+def no_step() -> None:
+    """Counts no frames."""
+
+
+class TrajectoryWriter(abc.ABC):
+    """Abstract writer of one trajectory into a file that other programs read, one subclass per form.
+
+    Attributes:
+        suffixes: Of the files' names, in lower case.
+        readers: Programs that open the file, in words.
+    """
+
+    suffixes: ClassVar[tuple[str, ...]]
+    readers: ClassVar[str]
+
+    @abc.abstractmethod
+    def write(
+        self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
+    ) -> Path:
+        """Writes a trajectory, whole or not at all, in place of a former file; `step` is called after each frame.
+
+        Returns:
+            The file that other programs are to open.
+
+        Raises:
+            DataError or OSError: if it cannot be written.
+        """
+
+    def obstacle(self, path: Path) -> str:
+        """Why nothing can be written to a path, in words; empty if it can."""
+        return file_obstacle(path)
+
+    def hint(self, path: Path) -> str:
+        """How to look at a written file."""
+        return f"open {path} in {self.readers}"

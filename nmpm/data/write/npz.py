@@ -1,0 +1,47 @@
+"""NumPy's archives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from nmpm._support.atomic import atomic_write
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.write.base import TrajectoryWriter, no_step
+from nmpm.data.write.frames import frame_times
+
+
+class Npz(TrajectoryWriter):
+    """`position` (T, N, D), `particle_type` (N,), `time` (T,), every field, and facts of the scene by their names."""
+
+    suffixes: ClassVar[tuple[str, ...]] = (".npz",)
+    readers: ClassVar[str] = "NumPy"
+
+    def write(
+        self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
+    ) -> Path:
+        facts: dict[str, Any] = {
+            "dt": metadata.dt,
+            "bounds": metadata.bounds,
+            "boundary": metadata.boundary,
+            "gravity": trajectory.attributes.get("gravity", metadata.gravity),
+            "particle_volume": metadata.particle_volume,
+            "static_types": sorted(metadata.static_types),
+            "type_ids": list(metadata.particle_types),
+            "type_names": list(metadata.particle_types.values()),
+        }
+        arrays = {
+            **{name: np.array(value) for name, value in facts.items() if value is not None},
+            **trajectory.fields,
+            "time": frame_times(trajectory, metadata),
+            "position": trajectory.position,
+            "particle_type": trajectory.particle_type,
+        }
+        with atomic_write(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        for _ in trajectory.position:
+            step()
+        return path

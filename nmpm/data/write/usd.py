@@ -1,0 +1,144 @@
+"""Universal Scene Description, as text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, ClassVar
+
+import numpy as np
+
+from nmpm._support.atomic import atomic_write
+from nmpm._support.colours import Rgb, material_colours
+from nmpm.data.format import TRUTH, Metadata, Trajectory
+from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.write.base import TrajectoryWriter, no_step
+from nmpm.data.write.frames import Frame, frame_times, frames, pad, particle_spacing
+
+
+class Usda(TrajectoryWriter):
+    """`UsdGeom.Points` for each type of particles, with positions, velocities and fields at a time code per frame.
+
+    `timeCodesPerSecond` is 1 / dt. Particles of static types have one position. A truth has points of its own.
+    """
+
+    suffixes: ClassVar[tuple[str, ...]] = (".usda",)
+    readers: ClassVar[str] = "Blender, Houdini, Omniverse"
+
+    def write(
+        self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
+    ) -> Path:
+        codes = frame_times(trajectory, metadata) / metadata.dt
+        with ExitStack() as stack:
+            clouds = _clouds(trajectory, metadata, stack)
+            for code, frame in zip(codes, frames(trajectory, metadata), strict=True):
+                for cloud in clouds:
+                    cloud.add(frame, code)
+                step()
+            with atomic_write(path) as part, part.open("w", encoding="utf-8") as file:
+                file.write(_head(codes, trajectory, metadata))
+                for cloud in clouds:
+                    file.writelines(cloud.lines())
+                file.write("}\n")
+        return path
+
+
+@dataclass
+class _Cloud:
+    """The points of one type. A file has their samples by attribute, here they come by frame."""
+
+    name: str
+    type_id: int
+    static: bool
+    colour: Rgb
+    width: float
+    stack: ExitStack  # closes the temporary files
+    truth: bool = False
+    samples: dict[str, IO[str]] = field(default_factory=dict)  # temporary files by declared attribute
+    ids: str = ""  # in the last frame
+
+    def add(self, frame: Frame, code: float) -> None:
+        """Adds the samples of a frame."""
+        if self.static and frame.number:
+            return
+        position = frame.fields[TRUTH] if self.truth else frame.position
+        part = (frame.particle_type == self.type_id) & ~np.isnan(position[:, 0])
+        if (ids := _list(frame.index[part])) != self.ids:
+            self.ids = ids
+            self._sample("int64[] ids", code, ids)
+        self._sample("point3f[] points", code, _list(position[part]))
+        if self.truth:
+            return
+        for name, values in frame.fields.items():
+            if name == "velocity":
+                self._sample("vector3f[] velocities", code, _list(values[part]))
+            elif name != TRUTH:
+                kind = "float[]" if values.ndim == 1 else "float3[]"
+                declared = f"{kind} primvars:{_identifier(name)}"
+                self._sample(declared, code, _list(values[part].astype(np.float32)))
+
+    def lines(self) -> Iterator[str]:
+        """The prim as text."""
+        red, green, blue = (level / 255 for level in self.colour)
+        yield f'\n    def Points "{self.name}"\n    {{\n'
+        yield f"        color3f[] primvars:displayColor = [({red:.3g}, {green:.3g}, {blue:.3g})]\n"
+        yield f'        float[] widths = [{self.width:.6g}] (interpolation = "constant")\n'
+        for declared, content in self.samples.items():
+            if "primvars:" in declared:
+                yield f'        {declared} (interpolation = "vertex")\n'
+            yield f"        {declared}.timeSamples = {{\n"
+            content.seek(0)
+            yield from content
+            yield "        }\n"
+        yield "    }\n"
+
+    def _sample(self, declared: str, code: float, values: str) -> None:
+        if declared not in self.samples:
+            part = TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 (the stack closes it)
+            self.samples[declared] = self.stack.enter_context(part)
+        self.samples[declared].write(f"            {code:.9g}: {values},\n")
+
+
+def _clouds(trajectory: Trajectory, metadata: Metadata, stack: ExitStack) -> list[_Cloud]:
+    types = np.unique(trajectory.particle_type).tolist()
+    names = {i: metadata.particle_types.get(i, f"type{i}") for i in types}
+    colours, width = material_colours(names.values()), particle_spacing(trajectory, metadata)
+    clouds = [
+        _Cloud(_identifier(name), i, i in metadata.static_types, colours[name], width, stack)
+        for i, name in names.items()
+    ]
+    truths = [
+        _Cloud(f"{TRUTH}_{cloud.name}", cloud.type_id, False, cloud.colour, width, stack, truth=True)
+        for cloud in clouds
+        if TRUTH in trajectory.fields and not cloud.static
+    ]
+    return clouds + truths
+
+
+def _head(codes: np.ndarray, trajectory: Trajectory, metadata: Metadata) -> str:
+    low, high = (pad(np.array([corner]))[0].tolist() for corner in np.array(metadata.bounds).T)
+    gravity = np.abs(trajectory_gravity(trajectory.attributes, metadata, "trajectory") or (0.0, 0.0, 1.0))
+    up = "Z" if metadata.dim == 3 and int(np.argmax(gravity)) == 2 else "Y"
+    rate = f"{1 / metadata.dt:.9g}"
+    return (
+        f'#usda 1.0\n(\n    defaultPrim = "particles"\n    upAxis = "{up}"\n    metersPerUnit = 1\n'
+        f"    timeCodesPerSecond = {rate}\n    framesPerSecond = {rate}\n"
+        f"    startTimeCode = {codes[0]:.9g}\n    endTimeCode = {codes[-1]:.9g}\n)\n\n"
+        f'def Xform "particles"\n{{\n    float3[] extentsHint = [{tuple(low)}, {tuple(high)}]\n'
+    )
+
+
+def _list(values: np.ndarray) -> str:
+    """Numbers (n,) or vectors (n, 3) in brackets; float32 are read back exactly."""
+    one = "%.9g" if values.dtype.kind == "f" else "%d"
+    pattern = one if values.ndim == 1 else f"({one}, {one}, {one})"
+    return "[" + ", ".join([pattern] * len(values)) % tuple(values.ravel().tolist()) + "]"
+
+
+def _identifier(name: str) -> str:
+    """A name of letters, digits and underscores that does not begin with a digit."""
+    return re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII)

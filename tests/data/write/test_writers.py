@@ -1,0 +1,166 @@
+"""Files are read back by the programs' own libraries."""
+
+import csv
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.write import WRITERS, find_writer
+from nmpm.data.write.frames import fields_left_out
+from nmpm.errors import ConfigError
+from nmpm.viz.files import read_labelled
+
+FRAMES, DT = 6, 0.25
+TYPES = np.array([5, 3, 5, 5])
+METADATA = Metadata(
+    bounds=((0, 1), (0, 2)), dt=DT, dim=2, sequence_length=FRAMES - 1, particle_types={5: "fresh water", 3: "wall"},
+    static_types=frozenset({3}), gravity=(0, -9.81), particle_volume=0.01, boundary=("periodic", "wall"),
+)  # fmt: skip
+
+
+def made(absent=False):
+    """Three drops that move right, by 0.2 a frame in a box of one; one wall particle."""
+    start = np.array([[0.1, 0.2], [0.5, 0.0], [0.3, 1.25], [1 / 3, 0.5]])
+    position = np.repeat(start[None], FRAMES, axis=0)
+    position[..., 0] += 0.2 * np.arange(FRAMES)[:, None] * (TYPES == 5)
+    position[..., 0] %= 1
+    truth = position[:-1] + 0.125
+    if absent:
+        position[:3, 3] = np.nan
+    heat = np.arange(FRAMES * 4, dtype=np.float32).reshape(FRAMES, 4)
+    fields = {"heat": heat, "share": np.arange(4.0), "truth": truth.astype(np.float32), "misfit": np.zeros(99)}
+    return Trajectory(position, TYPES, {}, fields)
+
+
+def write(path: Path, trajectory: Trajectory) -> Path:
+    return find_writer("--out", path).write(path, trajectory, METADATA)
+
+
+def there(trajectory, frame):
+    """(n, 2) positions of the particles that are there, and their indices."""
+    (index,) = np.nonzero(~np.isnan(trajectory.position[frame, :, 0]))
+    return trajectory.position[frame, index], index
+
+
+@pytest.fixture(params=[False, True], ids=["all there", "absent"])
+def trajectory(request):
+    return made(request.param)
+
+
+def test_vtk_reads_series(tmp_path, trajectory):
+    pyvista = pytest.importorskip("pyvista")
+    reader = pyvista.get_reader(write(tmp_path / "out.vtp", trajectory))
+    assert reader.path == str(tmp_path / "out.pvd")
+    assert reader.time_values == [DT * frame for frame in range(FRAMES)]
+    for frame in range(FRAMES):
+        reader.set_active_time_point(frame)
+        mesh, (position, index) = reader.read()[0], there(trajectory, frame)
+        np.testing.assert_array_equal(mesh.points, np.pad(position, ((0, 0), (0, 1))))
+        assert mesh.n_verts == len(index)
+        np.testing.assert_array_equal(mesh["id"], index)
+        np.testing.assert_array_equal(mesh["particle_type"], TYPES[index])
+        np.testing.assert_array_equal(mesh["heat"], trajectory.fields["heat"][frame, index])
+        np.testing.assert_allclose(mesh["velocity"][:, 0], 0.2 / DT * (TYPES[index] == 5), atol=1e-6)
+        if frame < FRAMES - 1:
+            np.testing.assert_array_equal(mesh["truth"][:, :2], trajectory.fields["truth"][frame, index])
+
+
+def test_usd_reads_points_by_material(tmp_path, trajectory):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    stage = usd.Stage.Open(str(write(tmp_path / "out.usda", trajectory)))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (4, 0, FRAMES - 1)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    prims = {prim.GetName(): UsdGeom.Points(prim) for prim in stage.GetDefaultPrim().GetChildren()}
+    assert list(prims) == ["wall", "fresh_water", "truth_fresh_water"]
+    assert prims["wall"].GetPointsAttr().GetNumTimeSamples() == 1
+    water = prims["fresh_water"]
+    assert list(water.GetWidthsAttr().Get()) == pytest.approx([0.1])
+    assert len(water.GetDisplayColorAttr().Get()) == 1
+    for frame in range(FRAMES):
+        position, index = there(trajectory, frame)
+        water_of = TYPES[index] == 5
+        points = np.array(water.GetPointsAttr().Get(frame))
+        np.testing.assert_array_equal(points, np.pad(position[water_of], ((0, 0), (0, 1))))
+        assert list(water.GetIdsAttr().Get(frame)) == index[water_of].tolist()
+        assert np.array(water.GetVelocitiesAttr().Get(frame))[:, 0] == pytest.approx(0.2 / DT)
+        heat = water.GetPrim().GetAttribute("primvars:heat").Get(frame)
+        assert list(heat) == trajectory.fields["heat"][frame, index[water_of]].tolist()
+    position, index = there(trajectory, 2)
+    truth = np.array(prims["truth_fresh_water"].GetPointsAttr().Get(2))
+    np.testing.assert_array_equal(truth[:, :2], trajectory.fields["truth"][2, index[TYPES[index] == 5]])
+
+
+def test_ase_reads_lammps_dumps(tmp_path, trajectory):
+    io = pytest.importorskip("ase.io")
+    images = io.read(write(tmp_path / "out.lammpstrj", trajectory), index=":", format="lammps-dump-text")
+    assert len(images) == FRAMES
+    for frame, image in enumerate(images):
+        position, index = there(trajectory, frame)
+        np.testing.assert_allclose(image.positions[:, :2], position, rtol=0, atol=1e-7)
+        assert image.numbers.tolist() == TYPES[index].tolist()
+        assert image.pbc.tolist() == [True, False, True]
+
+
+def test_numpy_reads_archives(tmp_path, trajectory):
+    with np.load(write(tmp_path / "out.npz", trajectory), allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(arrays["position"], trajectory.position)
+        np.testing.assert_array_equal(arrays["particle_type"], TYPES)
+        np.testing.assert_array_equal(arrays["time"], DT * np.arange(FRAMES))
+        np.testing.assert_array_equal(arrays["misfit"], np.zeros(99))
+        assert dict(zip(arrays["type_ids"], arrays["type_names"], strict=True)) == METADATA.particle_types
+
+
+def test_csv_reads_rows(tmp_path, trajectory):
+    with write(tmp_path / "out.csv", trajectory).open() as file:
+        table = list(csv.DictReader(file))
+    assert list(table[0])[:6] == ["frame", "time", "id", "type", "x", "y"]
+    for frame in range(FRAMES):
+        part, (position, index) = [row for row in table if int(row["frame"]) == frame], there(trajectory, frame)
+        assert [int(row["id"]) for row in part] == index.tolist()
+        assert [int(row["type"]) for row in part] == TYPES[index].tolist()
+        np.testing.assert_array_equal(np.float32([[row["x"], row["y"]] for row in part]), position)
+        assert [float(row["share"]) for row in part] == index.tolist()
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".vtkhdf"])
+def test_native_files_bring_their_scene_along(tmp_path, suffix, trajectory):
+    split = Split(write(tmp_path / f"out{suffix}", trajectory))
+    np.testing.assert_array_equal(split.read(0).position, trajectory.position)
+    assert ("velocity" in split.fields(0)) == (suffix == ".vtkhdf")
+    if not np.isnan(trajectory.position).any():
+        shown = read_labelled(split)
+        assert (list(shown.positions), shown.dt, shown.materials) == (["recorded"], DT, ("fresh water",))
+
+
+def test_fields_that_frames_cannot_have_are_named():
+    assert fields_left_out(made()) == ["misfit"]
+
+
+@pytest.mark.parametrize("suffix", [suffix for writer in WRITERS for suffix in writer.suffixes])
+def test_writing_again_gives_the_same_bytes_and_leaves_nothing_beside(tmp_path, suffix):
+    """And replaces what was there."""
+    path, contents = tmp_path / f"out{suffix}", []
+    for _ in range(2):
+        write(path, made())
+        contents.append({file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()})
+        time.sleep(1.1 if suffix in (".h5", ".npz") else 0)
+    assert contents[0] == contents[1]
+    assert {file.name for file in tmp_path.iterdir()} in ({path.name}, {"out", "out.pvd"})
+
+
+def test_what_cannot_be_written_is_refused_first(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/thesis.tex").touch()
+    for name, message in (
+        ("out.xyz", r"--out .*out.xyz: nothing is written by that suffix; there are .h5, .vtkhdf, .vtp, .usda"),
+        ("out", "nothing is written by that suffix"),
+        ("out.vtp", "its frames would replace .*out, which is not a folder of .vtp files"),
+        ("missing/out.csv", "does not exist; create it first"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            find_writer("--out", tmp_path / name)
