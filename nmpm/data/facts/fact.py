@@ -29,6 +29,15 @@ class Fact(Generic[Value]):
 
 
 @dataclass(frozen=True)
+class Unmoving:
+    """Particles of a moving type that never move in a trajectory where others do."""
+
+    trajectory: int
+    particle: int  # the first of them
+    count: int
+
+
+@dataclass(frozen=True)
 class Facts:
     """Facts about a dataset, named as the fields of `Metadata`; lengths and times in the file's units."""
 
@@ -41,6 +50,8 @@ class Facts:
     prescribed_types: Fact[frozenset[int]]
     particle_volume: Fact[float | None]  # None where it is not known
     sequence_length: Fact[int]
+    unmoving: tuple[Unmoving, ...] = ()  # particles of materials that never move where others do
+    walls: tuple[tuple[bool, bool], ...] = ()  # per axis, whether particles met a wall at the lower and upper end
 
     def complete(self, metadata: Metadata, unknown: Collection[str]) -> Metadata:
         """The metadata with the `unknown` fields replaced by these facts, and notes on them under the key `found`.

@@ -2,84 +2,153 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, find_axes
 from nmpm.data.facts.fact import Fact, Facts
-from nmpm.data.format import Split, Trajectory
+from nmpm.data.facts.free_fall import Track, find_gravity
+from nmpm.data.facts.obstacles import TypeMotion, name_types, prescribed_fact
+from nmpm.data.facts.openings import Openings
+from nmpm.data.facts.periodic import unwrap
+from nmpm.data.facts.sample import Samples
+from nmpm.data.facts.timing import TimeSteps
+from nmpm.data.facts.volume import find_particle_volume
+from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.statistics import Extent
 from nmpm.errors import DataError
-from nmpm.scene import Boundary
 
 _SAMPLE_BYTES = 2**27
-_MARGIN = 0.01  # of the extent
 
 
 class FactFinder:
-    """Finds the facts about a dataset in its trajectories.
+    """Finds the facts about a dataset in its trajectories, in bounded memory.
 
     Args:
         dim: Number of space dimensions.
+        dt: Time between frames, where it is known; else it is found.
+        obstacles: Types that are known to be obstacles, beside those that are found.
     """
 
-    def __init__(self, dim: int) -> None:
-        self.dim = dim
-        self._lower, self._upper = np.full(dim, np.inf), np.full(dim, -np.inf)
-        self._types: set[int] = set()
-        self._frames = 0
-        self._steps: list[float] = []
+    def __init__(self, dim: int, dt: float | None = None, obstacles: frozenset[int] = frozenset()) -> None:
+        self.dim, self._dt, self._obstacles = dim, dt, obstacles
+        self._extents: dict[int, Extent] = {}  # by type
+        self._motion, self._samples, self._times = TypeMotion(), Samples(), TimeSteps()
+        self._frames: set[int] = set()
 
     def add(self, trajectory: Trajectory) -> None:
         """Adds a trajectory."""
-        position = trajectory.position.reshape(-1, self.dim)
-        position = position[np.isfinite(position).all(axis=1)]
-        if len(position):
-            self._lower = np.minimum(self._lower, position.min(0))
-            self._upper = np.maximum(self._upper, position.max(0))
-        self._types.update(np.unique(trajectory.particle_type).tolist())
-        self._frames = max(self._frames, len(trajectory.position))
-        time = trajectory.fields.get("time")
-        if time is not None and len(time) > 1:
-            self._steps.append(float(np.median(np.diff(time))))
+        position, types = trajectory.position, trajectory.particle_type
+        self._frames.add(len(position))
+        self._times.add(trajectory.fields.get("time"))
+        low, high = np.fmin.reduce(position, axis=0), np.fmax.reduce(position, axis=0)
+        present = np.isfinite(low).all(axis=1)
+        if not present.any():
+            return
+        for kind in np.unique(types[present]).tolist():
+            extent = self._extents.setdefault(kind, Extent(self.dim))
+            extent.add(np.stack([low, high])[:, types == kind])
+        reach = (high - low).max(axis=1).astype(np.float64)
+        seen_once = np.isfinite(position[..., 0]).sum(axis=0) < 2
+        reach[seen_once] = np.nan
+        self._motion.add(types[present], reach[present], mean_spacing(low[present], high[present]))
+        self._samples.add(trajectory)
 
     def facts(self) -> Facts:
         """The facts; raises a DataError if no particle was ever there."""
-        if not np.isfinite(self._lower).all():
+        if not self._extents:
             raise DataError("no trajectory has a particle, so nothing can be found about them.")
-        size = float((self._upper - self._lower).max()) or 1.0
-        wall: Boundary = "wall"
-        bounds = tuple(
-            (float(low) - _MARGIN * size, float(high) + _MARGIN * size)
-            for low, high in zip(self._lower, self._upper, strict=True)
-        )
+        types, static = frozenset(self._extents), self._motion.static_fact()
+        moving = types - static.value - self._obstacles or types - static.value
+        volume = find_particle_volume(self._samples, moving)
+        prescribed = prescribed_fact(self._paths_by_type(moving), self._spacing(volume))
+        materials = moving - prescribed.value
+        if prescribed.value:
+            volume = find_particle_volume(self._samples, materials)
+        spacing, dt = self._spacing(volume), self._times.fact(tuple(self._samples))
+        axes, openings = self._axes(materials, spacing)
         return Facts(
-            bounds=Fact(bounds, "the extent of the positions and a margin of 1%.", "guessed"),
-            boundary=Fact((wall,) * self.dim, "nothing else was looked for.", "guessed"),
-            dt=self._dt(),
-            gravity=Fact(None, "not looked for.", "guessed"),
-            particle_types=Fact(name_types(self._types), "by their ids.", "guessed"),
-            static_types=Fact(frozenset(), "not looked for.", "guessed"),
-            prescribed_types=Fact(frozenset(), "not looked for.", "guessed"),
-            particle_volume=Fact(None, "not looked for.", "guessed"),
-            sequence_length=Fact(self._frames - 1, f"trajectories have up to {self._frames} frames.", "measured"),
+            bounds=bounds_fact(axes, spacing),
+            boundary=boundary_fact(axes, openings),
+            dt=dt,
+            gravity=self._gravity(axes, materials, spacing, self._dt or dt.value),
+            particle_types=self._names(static.value, prescribed.value),
+            static_types=static,
+            prescribed_types=prescribed,
+            particle_volume=volume,
+            sequence_length=self._length(),
+            unmoving=self._motion.unmoving(materials),
+            walls=tuple((axis.lower is not None, axis.upper is not None) for axis in axes),
         )
 
-    def _dt(self) -> Fact[float]:
-        if self._steps:
-            return Fact(float(np.median(self._steps)), "the median step of the recorded times.", "measured")
-        return Fact(1.0, "no times are recorded, so the unit of time is the frame.", "guessed")
+    def _paths_by_type(self, types: frozenset[int]) -> dict[int, list[np.ndarray]]:
+        paths = {kind: [sample.of(frozenset({kind})) for sample in self._samples] for kind in types}
+        return {kind: [each for each in positions if each.shape[1]] for kind, positions in paths.items()}
+
+    def _spacing(self, volume: Fact[float | None]) -> float:
+        """Typical distance of neighbours; where it is not known, a 64th of the longest side."""
+        if volume.value:
+            return math.pow(volume.value, 1 / self.dim)
+        low, high = self._extent(frozenset(self._extents))
+        return float(np.max(high - low)) / 64 or 1.0
+
+    def _extent(self, types: frozenset[int]) -> Ends:
+        """Lower and upper ends (D,) of all positions of some types."""
+        extents = [extent for kind, extent in self._extents.items() if kind in types]
+        lower, upper = (np.stack([getattr(each, side) for each in extents]) for side in ("lower", "upper"))
+        return lower.min(axis=0), upper.max(axis=0)
+
+    def _axes(self, materials: frozenset[int], spacing: float) -> tuple[tuple[Axis, ...], Openings]:
+        positions = [sample.of(materials) for sample in self._samples]
+        solid = frozenset(self._extents) - materials
+        beyond = self._extent(solid) if solid else None
+        return find_axes([each for each in positions if each.shape[1]], self._extent(materials), beyond, spacing)
+
+    def _gravity(
+        self, axes: tuple[Axis, ...], materials: frozenset[int], spacing: float, dt: float
+    ) -> Fact[tuple[float, ...] | None]:
+        periods = np.array([axis.period.length if axis.period else 0.0 for axis in axes])
+        tracks = [
+            Track(unwrap(sample.of(materials), periods), sample.times(dt))
+            for sample in self._samples
+            if np.isin(sample.types, list(materials)).any()
+        ]
+        closed = bool((periods > 0).all()) and materials == frozenset(self._extents)
+        return find_gravity(tracks, spacing, dt, closed)
+
+    def _names(self, static: frozenset[int], prescribed: frozenset[int]) -> Fact[dict[int, str]]:
+        names = name_types(self._extents, static, prescribed)
+        count = self._motion.count
+        rare = [f"{kind} in {number}" for kind, number in self._motion.types.items() if number < count]
+        how = f"by their ids{f'; of {count} trajectories type ' if rare else ''}{', '.join(rare)}."
+        return Fact(names, how, "guessed")
+
+    def _length(self) -> Fact[int]:
+        few, many = min(self._frames), max(self._frames)
+        how = f"trajectories have {many if few == many else f'{few} to {many}'} frames."
+        return Fact(many - 1, how, "measured")
 
 
-def name_types(types: set[int]) -> dict[int, str]:
-    """Names of type ids: `particles` if there is one, else `type1`, `type2`, … by their ids."""
-    return {i: "particles" if len(types) == 1 else f"type{i}" for i in sorted(types)}
+def mean_spacing(low: np.ndarray, high: np.ndarray) -> float:
+    """Edge of a cube with an equal part of the box around paths, from their lower and upper ends (N, D)."""
+    sides = high.max(axis=0) - low.min(axis=0)
+    longest = float(sides.max()) or 1.0
+    return longest * math.pow(float(np.prod(np.maximum(sides / longest, 1e-3))) / len(low), 1 / len(sides))
 
 
-def find_facts(split: Split) -> Facts:
+def find_facts(split: Split, metadata: Metadata | None = None) -> Facts:
     """The facts in up to 128 MiB of positions of a split, in evenly spaced trajectories.
+
+    Args:
+        split: The trajectories.
+        metadata: States the time between frames, for gravity, and which types are obstacles; all else is found.
 
     Raises:
         DataError: if a trajectory cannot be read, or no particle is ever there.
     """
-    finder = FactFinder(split.dim)
+    known = (metadata.dt, metadata.obstacle_types) if metadata else (None, frozenset[int]())
+    finder = FactFinder(split.dim, *known)
     for index in split.sample(_SAMPLE_BYTES):
         finder.add(split.read_with_fields(index))
     return finder.facts()

@@ -1,0 +1,183 @@
+"""Gravity, from particles in free flight.
+
+A particle that touches nothing follows a parabola. Gravity is the acceleration that most particles share in first
+frames, in one trajectory after another. The mean acceleration of all particles is compared with it: forces between
+particles cancel in the mean, so that it equals gravity as long as no particle touches a wall.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nmpm.data.facts.fact import Fact, Sure
+from nmpm.data.facts.parabolas import AGREE, Flight, fit_parabolas, join, shared_acceleration
+
+_FRAMES = (8, 4)  # of a parabola
+_LONG = 32  # frames in which a flight must be straight
+_SHARE = 0.2  # of the particles that move, that must be in free flight
+_MEAN_AGREE = 0.05  # of gravity
+_LATER, _LATER_FRAMES, _LATER_SHARE = 24, 5, 0.05  # parabolas over a whole trajectory, their frames, share that agrees
+_EXACT = 0.01  # of gravity: smaller components are none
+_ROUNDED = 5e-4  # of gravity
+_BALANCED = 1e-3  # of single accelerations: a smaller mean is none, where only particles push each other
+
+
+@dataclass(frozen=True)
+class Track:
+    """Moving particles of a trajectory from its first frame on, in length and frames."""
+
+    position: np.ndarray  # (F, N, D), without jumps along periodic axes; NaN where absent
+    time: np.ndarray  # (F,)
+
+    def flight(self, start: int, frames: int, spacing: float) -> Flight | None:
+        """The acceleration that particles share over some frames."""
+        stop = start + frames
+        if len(self.position) < stop:
+            return None
+        return shared_acceleration(fit_parabolas(self.position[start:stop], self.time[start:stop]), spacing)
+
+
+def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: bool) -> Fact[tuple[float, ...] | None]:
+    """Gravity in length per time², or None where trajectories do not show it.
+
+    Args:
+        tracks: Of some trajectories.
+        spacing: Typical distance of neighbours.
+        dt: Time between frames.
+        closed: Whether all axes are periodic and there are no obstacles, so that only gravity changes momentum.
+    """
+    number = len(tracks)
+    flights = [flight for flight in (_first_flight(track, spacing) for track in tracks) if flight is not None]
+    free = [flight for flight in flights if flight.share >= _SHARE]
+    straight = [flight for flight in free if flight.straight]
+    if straight and 2 * len(straight) >= len(free):
+        return _no_gravity(straight, number, spacing, dt)
+    if alike := _agreeing([flight.acceleration for flight in free], AGREE):
+        return _from_flights([free[index] for index in alike], number, dt)
+    if len(free) >= 3 and 2 * len(free) >= number:
+        return _differing(free, number, dt)
+    means = [flight.mean for flight in flights]
+    if len(means) >= 3 and len(_agreeing(means, _MEAN_AGREE)) == len(means):
+        how = f"the mean acceleration of all particles in first frames, in {len(means)} of {number} trajectories"
+        return _gravity(means, dt, how, "likely")
+    later = [flight for flight in (_later_flight(track, spacing) for track in tracks) if flight is not None]
+    alike = _agreeing([flight.acceleration for flight in later], AGREE)
+    if len(alike) >= 2:
+        how = f"particles in flight at any time, in {len(alike)} of {number} trajectories"
+        return _gravity([later[index].acceleration for index in alike], dt, how, "likely")
+    if closed and (momentum := _from_momentum(tracks, dt)):
+        return momentum
+    return Fact(None, f"{_why_not(tracks, flights, spacing)}.", "guessed")
+
+
+def _first_flight(track: Track, spacing: float) -> Flight | None:
+    """The flight in first frames: over many of them where it is straight, over few where few agree."""
+    flights = [track.flight(0, frames, spacing) for frames in _FRAMES]
+    best = max((flight for flight in flights if flight), key=lambda flight: flight.share > _SHARE, default=None)
+    if best is not None and best.straight:
+        longer = track.flight(0, _LONG, spacing)
+        return longer if longer is not None and longer.share >= _SHARE else best
+    return best
+
+
+def _later_flight(track: Track, spacing: float) -> Flight | None:
+    """The acceleration that particles share at any time, among those that are clearly accelerated."""
+    starts = np.unique(np.linspace(0, len(track.position) - _LATER_FRAMES, _LATER).astype(int))
+    fits = [
+        fit_parabolas(track.position[at : at + _LATER_FRAMES], track.time[at : at + _LATER_FRAMES])
+        for at in starts
+        if at >= 0
+    ]
+    if not fits:
+        return None
+    every = join(fits)
+    size = np.linalg.norm(every.acceleration, axis=1)
+    flight = shared_acceleration(every.select(every.error < AGREE / 2 * size), spacing)
+    return flight if flight is not None and not flight.straight and flight.share > _LATER_SHARE else None
+
+
+def _agreeing(vectors: Sequence[np.ndarray], tolerance: float) -> list[int]:
+    """Indices of the vectors that agree with the median of all, if they are half of them or more."""
+    if not vectors:
+        return []
+    median = np.median(vectors, axis=0)
+    agree = np.linalg.norm(np.stack(vectors) - median, axis=1) <= tolerance * np.linalg.norm(median)
+    return np.flatnonzero(agree).tolist() if 2 * agree.sum() >= len(vectors) else []
+
+
+def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[float, ...] | None]:
+    vectors = [flight.acceleration for flight in flights]
+    share = float(np.median([flight.share for flight in flights]))
+    size = float(np.linalg.norm(np.median(vectors, axis=0)))
+    means = sum(bool(np.linalg.norm(flight.mean - flight.acceleration) < AGREE * size) for flight in flights)
+    how = (
+        f"free flight of {share:.0%} of the particles in first frames, in {len(flights)} of {number} trajectories; the"
+        f" mean acceleration of all particles agrees in {means}"
+    )
+    return _gravity(vectors, dt, how, "measured" if len(flights) > 1 or means else "likely")
+
+
+def _gravity(vectors: Sequence[np.ndarray], dt: float, how: str, sure: Sure) -> Fact[tuple[float, ...] | None]:
+    """Their median, rounded, in length per time²."""
+    centre = np.median(vectors, axis=0)
+    size = float(np.linalg.norm(centre))
+    spread = max(float(np.linalg.norm(vector - centre)) for vector in vectors) / size
+    digits = -math.floor(math.log10(max(spread / math.sqrt(len(vectors)), _ROUNDED) * size / dt**2))
+    value = tuple(
+        round(float(part) / dt**2, digits) + 0.0 if abs(part) > max(_EXACT, spread) * size else 0.0 for part in centre
+    )
+    return Fact(value, f"{how}; trajectories agree to {max(spread, 1e-3):.1%}.", sure)
+
+
+def _no_gravity(flights: Sequence[Flight], number: int, spacing: float, dt: float) -> Fact[tuple[float, ...] | None]:
+    """No gravity, where straight flights go along all axes."""
+    travelled = np.max([flight.travelled for flight in flights], axis=0)
+    count = f"in {len(flights)} of {number} trajectories"
+    if not (travelled > spacing / 10).all():
+        names = "".join("xyz"[axis] for axis in np.flatnonzero(travelled > spacing / 10))
+        return Fact(None, f"particles move straight, but only along {names}, {count}.", "guessed")
+    least = max(float(np.linalg.norm(flight.acceleration)) + 3 * flight.error for flight in flights) / dt**2
+    how = f"particles fly straight {count}; gravity would be less than {least:.2g}."
+    return Fact((0.0,) * len(travelled), how, "measured" if len(flights) > 1 else "likely")
+
+
+def _differing(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[float, ...] | None]:
+    few = "; ".join(_text(flight.acceleration / dt**2) for flight in flights[:3])
+    how = f"it differs: free flight in {len(flights)} of {number} trajectories shows {few} …"
+    return Fact(None, f"{how}; state it in each trajectory's attribute `gravity`.", "measured")
+
+
+def _from_momentum(tracks: Sequence[Track], dt: float) -> Fact[tuple[float, ...] | None] | None:
+    """Gravity from the mean acceleration of all particles; None where it is not steady."""
+    second = [np.diff(track.position, 2, axis=0) for track in tracks if len(track.position) > 2]
+    if not second:
+        return None
+    single = math.sqrt(float(np.nanmean([np.nanmean(each**2) for each in second])))
+    means = [np.nanmean(each, axis=(0, 1)) for each in second]
+    if all(np.linalg.norm(mean) < _BALANCED * single for mean in means):
+        how = "all axes are periodic, and the mean acceleration is below 0.1% of single particles'."
+        return Fact((0.0,) * len(means[0]), how, "measured")
+    if len(means) > 1 and len(_agreeing(means, _MEAN_AGREE)) == len(means):
+        return _gravity(means, dt, "all axes are periodic; the mean acceleration of all particles", "likely")
+    return None
+
+
+def _why_not(tracks: Sequence[Track], flights: Sequence[Flight], spacing: float) -> str:
+    moved = [
+        float(np.nanmedian(np.linalg.norm(track.position[:8] - track.position[0], axis=2).max(axis=0)))
+        for track in tracks
+        if np.isfinite(track.position[0]).any()
+    ]
+    if moved and np.median(moved) < spacing / 50:
+        return "most particles are at rest in first frames"
+    if not flights:
+        return "paths in first frames are no parabolas: they are noisy, or particles push each other"
+    return "too few particles share an acceleration in first frames: they push each other, or touch walls"
+
+
+def _text(vector: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in vector) + ")"

@@ -1,0 +1,128 @@
+"""Small samples of trajectories: what estimators look at, in memory that does not grow with the dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from nmpm.data.format import Trajectory
+
+_TRAJECTORIES = 16
+_BYTES = 2**21  # of the positions of one trajectory
+_PARTICLES = 256  # that are kept before frames are left out
+_PER_TYPE = 64
+_SNAPSHOT = 50_000  # particles
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All particles of one frame that are there, or a compact part of them."""
+
+    position: np.ndarray  # (N, D) float64
+    types: np.ndarray  # (N,)
+
+    def of(self, types: frozenset[int]) -> np.ndarray:
+        """Positions (N', D) of the particles of some types."""
+        return self.position[np.isin(self.types, list(types))]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Some particles of a trajectory in successive frames from its first on; NaN where a particle is absent."""
+
+    position: np.ndarray  # (F, P, D) float32
+    types: np.ndarray  # (P,)
+    time: np.ndarray | None  # (F,) in the file's unit
+    velocity: np.ndarray | None  # (F, P, D) in length per unit of time, where the file has velocities
+    whole: bool  # whether the frames reach to the trajectory's end
+    first: Snapshot
+    last: Snapshot
+
+    def of(self, types: frozenset[int]) -> np.ndarray:
+        """Positions (F, P', D) float64 of the particles of some types."""
+        return self.position[:, np.isin(self.types, list(types))].astype(np.float64)
+
+    def times(self, dt: float) -> np.ndarray:
+        """(F,) times of the frames in units of dt; their numbers where no times are recorded, or other ones."""
+        frames = np.arange(len(self.position), dtype=np.float64)
+        if self.time is None or not np.isfinite(self.time).all():
+            return frames
+        times = (self.time - self.time[0]) / dt
+        plausible = len(frames) < 2 or abs(float(np.median(np.diff(times))) - 1) < 0.1
+        return times if plausible and (np.diff(times) > 0).all() else frames
+
+
+def take_sample(trajectory: Trajectory) -> Sample:
+    """A sample of up to 2 MiB of positions, at least 64 particles of each type, and the first and last frame."""
+    position, types = trajectory.position, trajectory.particle_type
+    frames, particles, dim = position.shape
+    row = 4 * dim
+    count = min(particles, max(_PARTICLES, _BYTES // (row * frames)))
+    index = _spread(types, count)
+    length = min(frames, max(2, _BYTES // (row * len(index))))
+    fields = trajectory.fields
+    time, velocity = fields.get("time"), fields.get("velocity")
+    return Sample(
+        position=position[:length, index],
+        types=types[index],
+        time=None if time is None or np.shape(time) != (frames,) else np.asarray(time, np.float64)[:length],
+        velocity=None if velocity is None or velocity.shape != position.shape else velocity[:length, index],
+        whole=length == frames,
+        first=_snapshot(position, types, range(frames)),
+        last=_snapshot(position, types, range(frames - 1, -1, -1)),
+    )
+
+
+def _spread(types: np.ndarray, count: int) -> np.ndarray:
+    """Sorted indices of about `count` random particles, of each type in proportion but at least 64."""
+    rng = np.random.default_rng(0)
+    kept = []
+    for kind in np.unique(types):
+        indices = np.flatnonzero(types == kind)
+        wanted = min(len(indices), max(_PER_TYPE, round(count * len(indices) / len(types))))
+        kept.append(rng.choice(indices, wanted, replace=False))
+    return np.sort(np.concatenate(kept))
+
+
+def _snapshot(position: np.ndarray, types: np.ndarray, frames: range) -> Snapshot:
+    """The first of some frames in which at least one particle is; of a type with many particles those in a slab."""
+    for frame in frames:
+        present = np.isfinite(position[frame]).all(axis=1)
+        if present.any():
+            break
+    points, kinds = position[frame, present].astype(np.float64), types[present]
+    kept = np.concatenate([_slab(points, np.flatnonzero(kinds == kind)) for kind in np.unique(kinds)])
+    return Snapshot(points[kept], kinds[kept])
+
+
+def _slab(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Of many points (N, D) those in the middle along their longest axis."""
+    if len(indices) <= _SNAPSHOT:
+        return indices
+    along = points[indices, int(np.argmax(np.ptp(points[indices], axis=0)))]
+    middle = (len(indices) - _SNAPSHOT) // 2
+    return indices[np.argsort(along, kind="stable")[middle : middle + _SNAPSHOT]]
+
+
+class Samples:
+    """Evenly spaced samples of a stream of trajectories, at most 16."""
+
+    def __init__(self) -> None:
+        self._kept: list[Sample] = []
+        self._seen, self._stride = 0, 1
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Keeps a sample of every trajectory, of every second one once there are many, and so on."""
+        if self._seen % self._stride == 0:
+            self._kept.append(take_sample(trajectory))
+        self._seen += 1
+        if len(self._kept) > _TRAJECTORIES:
+            self._kept, self._stride = self._kept[::2], 2 * self._stride
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
