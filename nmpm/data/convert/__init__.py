@@ -24,6 +24,7 @@ from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.rollout_pickle import RolloutPickle
+from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
 from nmpm.data.format import METADATA_FILE
 from nmpm.data.gravity import check_gravity
@@ -39,6 +40,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     Dmcf(),
     RolloutPickle(),
     ArrayFiles(),
+    Tracks(),
     Vtk(),
 )
 

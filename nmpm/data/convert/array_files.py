@@ -1,6 +1,6 @@
 """NumPy and HDF5 files of arrays under usual names: `.npz`, `.npy`, `.h5`, `.hdf5`, and folders of them.
 
-A file holds one run, or several: stacked, numbered, or in groups (`nmpm.data.convert.named_arrays`). A folder of `.npy`
+A file holds one run, or several: stacked, numbered, or in groups (`nmpm.data.convert.run_arrays`). A folder of `.npy`
 files of which one is called positions, and the others types, velocities and the like, is one run. Objects are not
 unpickled.
 """
@@ -20,20 +20,12 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import UNKNOWN_LENGTH, Options, split_files
-from nmpm.data.convert.named_arrays import (
-    USUAL_NAMES,
-    ArrayLike,
-    Arrays,
-    RunArrays,
-    group_runs,
-    is_flat,
-    plain_name,
-)
+from nmpm.data.convert.base import UNKNOWN_LENGTH, split_files
+from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, plain_name
+from nmpm.data.convert.run_arrays import RunArrays, group_runs, is_flat
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.data.metadata import find_family
 from nmpm.errors import DataError, NmpmError
 
 
@@ -62,12 +54,17 @@ class ArrayFiles(RunFiles):
         with open_arrays(file) as arrays:
             groups = list(group_runs(arrays, str(file)))
         numbered = [group for group in groups for _ in range(group.count)]
-        return [Run(file, index, group.frames, group.split) for index, group in enumerate(numbered)]
+        return [Run(file, index, split=group.split) for index, group in enumerate(numbered)]
 
-    def facts(self, file: Path, options: Options) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+    def frames(self, run: Run) -> int:
+        with open_arrays(run.file) as arrays:
+            groups = list(group_runs(arrays, str(run.file)))
+        return [group.frames for group in groups for _ in range(group.count)][run.index]
+
+    def facts(self, file: Path) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
         with open_arrays(file) as arrays:
             first = next(group_runs(arrays, str(file)))
-            return array_facts(first, options)
+            return array_facts(first)
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
         wanted, offset = set(indices), 0
@@ -80,7 +77,7 @@ class ArrayFiles(RunFiles):
                 offset += group.count
 
 
-def array_facts(first: RunArrays, options: Options) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+def array_facts(first: RunArrays) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
     """Metadata from the arrays of a run, names of those that are unknown, and notes on how arrays are read."""
     run, dt = first.positions(0), first.fact("dt")
     dim = 2 if is_flat(run) else run.shape[2]
@@ -91,9 +88,6 @@ def array_facts(first: RunArrays, options: Options) -> tuple[Metadata, frozenset
         stated["particle_types"] = names
     if dt is not None and (dt > 0).all():
         stated["dt"] = float(dt.reshape(-1)[0])
-    if options.family is not None:
-        family = find_family(options.family)
-        stated |= {"particle_types": dict(family.types), "static_types": family.static}
     facts: dict[str, Any] = {"bounds": ((0.0, 1.0),) * dim, "dt": 1.0, "particle_types": {}} | stated
     known = {*stated, *({"gravity"} if "gravity" in first.roles else ())}
     flat = ("z is 0 everywhere: the data are 2-D.",) if dim < run.shape[2] else ()

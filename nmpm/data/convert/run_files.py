@@ -14,6 +14,7 @@ import numpy as np
 from nmpm._support.messages import counted
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files, split_runs
 from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.metadata import find_family
 from nmpm.errors import DataError
 
 LEAST_FRAMES = 50
@@ -31,14 +32,14 @@ class Run:
     Args:
         file: Where it is.
         index: Which of the file's runs it is.
-        frames: Number of frames.
+        frames: Number of frames; 0 where they are not counted.
         split: Name of the split, where names in the file state one.
         part: Frames to take; all when left out.
     """
 
     file: Path
     index: int
-    frames: int
+    frames: int = 0
     split: str | None = None
     part: range | None = None
 
@@ -63,7 +64,11 @@ class RunFiles(DatasetFormat):
         """The runs in a file, in order; cheap where the format allows it."""
 
     @abc.abstractmethod
-    def facts(self, file: Path, options: Options) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+    def frames(self, run: Run) -> int:
+        """Number of frames of a run."""
+
+    @abc.abstractmethod
+    def facts(self, file: Path) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
         """Metadata from the first file, names of those that are unknown, and notes for the user."""
 
     @abc.abstractmethod
@@ -79,8 +84,15 @@ class RunFiles(DatasetFormat):
         if not files:
             raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
         runs = {split: [run for file in paths for run in self.runs(file)] for split, paths in files.items()}
-        splits, divided = divide(runs.pop("all")) if "all" in runs else (runs, ())
-        stated, unknown, notes = self.facts(next(iter(files.values()))[0], options)
+        undivided = runs.pop("all", [])
+        if undivided and len(undivided) < 3:  # they may be cut along time
+            undivided = [replace(run, frames=self.frames(run)) for run in undivided]
+        splits, divided = divide(undivided) if undivided else (runs, ())
+        stated, unknown, notes = self.facts(next(iter(files.values()))[0])
+        if options.family is not None:
+            family = find_family(options.family)
+            stated = replace(stated, particle_types=dict(family.types), static_types=family.static)
+            unknown -= {"particle_types", "static_types"}
         metadata = options.apply_to(stated)
         return ForeignDataset(
             metadata,

@@ -1,0 +1,165 @@
+"""Tables of tracks, as particle tracking writes them."""
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmpm.data.convert import convert, open_dataset
+from nmpm.data.convert.tables import plain_column
+from nmpm.data.format import Split, read_metadata
+from nmpm.errors import DataError
+
+FRAMES, TRACKS = 10, 4
+
+
+def made(seed: int = 0, dim: int = 2) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0, 1, (1, TRACKS, dim)) + 0.01 * np.cumsum(rng.normal(size=(FRAMES, TRACKS, dim)), axis=0)
+
+
+def lines(position: np.ndarray, header: str = "frame,particle,x,y", seed: int = 0, more: str = "") -> list[str]:
+    """Rows in any order."""
+    rows = [
+        ",".join([str(frame), str(particle), *(f"{value:.6f}" for value in position[frame, particle])]) + more
+        for frame in range(len(position))
+        for particle in range(position.shape[1])
+        if not np.isnan(position[frame, particle]).any()
+    ]
+    return [header, *np.random.default_rng(seed).permutation(rows).tolist()]
+
+
+def write(path: Path, rows: list[str]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    opener = gzip.open if path.suffix == ".gz" else open
+    with opener(path, "wt", encoding="utf-8") as file:
+        file.write("\n".join(rows) + "\n")
+    return path
+
+
+def read(path: Path, split: str = "train", index: int = 0):
+    return list(open_dataset(path).splits[split]())[index]
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.csv.gz", "a.tsv", "a.txt", "a.parquet"])
+def test_tracks_in_every_kind_of_file(tmp_path, name):
+    position, path = made(), tmp_path / name
+    position[:3, 1] = position[7:, 2] = position[4, 0] = np.nan
+    rows = lines(position)
+    if name == "a.parquet":
+        table, parquet = pytest.importorskip("pyarrow.csv"), pytest.importorskip("pyarrow.parquet")
+        parquet.write_table(table.read_csv(write(tmp_path / "a.csv", rows)), path)
+    else:
+        write(path, [row.replace(",", {".tsv": "\t", ".txt": " "}.get(path.suffix, ",")) for row in rows])
+    run = read(path)
+    np.testing.assert_allclose(run.position, position, atol=1e-6)
+    assert not run.fields
+
+
+def test_columns_are_known_by_usual_names_with_units(tmp_path):
+    names = "Time [s];TRACK_ID;POSITION_X;POSITION_Y;POSITION_Z;v_x (m/s);v_y (m/s);v_z (m/s);material;Diameter_um;note"
+    units = ";".join(["", "", *["(mm)"] * 3, *[""] * 6])  # as TrackMate has below its header
+    position = made(dim=3)
+    rows = [
+        ";".join(
+            map(str, [frame * 0.5, track, *position[frame, track], 1, 2, 3, "sand" if track else "mud", track, "a"])
+        )
+        for frame in range(FRAMES)
+        for track in range(TRACKS)
+    ]
+    path = write(tmp_path / "spots.csv", [names, units, *rows])
+    run, metadata = read(path), open_dataset(path).metadata
+    np.testing.assert_allclose(run.position, position, atol=1e-6)
+    assert [metadata.particle_types[i] for i in run.particle_type] == ["mud", "sand", "sand", "sand"]
+    assert run.fields["velocity"][3, 2].tolist() == [1, 2, 3]
+    assert run.fields["Diameter_um"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(run.fields["time"], 0.5 * np.arange(FRAMES))
+    assert [plain_column(name) for name in ("x_mm", "vx_mm/s", "Frame", "y (px)", "x_min")] == [
+        "x", "vx", "frame", "y", "xmin",
+    ]  # fmt: skip
+
+
+def test_missing_frames_of_a_grid_are_empty_and_other_times_are_kept(tmp_path):
+    position, header = made(), "t,id,x,y"
+    even, uneven = np.arange(FRAMES) * 0.004 + 1, np.cumsum(np.linspace(1, 3, FRAMES))
+    for times, name in ((even, "even.csv"), (uneven, "uneven.csv")):
+        rows = [
+            f"{times[frame]:.4f},{track},{x},{y}"
+            for frame in range(FRAMES)
+            if frame not in (4, 7)
+            for track, (x, y) in enumerate(position[frame])
+        ]
+        run = read(write(tmp_path / name, [header, *rows]))
+        empty = np.flatnonzero(np.isnan(run.position[..., 0]).all(axis=1)).tolist()
+        if name == "even.csv":
+            assert empty == [4, 7]
+            np.testing.assert_allclose(run.fields["time"], times)
+        else:
+            assert not empty
+            np.testing.assert_allclose(run.fields["time"], np.delete(times, (4, 7)), atol=1e-4)
+
+
+def test_runs_are_told_apart_and_divided(tmp_path):
+    rows = ["experiment,frame,id,x,y"]
+    for index in range(4):
+        rows += [f"{index},{row}" for row in lines(made(index), seed=index)[1:]]
+    path = write(tmp_path / "all.csv", rows)
+    dataset = open_dataset(path)
+    assert dataset.counts == {"train": 2, "valid": 1, "test": 1}
+    np.testing.assert_allclose(read(path, "test").position, made(3), atol=1e-6)
+    with pytest.raises(DataError, match=r"rows of experiment 0 do not follow each other. Sort the table by experiment"):
+        open_dataset(write(tmp_path / "mixed.csv", [*rows, rows[1]]))
+    for split in ("train", "valid"):
+        write(tmp_path / "folder" / split / "a.csv", lines(made()))
+    assert set(open_dataset(tmp_path / "folder").splits) == {"train", "valid"}
+
+
+def test_short_tracks_share_slots(tmp_path):
+    position = np.full((60, 30, 2), np.nan)
+    for track in range(30):  # two at a time
+        first = 2 * track
+        position[first : first + 4, track] = np.random.default_rng(track).random((min(4, 60 - first), 2))
+    path = write(tmp_path / "tracks.csv", lines(position))
+    run = read(path)
+    slots = run.position.shape[1]
+    assert slots < 6
+    present = ~np.isnan(run.position[..., 0])
+    track = run.fields["track"]
+    for frame, slot in np.argwhere(present):
+        np.testing.assert_allclose(run.position[frame, slot], position[frame, track[frame, slot]], atol=1e-6)
+    assert present.sum() == (~np.isnan(position[..., 0])).sum()
+    changes = (track[1:] != track[:-1]) & present[1:] & present[:-1]
+    assert not changes.any()
+    convert(path, tmp_path / "out")
+    assert Split(tmp_path / "out" / "train.h5").particles(0) == slots
+    assert read_metadata(tmp_path / "out").dim == 2
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([*lines(made()), "3,2,0.5,0.5"], r"rows \d+ and 41 are both track 2 in frame 3"),
+        ([*lines(made()), "3,2,0.5"], r"a\.csv, line 42: it has 3 cells, the header has 4"),
+        ([*lines(made()), "3,2,a,0.5"], r"the column x, y must contain numbers"),
+        (lines(made(), "frame,name,x,y"), r"no column id \(columns: frame, name, x, y\)"),
+    ],
+    ids=["twice", "cells", "text", "id"],
+)
+def test_bad_rows_are_refused_by_number(tmp_path, rows, message):
+    path = write(tmp_path / "a.csv", rows)
+    with pytest.raises(DataError, match=message):
+        list(open_dataset(path, "tracks").splits["train"]())
+
+
+def test_rows_without_a_track_are_left_out_with_a_warning(tmp_path, caplog):
+    run = read(write(tmp_path / "a.csv", [*lines(made()), "3,,0.5,0.5"]))
+    np.testing.assert_allclose(run.position, made(), atol=1e-6)
+    assert "1 row without particle left out" in caplog.text
+
+
+def test_a_sample_of_tracks_is_read(recorded):
+    run = read(recorded / "third-party" / "ptv-tracks")
+    assert run.position.shape[0] == 160
+    assert np.isnan(run.position[..., 0]).all(axis=1).sum() == 2
+    assert np.isfinite(run.position[..., 0]).sum() == 65_577
