@@ -148,10 +148,13 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--family", help="meaning of type ids: deepmind, lagrangebench or jax-sph")
     group.add_argument("--types", metavar="ID=NAME,...", help="names of particle types, e.g. 5=water,1=debris")
     group.add_argument("--static", metavar="ID,...", help='types that never move, e.g. 1,3; "none" where all move')
+    group.add_argument("--prescribed", metavar="ID,...", help="obstacles that move as recorded, like a paddle, e.g. 2")
     group.add_argument("--bounds", metavar="LOW:HIGH,...", help="where particles may be, per axis, e.g. 0:1,0:0.5")
     group.add_argument("--dt", type=float, help="seconds between stored frames")
     group.add_argument("--gravity", metavar="X,Y[,Z]", help="acceleration in length/s², e.g. 0,-9.81")
-    group.add_argument("--boundary", metavar="KIND,...", help='"wall" or "periodic" per axis, e.g. periodic,wall')
+    group.add_argument(
+        "--boundary", metavar="KIND,...", help='"wall", "periodic" or "open" per axis, e.g. periodic,wall'
+    )
     group.add_argument("--fields", metavar="NAME,...", help="fields that are inputs of models, e.g. temperature")
 
 
@@ -166,6 +169,7 @@ def data_options(options: argparse.Namespace) -> Options:
         family=options.family,
         types=_parse("--types", options.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
         static=_parse("--static", options.static, _ids, 'type ids, e.g. 1,3, or "none"'),
+        prescribed=_parse("--prescribed", options.prescribed, _ids, 'type ids, e.g. 2, or "none"'),
         bounds=_parse("--bounds", options.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
         dt=options.dt,
         gravity=gravity_option(options.gravity),

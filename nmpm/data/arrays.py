@@ -66,7 +66,7 @@ def _check_trajectories(
         if types.min() < 0 or types.max() >= kinds:
             known = ", ".join(f"{i} {name}" for i, name in _types(scene).items())
             raise DataError(f"{where} has particle types {types.tolist()}; the scene has {known}.")
-        if outside := first_outside(position, scene.domain, scene.periodic):
+        if outside := first_outside(position, scene.domain, scene.boundary):
             frame, particle, _ = outside
             raise DataError(
                 f"{where}, frame {frame}: particle {particle} is at {position[frame, particle].tolist()}, outside the"
@@ -94,13 +94,15 @@ def _types(scene: Scene) -> dict[int, str]:
 
 def scene_metadata(scene: Scene, types: dict[int, str], static_type: int | None) -> Metadata:
     """The metadata of trajectories of a scene whose type ids have these names; their length is still to be set."""
+    obstacle = frozenset() if static_type is None else frozenset({static_type})
     return Metadata(
         bounds=scene.bounds,
         dt=scene.dt,
         dim=scene.dim,
         sequence_length=1,
         particle_types=types,
-        static_types=frozenset() if static_type is None else frozenset({static_type}),
+        static_types=obstacle,
+        prescribed_types=obstacle if scene.moving_obstacles else frozenset(),
         boundary=scene.boundary,
         domain=scene.domain,
         gravity=scene.gravity,

@@ -61,10 +61,12 @@ class TrajectoryDataModule(LightningDataModule):
         family: Meaning of the type ids in recorded data where its metadata does not state it: "deepmind",
             "lagrangebench", "jax-sph".
         gravity: Acceleration in length/s² per axis, where recorded data do not state it.
-        boundary: "wall" or "periodic" per axis, instead of that in the metadata of recorded data.
+        boundary: "wall", "periodic" or "open" per axis, instead of that in the metadata of recorded data. Particles
+            that leave the bounds of an open axis are gone.
         bounds: (lower, upper) per axis, likewise.
         fields: Names of fields that are inputs of the model, such as [temperature], instead of those that the metadata
             of recorded data declare; [] for none. Those that evolve are predicted.
+        prescribed: Ids of the types in recorded data that are obstacles and move as recorded, such as [2] for a paddle.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
@@ -95,12 +97,20 @@ class TrajectoryDataModule(LightningDataModule):
         boundary: list[Boundary] | None = None,
         bounds: list[tuple[float, float]] | None = None,
         fields: list[str] | None = None,
+        prescribed: list[int] | None = None,
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        options = Options(family, bounds=bounds, gravity=gravity, boundary=boundary, fields=fields)
+        options = Options(
+            family,
+            prescribed=None if prescribed is None else frozenset(prescribed),
+            bounds=bounds,
+            gravity=gravity,
+            boundary=boundary,
+            fields=fields,
+        )
         self.data_source = make_source(path, name, source, options, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:

@@ -22,7 +22,7 @@ STATIC_NAMES = frozenset({"boundary", "wall", "obstacle"})
 
 @dataclass(frozen=True)
 class Family:
-    """Names of the particle type ids in one family of datasets, and the ids that do not move.
+    """Names of the particle type ids in one family of datasets, and the ids that do not move or move as recorded.
 
     The same id means different things in different families, so a dataset either names its types in its metadata or
     states which family it follows.
@@ -30,6 +30,7 @@ class Family:
 
     types: Mapping[int, str]
     static: frozenset[int]
+    prescribed: frozenset[int] = frozenset()
 
 
 FAMILIES: Mapping[str, Family] = MappingProxyType(
@@ -38,11 +39,14 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
             MappingProxyType({0: "rigid", 3: "boundary", 5: "water", 6: "sand", 7: "goop"}), frozenset({3})
         ),
         "lagrangebench": Family(
-            MappingProxyType({-1: PADDING, 0: "fluid", 1: "wall", 2: "moving wall", 3: "rigid"}), frozenset({1})
+            MappingProxyType({-1: PADDING, 0: "fluid", 1: "wall", 2: "moving wall", 3: "rigid"}),
+            frozenset({1}),
+            frozenset({2}),
         ),
         "jax-sph": Family(
             MappingProxyType({-1: PADDING, 0: "fluid", 1: "wall", 2: "moving wall", 3: "heated wall"}),
             frozenset({1, 3}),
+            frozenset({2}),
         ),
     }
 )
@@ -67,7 +71,7 @@ class Metadata:
     sequence_length: int  # frames per trajectory as the dataset declares them
     particle_types: dict[int, str]  # name of each type id
     static_types: frozenset[int] = frozenset()  # ids of the types that do not move
-    prescribed_types: frozenset[int] = frozenset()  # ids of obstacles that move as recorded; not among static_types
+    prescribed_types: frozenset[int] = frozenset()  # ids of obstacles that move as recorded; taken out of static_types
     boundary: tuple[Boundary, ...] = ()  # per axis; walls when left out
     domain: tuple[Interval, ...] | None = None  # what a grid should cover, (lower, upper) per axis
     gravity: tuple[float, ...] | None = None  # acceleration in length/s² per axis; None where unknown
@@ -79,6 +83,7 @@ class Metadata:
     def __post_init__(self) -> None:
         if not self.boundary:
             object.__setattr__(self, "boundary", ("wall",) * self.dim)
+        object.__setattr__(self, "static_types", self.static_types - self.prescribed_types)
 
     @property
     def periodic(self) -> tuple[bool, ...]:
@@ -103,6 +108,10 @@ class Metadata:
     def is_static(self, particle_type: np.ndarray) -> np.ndarray:
         """(N,) bool, of (N,) type ids."""
         return np.isin(particle_type, list(self.static_types))
+
+    def is_obstacle(self, particle_type: np.ndarray) -> np.ndarray:
+        """(N,) bool, of (N,) type ids: static, or moving as recorded."""
+        return np.isin(particle_type, list(self.obstacle_types))
 
     def unknown_types(self, particle_type: np.ndarray) -> list[int]:
         """Ids in an array that have no name, ascending."""

@@ -55,7 +55,7 @@ def parse_metadata(
     check_plain(plain, where)
     keys = JsonKeys(where, plain, problems, substitutes)
     dim = keys.take("dim", parse_dim)
-    types, static = _types(keys, family)
+    types, static, prescribed = _types(keys, family)
     length_key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
     length = keys.peek(length_key, parse_count)
     keys.left.pop("sequence_length", None)
@@ -68,7 +68,7 @@ def parse_metadata(
         sequence_length=length,
         particle_types=types,
         static_types=static,
-        prescribed_types=keys.take("prescribed_types", parse_ids, frozenset()),
+        prescribed_types=keys.take("prescribed_types", parse_ids, prescribed),
         boundary=keys.take("boundary", lambda value: parse_boundary(value, dim), kinds),
         domain=keys.take("domain", lambda value: parse_intervals(value, dim), None),
         gravity=keys.take("gravity", lambda value: parse_vector(value, dim), None),
@@ -79,8 +79,8 @@ def parse_metadata(
     )
 
 
-def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozenset[int]]:
-    """Names of type ids and static ids, from the file or else the family."""
+def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozenset[int], frozenset[int]]:
+    """Names of type ids and static ids, from the file or else the family, and the family's prescribed ids."""
     fallback = find_family(family) if family is not None else None
     if fallback is None and keys.left.get("particle_types") is None and keys.problems is None:
         raise DataError(
@@ -96,7 +96,9 @@ def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozense
             stacklevel=4,
         )
     walls = frozenset(i for i, name in types.items() if name in STATIC_NAMES)
-    return types, keys.take("static_types", parse_ids, fallback.static if fallback else walls)
+    static = keys.take("static_types", parse_ids, fallback.static if fallback else walls)
+    prescribed = fallback.prescribed - static if fallback else frozenset()
+    return types, static, frozenset(i for i in prescribed if types.get(i) == names[i])
 
 
 def write_metadata(folder: Path, metadata: Metadata) -> None:

@@ -10,7 +10,7 @@ from nmpm.data.convert.base import Options
 from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
 from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
-from nmpm.data.statistics import Extent, neighbour_distance
+from nmpm.data.statistics import Extent, neighbour_distance, without_those_gone
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
 
@@ -23,9 +23,10 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
 
     Bounds are the metadata's, widened to contain all sampled positions of moving particles. The domain is the
     metadata's, or else the metadata's bounds with a wall layer of 2.5% of their extent (further out where particles
-    are), and the bounds themselves on a periodic axis. Materials are the types that move and occur, in order of id.
-    The particle volume is the metadata's, or else (median distance to the nearest neighbour in first frames) ** dim.
-    Fields are those that the metadata or the user names and that differ anywhere in the sample.
+    are), and the bounds themselves on a periodic or open axis; particles that leave those of an open axis are gone.
+    Materials are the types that move and occur, in order of id. The particle volume is the metadata's, or else (median
+    distance to the nearest neighbour in first frames) ** dim. Fields are those that the metadata or the user names and
+    that differ anywhere in the sample.
 
     Sampled are the positions and fields of `train.h5` (or else `valid.h5`, `test.h5`): all of them up to 128 MiB,
     evenly spaced trajectories beyond that. Types and gravities are read from all its trajectories.
@@ -55,9 +56,13 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
     moving, everything = Extent(metadata.dim), Extent(metadata.dim)
     for index in sample:
         trajectory = split.read(index)
-        moves, rests = metadata.is_moving(trajectory.particle_type), metadata.is_static(trajectory.particle_type)
-        moving.add(trajectory.position[:, moves])
-        everything.add(trajectory.position[:, moves | rests])
+        moves, is_obstacle = (
+            metadata.is_moving(trajectory.particle_type),
+            metadata.is_obstacle(trajectory.particle_type),
+        )
+        position = without_those_gone(trajectory.position, metadata)
+        moving.add(position[:, moves])
+        everything.add(position[:, moves | is_obstacle])
     bounds, domain = _extents(metadata, moving, everything, folder)
     gravities = distinct_gravities(
         trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in range(len(split))
@@ -85,7 +90,8 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
         boundary=metadata.boundary,
         gravity=common_gravity(gravities, metadata, split),
         gravity_varies=len(gravities) > 1,
-        obstacles=bool(types & metadata.static_types),
+        obstacles=bool(types & metadata.obstacle_types),
+        moving_obstacles=bool(types & metadata.prescribed_types),
         densities=densities if 1 < len(densities) == len(materials) else (),
         evolving=tuple(name for name, kind in kinds.items() if kind == "evolving"),
         properties=tuple(name for name, kind in kinds.items() if kind == "property"),
@@ -107,12 +113,15 @@ def _extents(
 ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
     """Bounds and domain, (lower, upper) per axis."""
     stated = metadata.domain or (None,) * metadata.dim
-    pairs = [
-        _periodic_extent(bounds, stated[axis], axis, folder)
-        if metadata.periodic[axis]
-        else _walled_extent(bounds, stated[axis], moving.intervals[axis], everything.intervals[axis], axis, folder)
-        for axis, bounds in enumerate(metadata.bounds)
-    ]
+    pairs = list[tuple[Interval, Interval]]()
+    for axis, (bounds, kind) in enumerate(zip(metadata.bounds, metadata.boundary, strict=True)):
+        if kind == "periodic":
+            pairs.append(_periodic_extent(bounds, stated[axis], axis, folder))
+        elif kind == "open":
+            pairs.append((bounds, stated[axis] or bounds))
+        else:
+            seen = moving.intervals[axis], everything.intervals[axis]
+            pairs.append(_walled_extent(bounds, stated[axis], *seen, axis, folder))
     return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.errors import DataError
-from nmpm.scene import Interval
+from nmpm.scene import Boundary, Interval, Scene
 
 STATISTICS_KEYS = ("vel_mean", "vel_std", "acc_mean", "acc_std")
 _STILL = 1e-3  # of the extent; displacements up to it count as rest
@@ -25,6 +25,7 @@ class Extent:
 
     def __init__(self, dim: int) -> None:
         self.lower, self.upper = np.full(dim, np.inf), np.full(dim, -np.inf)
+        self.gone = 0  # particles that leave the bounds of an open axis, where somebody has counted them
 
     def add(self, position: np.ndarray) -> None:
         """Adds (T, N, D) positions, or none."""
@@ -39,12 +40,14 @@ class Extent:
 
     def notes(self, metadata: Metadata) -> list[str]:
         """Sentences on positions beyond the stated bounds."""
-        return [
+        beyond = [
             f"Along {'xyz'[axis]} positions reach from {low:.4g} to {high:.4g}, beyond the stated bounds"
             f" {list(bounds)}; the scene's domain contains them."
             for axis, ((low, high), bounds) in enumerate(zip(self.intervals, metadata.bounds, strict=True))
-            if not metadata.periodic[axis] and (low < bounds[0] or high > bounds[1])
+            if metadata.boundary[axis] == "wall" and (low < bounds[0] or high > bounds[1])
         ]
+        gone = f"{self.gone} particles leave the bounds of an open axis; they count as absent from then on."
+        return [*beyond, gone] if self.gone else beyond
 
 
 def extent_of(position: np.ndarray) -> Extent:
@@ -163,14 +166,15 @@ def _short(values: np.ndarray) -> str:
 
 
 def first_outside(
-    position: np.ndarray, domain: Sequence[Interval], periodic: Sequence[bool], present: np.ndarray | bool = True
+    position: np.ndarray, domain: Sequence[Interval], boundary: Sequence[Boundary], counted: np.ndarray | bool = True
 ) -> tuple[int, int, int] | None:
     """Frame and particle of the first (T, N, D) position outside, and how many particles are ever; None if none is.
 
-    On a periodic axis no position is outside. Only particles that are `present`, (N,), count.
+    Outside are positions beyond walls. Only particles that are `counted`, (N,), are compared.
     """
     lower, upper = np.asarray(domain, dtype=np.float32).T
-    outside = (((position < lower) | (position > upper)) & ~np.asarray(periodic)).any(axis=-1) & present
+    walls = [kind == "wall" for kind in boundary]
+    outside = (((position < lower) | (position > upper)) & walls).any(axis=-1) & counted
     if not outside.any():
         return None
     frame, particle = map(int, np.argwhere(outside)[0])
@@ -196,3 +200,20 @@ def first_positions(position: np.ndarray) -> np.ndarray:
     first, frames = first.copy(), np.argmax(~np.isnan(position[:, late, 0]), axis=0)
     first[late] = position[frames, late]
     return first
+
+
+def without_those_gone(position: np.ndarray, facts: Scene | Metadata) -> np.ndarray:
+    """(T, N, D) positions, NaN from the frame on in which a particle is beyond the bounds of an open axis."""
+    open_axes = [kind == "open" for kind in facts.boundary]
+    if not any(open_axes):
+        return position
+    lower, upper = np.asarray(facts.bounds, dtype=np.float32).T
+    outside = (((position < lower) | (position > upper)) & open_axes).any(axis=-1)
+    gone = np.logical_or.accumulate(outside, axis=0)
+    return np.where(gone[..., None], np.float32(np.nan), position)
+
+
+def count_gone(position: np.ndarray, metadata: Metadata) -> int:
+    """Number of particles of which `without_those_gone` leaves positions out."""
+    kept = without_those_gone(position, metadata)
+    return 0 if kept is position else int((np.isnan(kept[..., 0]) > np.isnan(position[..., 0])).any(axis=0).sum())

@@ -60,7 +60,7 @@ def test_absent_particles_count_nowhere(tmp_path):
     steps = np.diff(absent[:, :20].astype(np.float64), axis=0)
     np.testing.assert_array_equal(displacements(absent[:, :20], metadata), steps)
     np.testing.assert_allclose(statistics.result()["vel_std"], np.nanstd(steps, axis=(0, 1)), rtol=1e-9)
-    assert first_outside(absent, metadata.bounds, (False, False)) is None
+    assert first_outside(absent, metadata.bounds, metadata.boundary) is None
     assert first_moving_particle(absent, types == 3, metadata.bounds) is None
     late = absent.copy()
     late[:9, 22] = np.nan

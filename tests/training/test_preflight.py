@@ -43,7 +43,7 @@ def test_without_a_valid_split_it_trains_without_validations_alone(make_dataset)
 
 
 @pytest.mark.parametrize("split", ["train", "valid", "test"])
-@pytest.mark.parametrize(("frame", "value", "complaint"), [(0, np.nan, "be finite"), (11, 9.0, "outside the domain")])
+@pytest.mark.parametrize(("frame", "value", "complaint"), [(0, np.inf, "be finite"), (11, 9.0, "outside the domain")])
 def test_the_ends_of_every_trajectory_are_looked_at(make_dataset, split, frame, value, complaint):
     folder = make_dataset(**{split: ((12, 5), (12, 5))})
     data = data_of(folder)
@@ -55,7 +55,7 @@ def test_the_ends_of_every_trajectory_are_looked_at(make_dataset, split, frame, 
 
 
 def test_trajectories_that_cannot_be_tested_are_refused(make_dataset):
-    folder = make_dataset(test=((12, 5), (2, 5)))
+    folder = make_dataset(test=((2, 5), (2, 5)))
     assert "an evaluation needs 3" in refusal(DataError, folder)
     strange = made_up_trajectory(12, 5)
     strange.particle_type[:] = 99

@@ -32,6 +32,7 @@ class Options:
     family: str | None = None  # meaning of the type ids: "deepmind", "lagrangebench", "jax-sph"
     types: Mapping[int, str] | None = None  # names of type ids; they override those of the family and the files
     static: frozenset[int] | None = None  # type ids that do not move
+    prescribed: frozenset[int] | None = None  # type ids of obstacles that move as recorded, such as a paddle
     bounds: Sequence[Interval] | None = None  # where particles may be, (lower, upper) per axis, in domain length
     dt: float | None = None  # time between stored frames, in seconds
     gravity: Sequence[float] | None = None  # acceleration in length/s² per axis
@@ -61,11 +62,20 @@ class Options:
                 raise ConfigError(f"{name} = {list(value)} needs one entry for each of the data's {metadata.dim} axes.")
         if self.dt is not None and not self.dt > 0:
             raise ConfigError(f"dt = {self.dt} must be positive: seconds between stored frames.")
+        if self.static and self.prescribed and self.static & self.prescribed:
+            raise ConfigError(
+                f"static = {sorted(self.static)} and prescribed = {sorted(self.prescribed)} share types: those"
+                " that move as recorded are prescribed only."
+            )
         if self.types:
             walls = frozenset(i for i, name in self.types.items() if name in STATIC_NAMES)
             static = (metadata.static_types - frozenset(self.types)) | walls
-            metadata = replace(metadata, particle_types=metadata.particle_types | dict(self.types), static_types=static)
-        changes: dict[str, Any] = {"static_types": self.static, "dt": self.dt}
+            prescribed = metadata.prescribed_types - frozenset(self.types)
+            names = metadata.particle_types | dict(self.types)
+            metadata = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
+        if self.static:
+            metadata = replace(metadata, prescribed_types=metadata.prescribed_types - self.static)
+        changes: dict[str, Any] = {"static_types": self.static, "prescribed_types": self.prescribed, "dt": self.dt}
         if self.bounds is not None:
             changes |= {"bounds": tuple((float(low), float(high)) for low, high in self.bounds)}
             metadata = replace(metadata, domain=None)

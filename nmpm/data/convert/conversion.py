@@ -20,6 +20,7 @@ from nmpm.data.statistics import (
     STATISTICS_KEYS,
     Extent,
     MotionStatistics,
+    count_gone,
     find_disagreements,
     first_moving_particle,
     notes_on_lengths,
@@ -126,7 +127,8 @@ class _Log:
             check_end(position[:, moving], where)
         self.number += 1
         self.moving_boundaries += first_moving_particle(position, static, metadata.bounds) is not None
-        self.extent.add(position[:, static | moving])
+        self.extent.add(position[:, metadata.is_obstacle(types) | moving])
+        self.extent.gone += count_gone(position[:, moving], metadata)
         self.frames.add(len(position))
         self.particles = max(self.particles, position.shape[1])
 
@@ -157,7 +159,8 @@ class _Log:
             extra[MOVING_BOUNDARIES] = True
             notes.append(
                 f"Particles of a static type move in {self.moving_boundaries} of {self.number} trajectories. Their"
-                " positions are kept; to train on them, state which types are static (--static)."
+                " positions are kept; to train on them, state which types are static (--static), and which move as"
+                " recorded (--prescribed)."
             )
         notes += self._facts
         if self.metadata.sequence_length != UNKNOWN_LENGTH:
@@ -194,9 +197,10 @@ def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDat
     if len(types) < len(kept):
         raise ConfigError(f"{dict(ids)} gives two particle types the same id.")
     static = frozenset(ids.get(i, i) for i in metadata.static_types if i in kept)
+    prescribed = frozenset(ids.get(i, i) for i in metadata.prescribed_types if i in kept)
     return replace(
         source,
-        metadata=replace(metadata, particle_types=types, static_types=static),
+        metadata=replace(metadata, particle_types=types, static_types=static, prescribed_types=prescribed),
         splits={name: partial(_renumber, start, ids, kept) for name, start in source.splits.items()},
     )
 

@@ -91,7 +91,9 @@ class RunFiles(DatasetFormat):
         stated, unknown, notes = self.facts(next(iter(files.values()))[0])
         if options.family is not None:
             family = find_family(options.family)
-            stated = replace(stated, particle_types=dict(family.types), static_types=family.static)
+            static, prescribed = family.static, family.prescribed
+            names = dict(family.types)
+            stated = replace(stated, particle_types=names, static_types=static, prescribed_types=prescribed)
             unknown -= {"particle_types", "static_types"}
         metadata = options.apply_to(stated)
         return ForeignDataset(

@@ -9,7 +9,7 @@ import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.grid_rule import GridFacts, grid_shape
-from nmpm.data.statistics import Extent, displacements, first_moving_particle, first_outside
+from nmpm.data.statistics import Extent, count_gone, displacements, first_moving_particle, first_outside
 from nmpm.scene import Interval
 
 _MASK_CELLS = 64
@@ -50,7 +50,8 @@ class Measurements:
         """Adds a trajectory."""
         types, position = trajectory.particle_type, trajectory.position
         moving = self.metadata.is_moving(types)
-        self.observed.add(position[:, moving | self.metadata.is_static(types)])
+        self.observed.add(position[:, moving | self.metadata.is_obstacle(types)])
+        self.observed.gone += count_gone(position[:, moving], self.metadata)
         if moving.any():
             step = displacements(position[:, moving], self.metadata)
             if len(step):
@@ -113,7 +114,7 @@ def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, w
     """
     types, position = trajectory.particle_type, trajectory.position
     moving = np.flatnonzero(metadata.is_moving(types))
-    if metadata.domain is not None and (outside := first_outside(position, metadata.domain, metadata.periodic)):
+    if metadata.domain is not None and (outside := first_outside(position, metadata.domain, metadata.boundary)):
         frame, particle, leaving = outside
         yield (
             f"{where}, frame {frame}: particle {particle} is outside of the stated domain, at"

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from nmpm.errors import DataError
-from nmpm.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -64,14 +63,3 @@ def first_frames(present: np.ndarray, length: int) -> np.ndarray:
         return np.full(windows, windows - 1)
     following = np.searchsorted(inhabited, np.arange(windows))
     return np.asarray(inhabited[np.minimum(following, len(inhabited) - 1)])
-
-
-def without_those_gone(position: np.ndarray, scene: Scene) -> np.ndarray:
-    """(T, N, D) positions, NaN from the frame on in which a particle is beyond the bounds of an open axis."""
-    open_axes = [kind == "open" for kind in scene.boundary]
-    if not any(open_axes):
-        return position
-    lower, upper = np.asarray(scene.bounds, dtype=np.float32).T
-    outside = (((position < lower) | (position > upper)) & open_axes).any(axis=-1)
-    gone = np.logical_or.accumulate(outside, axis=0)
-    return np.where(gone[..., None], np.float32(np.nan), position)

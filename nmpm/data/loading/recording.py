@@ -21,8 +21,8 @@ from nmpm.data.array_checks import check_end
 from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.loading.presence import Presence, without_those_gone
-from nmpm.data.statistics import first_moving_particle, first_outside
+from nmpm.data.loading.presence import Presence
+from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -110,9 +110,9 @@ class RecordingReader:
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
         moving = self.metadata.is_moving(types)
-        obstacle = np.isin(types, list(self.metadata.obstacle_types))
-        passable = [kind != "wall" for kind in self.scene.boundary]
-        if outside := first_outside(trajectory.position, self.scene.domain, passable, moving | obstacle):
+        obstacle = self.metadata.is_obstacle(types)
+        position = without_those_gone(trajectory.position, self.scene)
+        if outside := first_outside(position, self.scene.domain, self.scene.boundary, moving | obstacle):
             frame, particle, number = outside
             raise DataError(
                 f"{where}: particle {particle} in frame {first_frame + frame} is at"
