@@ -21,11 +21,13 @@ from nmpm.data.convert.conversion import renumber_types, write_native
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
+from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.rollout_pickle import RolloutPickle
 from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
+from nmpm.data.convert.xyz import Xyz
 from nmpm.data.format import METADATA_FILE
 from nmpm.data.gravity import check_gravity
 from nmpm.errors import ConfigError, DataError
@@ -42,6 +44,8 @@ FORMATS: tuple[DatasetFormat, ...] = (
     ArrayFiles(),
     Tracks(),
     Vtk(),
+    Lammps(),
+    Xyz(),
 )
 
 

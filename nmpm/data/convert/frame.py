@@ -38,6 +38,17 @@ class Frame:
     boundary: tuple[Boundary, ...] | None = None
 
 
+def wrap(position: np.ndarray, box: Sequence[Interval] | None, boundary: Sequence[Boundary] | None) -> np.ndarray:
+    """(N, D) positions within the box along periodic axes."""
+    for axis, kind in enumerate((boundary or ())[: position.shape[1]]):
+        low, high = box[axis] if box else (0.0, 0.0)
+        values = position[:, axis]
+        outside = (values < low) | (values >= high)
+        if kind == "periodic" and high > low and outside.any():
+            position[:, axis] = np.where(outside, low + (values - low) % (high - low), values)
+    return position
+
+
 @dataclass(frozen=True)
 class ParticleArrays:
     """The arrays of a frame by what they are."""

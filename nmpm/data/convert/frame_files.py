@@ -74,7 +74,7 @@ class Layout:
     first: tuple[Frame, ...]
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], names: frozenset[str]) -> Layout:
+    def of(cls, frames: Sequence[Frame], type_ids: dict[str, int]) -> Layout:
         """The layout of frames; an axis in which nothing has an extent is left out."""
         dim = frames[0].position.shape[1]
         position = np.concatenate([frame.position for frame in frames if frame.position.shape[1] == dim])
@@ -82,7 +82,7 @@ class Layout:
         flat = [axis for axis in range(dim) if dim == 3 and len(position) > 1 and np.ptp(position[:, axis]) == 0]
         constant = {axis: float(position[0, axis]) for axis in flat} if len(flat) == 1 else {}
         axes = tuple(axis for axis in range(dim) if axis not in constant)
-        return cls(axes, constant, {name: index for index, name in enumerate(sorted(names))}, tuple(frames))
+        return cls(axes, constant, type_ids, tuple(frames))
 
     def notes(self) -> tuple[str, ...]:
         """For the user."""
@@ -122,15 +122,15 @@ class FrameFormat(DatasetFormat):
         runs, gaps = self._runs(path)
         splits, divided = divide(runs)
         first = self._first_frames(next(iter(splits.values()))[0])
-        layout = Layout.of(first, self._type_names(first, runs))
+        layout = Layout.of(first, self._type_ids(first, runs))
         metadata = _metadata(layout)
-        unknown = EVERYTHING_UNKNOWN - {name for name in ("bounds", "boundary") if first[0].box is not None}
+        stated = {"bounds": first[0].box, "boundary": first[0].boundary}
         return ForeignDataset(
             options.apply_to(metadata),
             {split: partial(self._read_all, each, layout) for split, each in splits.items()},
             (*layout.notes(), *gaps, *divided, *self.notes(first, options)),
             {split: len(each) for split, each in splits.items()},
-            unknown=unknown - ({"particle_types"} if layout.type_ids else set()),
+            unknown=EVERYTHING_UNKNOWN - {name for name, value in stated.items() if value is not None},
         )
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
@@ -157,6 +157,8 @@ class FrameFormat(DatasetFormat):
         if not folders:
             raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
         many = len(list(islice(self.frames(folders[0][1][0]), 2))) > 1
+        if path.is_file() and not many:
+            raise DataError(f"{path}: there is one frame in it. Give the folder of the frames.")
         runs: list[FrameRun] = []
         gaps: list[str] = []
         for folder, files in folders:
@@ -165,8 +167,6 @@ class FrameFormat(DatasetFormat):
             else:
                 series = _series(folder, files, gaps)
                 runs.append(FrameRun(folder, 0, len(series), _split_of(folder, path), None, series))
-        if path.is_file() and not many:
-            raise DataError(f"{path}: there is one frame in it. Give the folder of the frames.")
         if many and len(runs) < 3:
             runs = [replace(run, frames=self.count(run.file)) for run in runs]
         rest = f" The same in {counted(len(gaps) - 1, 'more run')}." if gaps[1:] else ""
@@ -178,23 +178,33 @@ class FrameFormat(DatasetFormat):
         if len(files) == 1:
             frames = list(islice(self.frames(files[0]), _FIRST_FRAMES))
         else:
-            frames = [self._only_frame(file, run) for file in (files[0], files[len(files) // 2], files[-1])]
+            frames = [self._only_frame(file, run) for file in (*files[:2], files[-1])]
         inhabited = [frame for frame in frames if len(frame.position)]
         if not inhabited:
             raise DataError(f"{run.file}: there are no particles in its first frames.")
         return inhabited
 
-    def _type_names(self, first: Sequence[Frame], runs: Sequence[FrameRun]) -> frozenset[str]:
-        """Names of types in the first frame of all runs; none where types are numbers."""
+    def _type_ids(self, first: Sequence[Frame], runs: Sequence[FrameRun]) -> dict[str, int]:
+        """Type ids by the names in the first frame of all runs, where types have names; those of the files, or new."""
 
-        def names(frame: Frame) -> set[str]:
+        def ids(frame: Frame) -> dict[str, int]:
             arrays = ParticleArrays.of(frame, range(frame.position.shape[1]))
-            return set() if arrays.type_names is None else set(np.unique(arrays.type_names).tolist())
+            if arrays.type_names is None:
+                return {}
+            names, index = np.unique(arrays.type_names, return_index=True)
+            return (
+                dict.fromkeys(names.tolist(), -1)
+                if arrays.type is None
+                else dict(zip(names.tolist(), arrays.type[index].tolist(), strict=True))
+            )
 
-        if not names(first[0]):
-            return frozenset()
-        others = (frame for run in runs for frame in islice(self.frames(run.present[0]), 1))
-        return frozenset().union(*map(names, first), *map(names, others))
+        named = ids(first[0])
+        if named:
+            others = (frame for run in runs for frame in islice(self.frames(run.present[0]), 1))
+            named = {name: number for frame in (*others, *first) for name, number in ids(frame).items()}
+        if len(set(named.values())) < len(named):
+            named = {name: number for number, name in enumerate(sorted(named))} if set(named.values()) == {-1} else {}
+        return named
 
     def _read_all(self, runs: Sequence[FrameRun], layout: Layout) -> Iterator[Trajectory]:
         for run in runs:
@@ -255,7 +265,9 @@ def _series(folder: Path, files: Sequence[Path], gaps: list[str]) -> tuple[Path 
     steps = np.diff(numbers)
     if len(files) < 3 or (steps == steps[0]).all():
         return tuple(files)
-    step, after = int(np.median(steps)), files[int(np.argmax(steps != np.median(steps)))].name
+    values, counts = np.unique(steps, return_counts=True)
+    step = int(values[counts.argmax()])
+    after = files[int(np.argmax(steps != step))].name
     places = (numbers - numbers[0]) // max(step, 1)
     missing = int(places[-1]) + 1 - len(files)
     if steps.min() < 1 or (steps % step).any() or missing > _MISSING * len(files):

@@ -1,0 +1,118 @@
+"""Text files of numbers, plain or gzipped, read in blocks of lines."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
+from nmpm._support.messages import one_line
+from nmpm.errors import DataError, NmpmError
+
+_LINE_BYTES = 2**20
+
+
+class Lines:
+    """The lines of a file in order.
+
+    Args:
+        file: An open binary file.
+        limit: Bytes that it may have in all.
+    """
+
+    def __init__(self, file: Any, limit: int) -> None:
+        self._file, self._left = file, limit
+        self.number = 0
+        """Of lines that were read."""
+
+    def next(self) -> str:
+        """The next line without its end; empty at the end of the file, and " " for an empty line.
+
+        Raises:
+            ValueError: if it is very long.
+        """
+        line = self._file.readline(_LINE_BYTES)
+        if len(line) == _LINE_BYTES:
+            raise ValueError(f"line {self.number + 1} has more than {_LINE_BYTES:,} characters")
+        self._count([line])
+        return line.decode("utf-8", "replace").rstrip() or (" " if line else "")
+
+    def block(self, count: int, start: int) -> list[bytes]:
+        """The next lines, which belong to a frame that began after `start` lines.
+
+        Raises:
+            ValueError: if there are fewer, or the last one is cut short.
+        """
+        lines = list(islice(self._file, count))
+        self._count(lines)
+        if len(lines) < count or (lines and not lines[-1].endswith(b"\n")):
+            raise ValueError(f"it ends at line {self.number}, within a frame{complete_frames(start)}")
+        return lines
+
+    def _count(self, lines: Sequence[bytes]) -> None:
+        self.number += len(lines)
+        self._left -= sum(map(len, lines))
+        if self._left < 0:
+            raise ValueError(f"it unpacks to more than {EXPANSION} times its size")
+
+
+def complete_frames(lines: int) -> str:
+    """Advice, for an error, on a file that ends within a frame which begins after so many lines."""
+    return f"; its first {lines} lines are complete frames: head -n {lines}" if lines else ""
+
+
+@contextmanager
+def open_lines(path: Path, kind: str) -> Iterator[Lines]:
+    """Opens a text file, gzipped if its name ends in `.gz`.
+
+    Raises:
+        DataError: naming the file, for its errors and any ValueError within; `kind` is what it should be.
+    """
+    check_regular(path)
+    try:
+        packed = path.suffix.lower() == ".gz"
+        size = path.stat().st_size
+        with gzip.open(path) if packed else path.open("rb") as file:
+            yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
+    except NmpmError:
+        raise
+    except (OSError, EOFError, zlib.error, ValueError, MemoryError) as error:
+        hint = "" if isinstance(error, ValueError) else " Is it complete?"
+        raise DataError(f"{path}: cannot be read as {kind} ({one_line(error)}).{hint}") from error
+
+
+def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The columns of lines by name: numbers (float64), or texts where the first line has one.
+
+    Raises:
+        ValueError: if a line has fewer columns, or a text among numbers.
+    """
+    first = lines[0].split() if lines else []
+    if lines and len(first) != len(names):
+        raise ValueError(f"{len(first)} columns, but {len(names)} names: {' '.join(names)}")
+    texts = [index for index, word in enumerate(first) if not _is_number(word)]
+    numbers = [index for index in range(len(names)) if index not in texts]
+    if not lines:
+        return {name: np.zeros(0) for name in names}
+    values = np.loadtxt(lines, comments=None, usecols=numbers, ndmin=2)
+    if len(values) != len(lines):
+        raise ValueError("an empty line among those of particles")
+    columns = {names[index]: values[:, column] for column, index in enumerate(numbers)}
+    for index in texts:
+        columns[names[index]] = np.array([line.split(None, index + 1)[index] for line in lines]).astype(str)
+    return columns
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

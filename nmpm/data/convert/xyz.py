@@ -1,0 +1,105 @@
+"""XYZ files, plain, extended or gzipped; many frames in a file or a file per frame.
+
+A frame is a line with the number of particles, a comment, and a line per particle. In extended XYZ, the comment has
+keys: `Properties=species:S:1:pos:R:3:vel:R:3` names the columns, `Time`, `Lattice` and `pbc` state time and box. Else
+columns are a name or type, x, y, z, and velocities if there are three more.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from nmpm._support.messages import one_line
+from nmpm.data.convert.frame import AXES, Frame, wrap
+from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.text_lines import Lines, open_lines, parse_columns
+from nmpm.errors import DataError
+from nmpm.scene import Boundary, Interval
+
+_KEY = re.compile(r"(\w+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))")
+
+
+class Xyz(FrameFormat):
+    """XYZ files."""
+
+    name: ClassVar[str] = "xyz"
+    summary: ClassVar[str] = "XYZ and extended XYZ (.xyz, .extxyz), also gzipped"
+    patterns: ClassVar[tuple[str, ...]] = ("*.xyz", "*.extxyz", "*.xyz.gz", "*.extxyz.gz")
+
+    def frames(self, file: Path) -> Iterator[Frame]:
+        with open_lines(file, "XYZ") as lines:
+            for number, (comment, block) in enumerate(_blocks(lines)):
+                yield _frame(comment, block, f"{file}, frame {number}")
+
+    def count(self, file: Path) -> int:
+        with open_lines(file, "XYZ") as lines:
+            return sum(1 for _ in _blocks(lines))
+
+
+def _blocks(lines: Lines) -> Iterator[tuple[str, list[bytes]]]:
+    """Yields the comment and the lines of particles of each frame."""
+    while line := lines.next():
+        start = lines.number - 1
+        if not line.strip():
+            continue
+        if not line.strip().isdigit():
+            raise ValueError(f"line {lines.number} is {one_line(line, 60)!r}; expected the number of particles")
+        yield lines.next(), lines.block(int(line), start)
+
+
+def _frame(comment: str, block: Sequence[bytes], where: str) -> Frame:
+    keys = {match[1].lower(): match[2] or match[3] or match[4] or "" for match in _KEY.finditer(comment)}
+    try:
+        names = _columns(keys["properties"]) if "properties" in keys else _plain_columns(block)
+        columns = parse_columns(block, [f"{name}/{part}" for name, width in names for part in range(width)])
+        arrays = {name: _join([columns[f"{name}/{part}"] for part in range(width)]) for name, width in names}
+        position = arrays.pop("pos")
+        if position.ndim != 2 or position.shape[1] > len(AXES) or position.dtype.kind != "f":
+            raise ValueError("expected two or three columns of coordinates")
+        box, boundary = _box(keys)
+        return Frame(
+            wrap(position, box, boundary), arrays, float(keys["time"]) if "time" in keys else None, None, box, boundary
+        )
+    except (KeyError, ValueError) as error:
+        raise DataError(f"{where}: {one_line(error)}.") from error
+
+
+def _columns(properties: str) -> list[tuple[str, int]]:
+    """Names and widths of the columns that `Properties` lists."""
+    words = properties.split(":")
+    if len(words) % 3 or not all(width.isdigit() for width in words[2::3]) or "pos" not in words[::3]:
+        raise ValueError(f"Properties={one_line(properties, 60)} does not list names, kinds and widths, or has no pos")
+    return [(name, int(width)) for name, width in zip(words[::3], words[2::3], strict=True)]
+
+
+def _plain_columns(block: Sequence[bytes]) -> list[tuple[str, int]]:
+    """Names and widths of the columns of plain XYZ."""
+    width = len(block[0].split()) if block else 4
+    rest = [("velocity", 3)] if width == 7 else [(f"column{index}", 1) for index in range(5, width + 1)]
+    return [("type", 1), ("pos", min(width - 1, 3)), *rest]
+
+
+def _join(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Columns as (N,) or (N, k); texts of digits become numbers."""
+    if len(columns) > 1:
+        return np.stack(columns, axis=1)
+    texts = columns[0].dtype.kind == "U" and len(columns[0]) > 0
+    return columns[0].astype(np.int64) if texts and np.char.isdigit(columns[0]).all() else columns[0]
+
+
+def _box(keys: dict[str, str]) -> tuple[tuple[Interval, ...] | None, tuple[Boundary, ...] | None]:
+    """The box and its boundary, where an axis is periodic; else neither is stated."""
+    periodic = [word.lower() in ("t", "true", "1") for word in keys.get("pbc", "").split()]
+    if "lattice" not in keys or not any(periodic):
+        return None, None
+    lattice = np.array(keys["lattice"].split(), float).reshape(3, 3)
+    if (lattice != np.diag(np.diag(lattice))).any():
+        raise ValueError("its box is not rectangular; only rectangular boxes can be read")
+    origin = np.array(keys.get("origin", "0 0 0").split(), float)
+    box = tuple(zip(origin.tolist(), (origin + np.diag(lattice)).tolist(), strict=True))
+    return box, tuple("periodic" if wraps else "wall" for wraps in periodic)

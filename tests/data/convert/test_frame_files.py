@@ -1,0 +1,249 @@
+"""Folders of runs with a file per frame, and files of many frames; as XYZ, whose frames any test can write."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmpm.data.convert import Options, convert, open_dataset
+from nmpm.data.format import Split
+from nmpm.errors import DataError
+
+T, N = 12, 6
+
+
+def positions(frames: int = T, seed: int = 0, particles: int = N) -> np.ndarray:
+    return np.random.default_rng(seed).random((frames, particles, 3)).round(4)
+
+
+def frame_text(position: np.ndarray, properties: str = "pos:R:3", comment: str = "", **columns: np.ndarray) -> str:
+    table = [position, *(np.asarray(values).reshape(len(position), -1) for values in columns.values())]
+    rows = [" ".join(str(value) for part in table for value in part[i]) for i in range(len(position))]
+    return "\n".join([str(len(position)), f"Properties={properties} {comment}", *rows]) + "\n"
+
+
+def write_run(folder: Path, seed: int = 0, numbers: range | list[int] = range(T)) -> np.ndarray:
+    folder.mkdir(parents=True)
+    position = positions(len(numbers), seed)
+    for number, frame in zip(numbers, position, strict=True):
+        (folder / f"frame_{number}.xyz").write_text(frame_text(frame))
+    return position
+
+
+def write_frames(path: Path, *frames: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(frames))
+    return path
+
+
+def read(source: Path, out: Path, split: str = "train", index: int = 0, **options: object):
+    if not out.exists():
+        convert(source, out, options=Options(**options))
+    return Split(out / f"{split}.h5").read_with_fields(index)
+
+
+@pytest.mark.parametrize("kind", ["a file per frame", "a file per run"])
+def test_folders_are_splits_and_runs_in_numeric_order(tmp_path, kind):
+    for seed, name in enumerate(["train/run2", "train/run10", "val/run0", "test/deep/er"]):
+        if kind == "a file per frame":
+            write_run(tmp_path / "data" / name, seed)
+        else:
+            write_frames(tmp_path / "data" / f"{name}.xyz", *map(frame_text, positions(seed=seed)))
+    for seed, (split, index) in enumerate([("train", 0), ("train", 1), ("valid", 0), ("test", 0)]):
+        trajectory = read(tmp_path / "data", tmp_path / "out", split, index)
+        np.testing.assert_array_equal(trajectory.position, positions(seed=seed).astype("f4"))
+
+
+def test_runs_without_splits_are_divided(tmp_path):
+    for run in range(5):
+        write_run(tmp_path / "data" / f"run{run}", run)
+    dataset = open_dataset(tmp_path / "data")
+    assert dataset.counts == {"train": 3, "valid": 1, "test": 1}
+    np.testing.assert_array_equal(next(dataset.splits["test"]()).position, positions(seed=4).astype("f4"))
+
+
+@pytest.mark.parametrize("kind", ["a file per frame", "a file per run"])
+def test_one_long_run_is_cut_along_time(tmp_path, kind):
+    if kind == "a file per frame":
+        position = write_run(tmp_path / "run", numbers=range(500))
+    else:
+        position = positions(500)
+        write_frames(tmp_path / "run", *map(frame_text, position)).rename(tmp_path / "run.xyz")
+    source = tmp_path / ("run" if kind == "a file per frame" else "run.xyz")
+    for split, part in (("train", slice(400)), ("valid", slice(400, 450)), ("test", slice(450, None))):
+        np.testing.assert_array_equal(read(source, tmp_path / "out", split).position, position[part].astype("f4"))
+
+
+def test_a_missing_frame_is_empty_where_the_others_are_regular(tmp_path):
+    numbers = [n for n in range(0, 40, 2) if n != 8]
+    position = write_run(tmp_path / "run", numbers=numbers)
+    notes = convert(tmp_path / "run", tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").read(0)
+    assert np.flatnonzero(np.isnan(trajectory.position).all(axis=(1, 2))).tolist() == [4]
+    np.testing.assert_array_equal(np.delete(trajectory.position, 4, axis=0), position.astype("f4"))
+    assert any("1 of 20 frames are missing (first after frame_6.xyz)" in note for note in notes)
+
+
+def test_uneven_numbers_are_noted(tmp_path):
+    for run in range(3):
+        write_run(tmp_path / "data" / f"run{run}", run, [0, 1, 2, 5, 9])
+    dataset = open_dataset(tmp_path / "data")
+    assert len(next(dataset.splits["train"]()).position) == 5
+    notes = [note for note in dataset.notes if "uneven" in note]
+    assert len(notes) == 1
+    assert "first after frame_2.xyz" in notes[0]
+    assert "2 more runs" in notes[0]
+
+
+def test_particles_are_matched_by_their_ids(tmp_path):
+    """They come, go, and are in another order in each frame; those that come are in slots by their ids, too."""
+    rng, position = np.random.default_rng(0), positions()
+    there = rng.random((T, N)) < 0.6
+    there[0, 0], there[:, 1] = False, True
+    frames = []
+    for t in range(T):
+        order = rng.permutation(np.flatnonzero(there[t]))
+        frames.append(frame_text(position[t, order], "pos:R:3:track:I:1:heat:R:1", track=order * 7, heat=order + t))
+    trajectory = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+    np.testing.assert_array_equal(np.isnan(trajectory.position[..., 0]), ~there)
+    np.testing.assert_array_equal(trajectory.position[there], position[there].astype("f4"))
+    heat = np.arange(N) + np.arange(T)[:, None]
+    np.testing.assert_array_equal(trajectory.fields["heat"][there], heat[there])
+
+
+@pytest.mark.parametrize(("name", "absent", "present"), [("type", -1, 4), ("active", 0, 1)])
+def test_masks_make_particles_absent(tmp_path, name, absent, present):
+    marks = np.full((T, N), present)
+    marks[3:5, 2] = absent
+    frames = [frame_text(*each, **{name: mark}) for each, mark in
+              ((((p, f"pos:R:3:{name}:I:1"), m) for p, m in zip(positions(), marks, strict=True)))]  # fmt: skip
+    trajectory = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+    np.testing.assert_array_equal(np.isnan(trajectory.position).all(axis=2), marks == absent)
+    assert trajectory.particle_type.tolist() == [4 if name == "type" else 0] * N
+
+
+def test_particles_that_are_never_there_are_left_out_with_a_count(tmp_path, caplog):
+    types = np.array([5, -1, 5, 6, 6, -1])
+    frames = [frame_text(position, "pos:R:3:type:I:1", type=types) for position in positions()]
+    with caplog.at_level(logging.WARNING):
+        trajectory = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+    assert trajectory.particle_type.tolist() == [5, 5, 6, 6]
+    np.testing.assert_array_equal(trajectory.position, positions()[:, types != -1].astype("f4"))
+    assert "2 particles have type -1 in all frames" in caplog.text
+
+
+def test_vectors_become_velocities_or_fields_per_component(tmp_path):
+    position = positions()
+    frames = [
+        frame_text(p, "pos:R:3:Velocity:R:3:spin:R:3:stress:R:6", v=2 * p, spin=3 * p, stress=np.tile(p, 2))
+        for p in position
+    ]
+    fields = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out").fields
+    np.testing.assert_allclose(fields["velocity"], 2 * position, rtol=1e-6)
+    np.testing.assert_allclose(fields["spin_y"], 3 * position[..., 1], rtol=1e-6)
+    np.testing.assert_allclose(fields["stress_5"], position[..., 2], rtol=1e-6)
+    assert len(fields) == 1 + 3 + 6
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_an_axis_without_extent_is_left_out(tmp_path, axis):
+    position = positions()
+    position[..., axis] = 0.25
+    frames = [frame_text(p, "pos:R:3:vel:R:3", vel=p) for p in position]
+    notes = convert(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
+    flat = np.delete(position, axis, axis=2).astype("f4")
+    np.testing.assert_array_equal(trajectory.position, flat)
+    np.testing.assert_array_equal(trajectory.fields["velocity"], flat)
+    assert any(f"{'xyz'[axis]} is 0.25 everywhere" in note for note in notes)
+
+
+def test_times_and_an_array_that_some_frames_lack(tmp_path, caplog):
+    frames = [frame_text(p, comment=f"Time={0.5 * t}") for t, p in enumerate(positions())]
+    frames[:2] = [
+        frame_text(p, "pos:R:3:heat:R:1", f"Time={0.5 * t}", h=p[:, :1]) for t, p in enumerate(positions()[:2])
+    ]
+    with caplog.at_level(logging.WARNING):
+        fields = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out").fields
+    assert fields["time"].tolist() == (0.5 * np.arange(T)).tolist()
+    assert "heat" not in fields
+    assert "frame 2: there is no array 'heat'" in caplog.text
+
+
+TWO = [[0, 0, 0], [1, 1, 1]]
+ONE_MORE = [*TWO, [0.5, 0.5, 0.6]]
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (frame_text(np.array(ONE_MORE), "pos:R:3"), "frame 1: 3 particles, but 2 in .*frame 0. .*id array"),
+        (frame_text(np.array(TWO), "pos:R:3:id:I:1", id=[1, 2]), "frame 1: only some frames have ids"),
+        (frame_text(np.array(TWO), "pos:R:3:type:I:1", id=[1, 2]), "frame 1: only some frames have types"),
+        (frame_text(np.array([[0, 0, np.inf], [1, 1, 1]])), r"frame 1: position of particle 0 is \[0.0, 0.0, inf\]"),
+        (frame_text(np.array(TWO)[:, :2], "pos:R:2"), "frame 1: 2 axes, unlike the first frame"),
+        ("2\nsomething\n1 0 0\n", "ends at line 7, within a frame; its first 4 lines are complete frames"),
+        ("many\n", "line 5 is 'many'; expected the number of particles"),
+        ("2\nProperties=where:R:3\n0 0 0\n1 1 1\n", "Properties=where:R:3 does not list names, kinds and widths, or"),
+        ("2\nProperties=pos:R:3\n0 0 0\n1 1\n", "frame 1: .*column"),
+    ],
+    ids=["number", "ids", "types", "infinite", "axes", "cut", "no number", "no positions", "columns"],
+)
+def test_frames_that_do_not_fit_are_named(tmp_path, second, message):
+    write_frames(tmp_path / "run.xyz", frame_text(np.array(TWO)), second)
+    with pytest.raises(DataError, match=f"run.xyz.*{message}"):
+        convert(tmp_path / "run.xyz", tmp_path / "out")
+
+
+def test_a_type_that_changes_is_named(tmp_path):
+    types = [[1, 2], [1, 2], [1, 3]]
+    frames = [frame_text(np.array(TWO), "pos:R:3:id:I:1:material:I:1", id=[7, 9], material=each) for each in types]
+    with pytest.raises(DataError, match=r"frame 2: particle with id 9 has type 3, but 2 in frames before"):
+        convert(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+
+
+def test_a_plane_that_is_left_late_is_named(tmp_path):
+    position = positions(20)
+    position[:15, :, 2] = 0
+    with pytest.raises(DataError, match=r"frame 15: z = .*, but 0 for all particles of the first frames"):
+        convert(write_frames(tmp_path / "run.xyz", *map(frame_text, position)), tmp_path / "out")
+
+
+def add_other_series(run: Path) -> None:
+    (run / "wall_0.xyz").write_text("")
+
+
+def empty_the_last(run: Path) -> None:
+    (run / f"frame_{T - 1}.xyz").write_text("")
+
+
+def cut_in_the_middle(run: Path) -> None:
+    (run / "frame_5.xyz").write_text((run / "frame_5.xyz").read_text()[:-20])
+
+
+def append_a_frame(run: Path) -> None:
+    (run / "frame_5.xyz").write_text(2 * (run / "frame_5.xyz").read_text())
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (add_other_series, r"run: files of 2 kinds: frame_\*.xyz \(12\), wall_\*.xyz \(1\). .*a folder of its own"),
+        (empty_the_last, r"frame_11.xyz: there is no frame in it"),
+        (cut_in_the_middle, "frame_5.xyz: cannot be read as XYZ"),
+        (append_a_frame, "frame_5.xyz: there is more than one frame in it, but one in the first file"),
+    ],
+    ids=["series", "empty", "cut", "many"],
+)
+def test_wrong_files_are_named(tmp_path, damage, message):
+    write_run(tmp_path / "run")
+    damage(tmp_path / "run")
+    with pytest.raises(DataError, match=message):
+        convert(tmp_path / "run", tmp_path / "out")
+
+
+def test_one_frame_is_no_run(tmp_path):
+    write_run(tmp_path / "run")
+    with pytest.raises(DataError, match=r"frame_3.xyz: there is one frame in it. Give the folder of the frames."):
+        convert(tmp_path / "run" / "frame_3.xyz", tmp_path / "out")
