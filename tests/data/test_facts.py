@@ -1,39 +1,252 @@
+"""Facts that are found in trajectories, on motions that are known in closed form."""
+
 import numpy as np
 import pytest
 
 from nmpm.data.convert import ForeignDataset
 from nmpm.data.convert.conversion import write_native
-from nmpm.data.format import Metadata, Trajectory, read_metadata
+from nmpm.data.facts import FactFinder, Facts, find_facts
+from nmpm.data.facts.periodic import roundest
+from nmpm.data.format import Metadata, Split, Trajectory, read_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
+from nmpm.errors import DataError
 
 PLACEHOLDERS = Metadata(((0.0, 1.0),) * 2, 1.0, 2, 0, {})
-EVERYTHING = frozenset({"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "particle_types"})
+EVERYTHING = frozenset(
+    {"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "particle_types", "sequence_length"}
+)
+SPACING = 0.1
 
 
-def test_a_dataset_of_bare_positions_becomes_a_scene(tmp_path):
-    rng = np.random.default_rng(0)
-    start = rng.uniform(2, 3, (1, 40, 2))
-    runs = [
-        Trajectory(
-            (start + 0.01 * np.arange(9)[:, None, None]).astype(np.float32),
-            np.full(40, 4),
-            {},
-            {"time": 0.5 * np.arange(9)},
-        )
-        for _ in range(2)
-    ]
-    notes = write_native(
-        ForeignDataset(PLACEHOLDERS, {"train": lambda: iter(runs)}, unknown=EVERYTHING), tmp_path / "a"
-    )
-    metadata = read_metadata(tmp_path / "a")
-    assert metadata.dt == 0.5
-    assert metadata.particle_types == {4: "particles"}
-    assert metadata.sequence_length == 8
-    assert metadata.extra["vel_mean"] == pytest.approx([0.01, 0.01], rel=1e-3)
-    assert set(metadata.extra["found"]) >= EVERYTHING
-    assert any("recorded times" in note for note in notes)
-    scene = infer_scene(tmp_path / "a")
-    assert scene.materials == ("particles",)
-    for low, high in scene.bounds:
-        assert low < 2.05
-        assert high > 3.0
+def block(rng: np.random.Generator, side: int = 12, dim: int = 2, jitter: float = 0.0) -> np.ndarray:
+    """(N, D) particles on a lattice, or near it, around the middle of a box of 10."""
+    axis = SPACING * np.arange(side)
+    points = np.stack(np.meshgrid(*[axis] * dim), axis=-1).reshape(-1, dim)
+    return points + rng.uniform(4, 5, dim) + jitter * SPACING * rng.uniform(-1, 1, points.shape)
+
+
+def thrown(rng: np.random.Generator, gravity: tuple[float, ...], frames: int = 60, dt: float = 0.1) -> np.ndarray:
+    """(T, N, D) positions of a block in a box of 10, whose particles lose half of their speed at walls."""
+    start, dim = block(rng, side=5 if len(gravity) == 3 else 12, dim=len(gravity)), len(gravity)
+    position, velocity = start.copy(), rng.uniform(-3, 3, dim) + rng.normal(scale=0.01, size=start.shape)
+    path = [start]
+    for _ in range(frames - 1):
+        position = position + velocity * dt + 0.5 * np.array(gravity) * dt**2
+        velocity = velocity + np.array(gravity) * dt
+        outside = (position < 0) | (position > 10)
+        position, velocity = np.clip(position, 0, 10), np.where(outside, -velocity / 2, velocity)
+        path.append(position)
+    return np.stack(path)
+
+
+def facts_of(*positions: np.ndarray, types: np.ndarray | None = None, **fields: np.ndarray) -> Facts:
+    finder = FactFinder(positions[0].shape[2])
+    for position in positions:
+        kinds = np.zeros(position.shape[1], int) if types is None else types
+        finder.add(Trajectory(position, kinds, {}, fields))
+    return finder.facts()
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+class TestGravity:
+    @pytest.mark.parametrize("gravity", [(0.0, -2.0), (1.5, 0.0), (0.0, 0.0, 2.0)])
+    def test_direction_sign_and_size_from_thrown_blocks(self, rng, gravity):
+        runs = [thrown(rng, gravity, frames=30) for _ in range(4)]
+        fact = facts_of(*runs, time=0.1 * np.arange(30)).gravity
+        assert fact.value == pytest.approx(gravity, abs=2e-3)
+        assert fact.sure == "measured"
+        assert "4 of 4 trajectories" in fact.how
+
+    def test_is_none_where_particles_fly_straight(self, rng):
+        fact = facts_of(*[thrown(rng, (0.0, 0.0)) for _ in range(3)]).gravity
+        assert (fact.value, fact.sure) == ((0.0, 0.0), "measured")
+
+    def test_is_unknown_where_particles_start_at_rest(self, rng):
+        runs = [np.repeat(block(rng)[None], 40, axis=0) for _ in range(3)]
+        for run in runs:
+            run[20:] += np.cumsum(rng.normal(scale=0.02, size=(20, *run.shape[1:])), axis=0)
+        fact = facts_of(*runs).gravity
+        assert fact.value is None
+        assert "at rest in first frames" in fact.how
+
+    def test_is_unknown_under_noise_and_known_where_the_fall_exceeds_it(self, rng):
+        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
+        assert facts_of(*[run + rng.normal(scale=0.5, size=run.shape) for run in runs]).gravity.value is None
+        fact = facts_of(
+            *[run + rng.normal(scale=5e-4, size=run.shape) for run in runs], time=0.1 * np.arange(30)
+        ).gravity
+        assert fact.value == pytest.approx((0.0, -2.0), abs=0.02)
+
+    def test_that_differs_between_trajectories_is_reported(self, rng):
+        runs = [thrown(rng, gravity, frames=20) for gravity in ((0.0, -2.0), (2.0, 0.0), (0.0, 2.0), (-2.0, 0.0))]
+        fact = facts_of(*runs).gravity
+        assert fact.value is None
+        assert "differs" in fact.how
+
+    def test_from_flights_after_a_start_at_rest(self, rng):
+        runs = []
+        for _ in range(3):
+            flight = thrown(rng, (0.0, -2.0), frames=30)
+            runs.append(np.concatenate([np.repeat(flight[:1], 20, axis=0), flight]))
+        fact = facts_of(*runs, time=0.1 * np.arange(50)).gravity
+        assert fact.value == pytest.approx((0.0, -2.0), abs=0.02)
+        assert "at any time" in fact.how
+
+
+class TestBounds:
+    def test_walls_that_are_touched_in_several_trajectories(self, rng):
+        facts = facts_of(*[thrown(rng, (0.0, -2.0), frames=120) for _ in range(8)])
+        (left, right), (floor, top) = facts.bounds.value
+        assert (left, right, floor) == pytest.approx((0.0, 10.0, 0.0), abs=1e-6)
+        assert top > 6
+        assert facts.walls[0] == (True, True)
+        assert facts.boundary.value == ("wall", "wall")
+
+    def test_a_free_block_touches_nothing(self, rng):
+        facts = facts_of(*[thrown(rng, (0.0, -1.0), frames=8) for _ in range(3)])
+        assert facts.walls == ((False, False), (False, False))
+        assert facts.bounds.sure == "guessed"
+
+    def test_a_period_from_jumps(self, rng):
+        start = rng.uniform(0, 1, (300, 2)) * (4, 1)
+        path = start + np.arange(40)[:, None, None] * rng.normal((0.12, 0.0), (0.02, 0.001), start.shape)
+        path[..., 0] = np.mod(path[..., 0] + 2, 4) - 2
+        facts = facts_of(path)
+        assert facts.boundary.value == ("periodic", "wall")
+        assert facts.bounds.value[0] == (-2.0, 2.0)
+
+    def test_particles_that_are_put_back_elsewhere_do_not_wrap(self, rng):
+        path = rng.uniform(0, 1, (300, 2)) + np.arange(40)[:, None, None] * np.array([0.024, 0.0])
+        again = path[..., 0] > 1
+        path[..., 0] = np.mod(path[..., 0], 1)
+        path[..., 1] = np.where(again, rng.uniform(0, 1, path.shape[1]), path[..., 1])
+        assert "periodic" not in facts_of(path).boundary.value
+
+    def test_open_where_tracks_end_at_one_end(self, rng):
+        path = rng.uniform(0, 1, (400, 2)) * (4, 1) + np.arange(60)[:, None, None] * np.array([0.08, 0.0])
+        path[path[..., 0] > 4] = np.nan
+        facts = facts_of(path)
+        assert facts.boundary.value == ("open", "wall")
+        assert facts.bounds.value[0] == pytest.approx((0, 4), abs=0.05)
+
+    def test_open_everywhere_where_tracks_begin_and_end_anywhere(self, rng):
+        path = rng.uniform(0, 1, (400, 3)) + np.cumsum(rng.normal(scale=0.01, size=(60, 400, 3)), axis=0)
+        first, last = np.sort(rng.integers(0, 60, (2, 400)), axis=0)
+        frame = np.arange(60)[:, None]
+        path[(frame < first) | (frame > last)] = np.nan
+        assert facts_of(path).boundary.value == ("open",) * 3
+
+
+class TestTypes:
+    def test_static_and_rigid_types_and_particles_that_never_move(self, rng):
+        fluid = thrown(rng, (0.0, -2.0), frames=40)
+        fluid[:, :3] = fluid[:1, :3]
+        wall = np.repeat(rng.uniform(0, 10, (1, 30, 2)), 40, axis=0)
+        angle = 0.1 * np.arange(40)
+        turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(40, 2, 2)
+        paddle = np.einsum("tij,nj->tni", turn, rng.uniform(-1, 1, (20, 2))) + 5
+        types = np.repeat([4, 2, 7], [fluid.shape[1], 30, 20])
+        facts = facts_of(np.concatenate([fluid, wall, paddle], axis=1), types=types)
+        assert facts.static_types.value == {2}
+        assert facts.prescribed_types.value == {7}
+        assert facts.particle_types.value == {2: "boundary", 4: "particles", 7: "moving boundary"}
+        (still,) = facts.unmoving
+        assert (still.trajectory, still.particle, still.count) == (0, 0, 3)
+
+    def test_nothing_is_static_where_nothing_moves(self, rng):
+        facts = facts_of(np.repeat(block(rng)[None], 5, axis=0))
+        assert facts.static_types.value == facts.prescribed_types.value == frozenset()
+        assert facts.particle_types.value == {0: "particles"}
+
+
+class TestVolume:
+    @pytest.mark.parametrize("dim", [2, 3])
+    @pytest.mark.parametrize("jitter", [0.0, 0.25])
+    def test_of_lattices(self, rng, dim, jitter):
+        start = block(rng, side=30 if dim == 2 else 14, dim=dim, jitter=jitter)
+        fact = facts_of(np.stack([start, start + 1])).particle_volume
+        assert fact.value == pytest.approx(SPACING**dim, rel=0.05)
+
+    @pytest.mark.parametrize("dim", [2, 3])
+    def test_of_particles_at_random_places_in_blocks(self, rng, dim):
+        start = np.concatenate([rng.uniform(0, 1, (900, dim)), rng.uniform(3, 4, (900, dim))])
+        fact = facts_of(np.stack([start, start + 1])).particle_volume
+        assert fact.value == pytest.approx(1 / 900, rel=0.1)
+        assert "not a lattice" in fact.how
+
+
+class TestTime:
+    def test_median_of_recorded_steps_and_a_word_on_uneven_ones(self, rng):
+        run = thrown(rng, (0.0, -2.0), frames=20)
+        assert facts_of(run, time=0.25 * np.arange(20)).dt.value == 0.25
+        uneven = np.where(np.arange(20) < 15, 0.25, 0.5).cumsum()
+        assert "uneven" in facts_of(run, time=uneven).dt.how
+
+    def test_from_velocities(self, rng):
+        run = thrown(rng, (0.0, -2.0), frames=20)
+        velocity = np.gradient(run, axis=0) / 0.04
+        fact = facts_of(run, velocity=velocity)
+        assert fact.dt.value == pytest.approx(0.04, rel=2e-3)
+        steps = facts_of(run, velocity=velocity, time=100.0 * np.arange(20)).dt
+        assert steps.value == pytest.approx(0.04, rel=2e-3)
+        assert "another unit" in steps.how
+        assert facts_of(run, velocity=velocity * 0.04, time=0.1 * np.arange(20)).dt.value == 0.1
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(0.98, 1.02, 1.0), (-0.03, 0.02, 0.0), (119, 131, 120), (-30.2, -29.7, -30), (1, 1, 1)],
+)
+def test_the_roundest_number_of_an_interval(low, high, expected):
+    assert roundest(low, high) == expected
+
+
+def test_absent_particles_everywhere_are_an_error():
+    with pytest.raises(DataError, match="no trajectory has a particle"):
+        FactFinder(2).facts()
+
+
+class TestConversion:
+    def test_bare_positions_become_a_scene(self, rng, tmp_path):
+        runs = [
+            Trajectory(thrown(rng, (0.0, -2.0)), np.full(144, 4), {}, {"time": 0.1 * np.arange(60)}) for _ in range(3)
+        ]
+        source = ForeignDataset(PLACEHOLDERS, {"train": lambda: iter(runs)}, unknown=EVERYTHING)
+        notes = write_native(source, tmp_path / "a")
+        metadata = read_metadata(tmp_path / "a")
+        assert metadata.dt == pytest.approx(0.1)
+        assert metadata.particle_types == {4: "particles"}
+        assert metadata.sequence_length == 59
+        assert set(metadata.extra["found"]) >= EVERYTHING
+        assert any("gravity (0, -2) (measured: free flight" in note for note in notes)
+        scene = infer_scene(tmp_path / "a")
+        assert scene.materials == ("particles",)
+        assert scene.gravity == pytest.approx((0.0, -2.0), abs=1e-3)
+
+    def test_statistics_are_those_of_the_types_that_are_found_to_move(self, rng, tmp_path):
+        fluid = thrown(rng, (0.0, -2.0))
+        position = np.concatenate([fluid, np.repeat(block(rng)[None], 60, axis=0)], axis=1)
+        run = Trajectory(position, np.repeat([0, 1], 144))
+        unknown = ForeignDataset(PLACEHOLDERS, {"train": lambda: iter([run])}, unknown=EVERYTHING)
+        write_native(unknown, tmp_path / "a")
+        metadata = read_metadata(tmp_path / "a")
+        assert metadata.static_types == {1}
+        assert metadata.extra["vel_mean"] == pytest.approx(np.diff(fluid, axis=0).mean((0, 1)).tolist(), rel=1e-3)
+
+    def test_gravities_of_trajectories_are_kept(self, rng, tmp_path):
+        run = Trajectory(thrown(rng, (0.0, -2.0)), np.zeros(144, int), {"gravity": [0.0, -5.0]})
+        write_native(ForeignDataset(PLACEHOLDERS, {"train": lambda: iter([run])}, unknown=EVERYTHING), tmp_path / "a")
+        assert read_metadata(tmp_path / "a").gravity is None
+        assert infer_scene(tmp_path / "a").gravity == (0.0, -5.0)
+
+
+def test_facts_of_a_split_in_the_units_that_metadata_state(rng, tmp_path):
+    write_split(tmp_path / "train.h5", [Trajectory(thrown(rng, (0.0, -2.0)), np.zeros(144, int)) for _ in range(3)])
+    split = Split(tmp_path / "train.h5")
+    assert find_facts(split).gravity.value == pytest.approx((0.0, -0.02), abs=1e-4)
+    stated = Metadata(((0.0, 10.0),) * 2, 0.1, 2, 59, {0: "sand"})
+    assert find_facts(split, stated).gravity.value == pytest.approx((0.0, -2.0), abs=1e-2)

@@ -95,7 +95,8 @@ class _Log:
         self.number = self.moving_boundaries = self.particles = 0
         self.frames: set[int] = set()
         self.extent = Extent(self.metadata.dim)
-        self._finder = FactFinder(self.metadata.dim)
+        dt = None if "dt" in self.unknown else self.metadata.dt
+        self._finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types)
         self._facts: list[str] = []
 
     def watch(
@@ -118,6 +119,8 @@ class _Log:
             raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {metadata.dim}.")
         if self.unknown:
             self._finder.add(trajectory)
+            if "gravity" in trajectory.attributes:
+                self.unknown -= {"gravity"}
         if self.problems is None and "particle_types" not in self.unknown:
             metadata.check_types(types, where)
         if not self.statistics:

@@ -100,7 +100,7 @@ def find_axes(
     openings = find_openings(positions, *extent)
     axes = []
     for axis, (low, high) in enumerate(zip(*extent, strict=True)):
-        period = find_period(positions, axis, float(low), float(high))
+        period = find_period(positions, axis, *extent)
         lower, upper = (None if period else find_wall(positions, axis, end, spacing) for end in (False, True))
         axes.append(
             Axis(

@@ -75,25 +75,30 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
 
 
 def _first_flight(track: Track, spacing: float) -> Flight | None:
-    """The flight in first frames: over many of them where it is straight, over few where few agree."""
+    """The flight in first frames: over few of them where few agree, over many where it is straight so far."""
     flights = [track.flight(0, frames, spacing) for frames in _FRAMES]
     best = max((flight for flight in flights if flight), key=lambda flight: flight.share > _SHARE, default=None)
     if best is not None and best.straight:
+        half = _LONG // 2
+        halves = [track.flight(start, half, spacing) for start in (0, half)]
         longer = track.flight(0, _LONG, spacing)
-        return longer if longer is not None and longer.share >= _SHARE else best
+        if longer and all(part and _same(part.acceleration, longer.acceleration, 2 * AGREE) for part in halves):
+            return longer
     return best
+
+
+def _same(one: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
+    return bool(np.linalg.norm(one - other) < tolerance * np.linalg.norm(other))
 
 
 def _later_flight(track: Track, spacing: float) -> Flight | None:
     """The acceleration that particles share at any time, among those that are clearly accelerated."""
-    starts = np.unique(np.linspace(0, len(track.position) - _LATER_FRAMES, _LATER).astype(int))
-    fits = [
-        fit_parabolas(track.position[at : at + _LATER_FRAMES], track.time[at : at + _LATER_FRAMES])
-        for at in starts
-        if at >= 0
-    ]
-    if not fits:
+    final = len(track.position) - _LATER_FRAMES
+    if final < 0:
         return None
+    starts = np.unique(np.linspace(0, final, _LATER).astype(int))
+    windows = [slice(start, start + _LATER_FRAMES) for start in starts.tolist()]
+    fits = [fit_parabolas(track.position[window], track.time[window]) for window in windows]
     every = join(fits)
     size = np.linalg.norm(every.acceleration, axis=1)
     flight = shared_acceleration(every.select(every.error < AGREE / 2 * size), spacing)
@@ -112,8 +117,7 @@ def _agreeing(vectors: Sequence[np.ndarray], tolerance: float) -> list[int]:
 def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[float, ...] | None]:
     vectors = [flight.acceleration for flight in flights]
     share = float(np.median([flight.share for flight in flights]))
-    size = float(np.linalg.norm(np.median(vectors, axis=0)))
-    means = sum(bool(np.linalg.norm(flight.mean - flight.acceleration) < AGREE * size) for flight in flights)
+    means = sum(_same(flight.mean, flight.acceleration, AGREE) for flight in flights)
     how = (
         f"free flight of {share:.0%} of the particles in first frames, in {len(flights)} of {number} trajectories; the"
         f" mean acceleration of all particles agrees in {means}"

@@ -12,6 +12,7 @@ _FAR = 0.5  # of the extent: longer steps are jumps
 _AGREE = 0.02  # of the period
 _JUMPS = 3  # fewer suffice where their period is the extent
 _FULL = 0.01  # of the period: how far the extent may differ from it then
+_WRAPS = 0.5  # of the long steps
 _ROUNDING = 1e-4  # of the period: errors that are rounded away
 
 
@@ -29,14 +30,19 @@ class Period:
         return self.lower, self.lower + self.length
 
 
-def find_period(positions: Iterable[np.ndarray], axis: int, low: float, high: float) -> Period | None:
-    """The period along an axis where positions (F, N, D) lie in [low, high], or None if particles do not wrap.
+def find_period(positions: Iterable[np.ndarray], axis: int, low: np.ndarray, high: np.ndarray) -> Period | None:
+    """The period along an axis, where positions (F, N, D) lie between low and high (D,); None if they do not wrap.
 
-    A jump counts where the steps before and after it, which are short, continue one motion along all axes.
+    Most long steps must be wraps, where the steps before and after continue one motion along all axes.
     """
     lengths = np.concatenate([np.empty(0), *(_jumps(position, axis, high - low) for position in positions)])
-    if not len(lengths):
+    wraps = np.isfinite(lengths)
+    if not len(lengths) or wraps.mean() < _WRAPS:
         return None
+    return _period(lengths[wraps], float(low[axis]), float(high[axis]))
+
+
+def _period(lengths: np.ndarray, low: float, high: float) -> Period | None:
     length, least = float(np.median(lengths)), high - low
     close = np.abs(lengths - length) < _AGREE * length
     if close.mean() < 0.5 or (close.sum() < _JUMPS and abs(length - least) > _FULL * length):
@@ -47,23 +53,22 @@ def find_period(positions: Iterable[np.ndarray], axis: int, low: float, high: fl
     return Period(roundest(min(high - length, low) - slack, low + slack), length, int(close.sum()))
 
 
-def _jumps(position: np.ndarray, axis: int, extent: float) -> np.ndarray:
-    """Lengths of the period by each jump along an axis."""
-    step = np.diff(position.astype(np.float64), axis=0)
-    if len(step) < 3 or extent <= 0:
+def _jumps(position: np.ndarray, axis: int, extent: np.ndarray) -> np.ndarray:
+    """The period by each long step along an axis; NaN by steps that do not continue the motion."""
+    step = np.diff(position, axis=0)
+    if len(step) < 3 or not extent[axis] > 0:
         return np.empty(0)
     before, jump, after = step[:-2], step[1:-1], step[2:]
-    far = np.abs(jump[..., axis]) > _FAR * extent
-    far &= (np.abs(before[..., axis]) < _FAR * extent) & (np.abs(after[..., axis]) < _FAR * extent)
+    size = [np.abs(each[..., axis]) / extent[axis] for each in (before, jump, after)]
+    far = (size[1] > _FAR) & (size[0] < _FAR) & (size[2] < _FAR)
     expected = (before[far] + after[far]) / 2
-    across = jump[far] - expected
-    speed = np.linalg.norm(expected, axis=1) + 1e-3 * extent
+    excess = jump[far] - expected
+    speed = np.linalg.norm(expected, axis=1)[:, None] + 1e-3 * extent
     # Along the other axes a particle moves on, unless it wraps there too.
-    others = np.abs(np.delete(across, axis, axis=1))
-    smooth = ((others < speed[:, None]) | (others > _FAR * extent)).all(axis=1)
+    smooth = np.abs(excess) < speed
+    smooth |= np.abs(excess) > (1 - _FULL) * extent
     outward = np.sign(expected[:, axis]) != np.sign(jump[far][:, axis])
-    lengths: np.ndarray = np.abs(across[smooth & outward, axis])
-    return lengths
+    return np.where(smooth.all(axis=1) & outward, np.abs(excess[:, axis]), np.nan)
 
 
 def roundest(low: float, high: float) -> float:
