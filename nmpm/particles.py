@@ -191,6 +191,11 @@ class Window(Batched):
         return dataclasses.replace(self, **cut)
 
     @property
+    def recorded(self) -> Tensor:
+        """The frames, (B, T, N, D), NaN where a particle is absent."""
+        return self.frames if self.present is None else self.frames.where(self.present.unsqueeze(-1), torch.nan)
+
+    @property
     def target(self) -> Tensor:
         """The frames to predict, (B, T - 2, N, D)."""
         return self.frames[:, 2:]

@@ -24,7 +24,7 @@ from nmpm.data.write import find_writer, write_trajectory
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from nmpm.emulator import Rollout
+    from nmpm.emulator import Prescribed, Rollout
     from nmpm.particles import Particles, Window
     from nmpm.zoo import Pretrained
 
@@ -45,6 +45,7 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
     options = _parser().parse_args(words[1:])
     _check(options)
+    from nmpm.emulator import Prescribed
     from nmpm.emulator.input_checks import warn_of_start_outside
     from nmpm.zoo.registry import load_model
 
@@ -54,7 +55,8 @@ def run(words: list[str]) -> None:
     recorded = 0 if window is None else window.target.shape[1]
     state = _thrown_state(model, options) if window is None else window.initial
     warn_of_start_outside(model.emulator, state.to(model.emulator.device))
-    rollout = _predict(model, state, options.frames or recorded or FRAMES, options)
+    prescribed = None if window is None else Prescribed.of(window)
+    rollout = _predict(model, state, prescribed, options.frames or recorded or FRAMES, options)
     hint = _write(model, state, rollout, window if recorded else None, options)
     if window is not None and recorded:
         _print_errors(model, window, rollout, options)
@@ -141,14 +143,17 @@ def _recorded(model: Pretrained, path: Path, index: int) -> Window:
     return collate([recordings[index]], model.scene)
 
 
-def _predict(model: Pretrained, state: Particles, frames: int, options: argparse.Namespace) -> Rollout:
+def _predict(
+    model: Pretrained, state: Particles, prescribed: Prescribed | None, frames: int, options: argparse.Namespace
+) -> Rollout:
     from nmpm._support.progress import progress_bar
     from nmpm.emulator import Rollout, stream_rollout
     from nmpm.emulator.monitor import Monitor, Policy
 
     monitor, parts = Monitor(Policy(options.watch)), []
     with progress_bar("rollout", -(-frames // model.emulator.frames)) as step:
-        for bundle in stream_rollout(model.emulator, state.to(model.emulator.device), frames, monitor):
+        start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
+        for bundle in stream_rollout(model.emulator, start, frames, monitor, given):
             parts.append(bundle.cpu())  # as a device may have less memory than a long rollout needs
             step()
     sys.stdout.write(monitor.report() + "\n")
@@ -163,9 +168,17 @@ def _write(
     from nmpm.data.predictions import predicted_trajectory
 
     origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
-    truth = None if window is None else window.frames[:, : rollout.position.shape[1] + 2]
     start = state.to("cpu")
-    predicted = predicted_trajectory(model.scene, start, rollout.position, origin, fields=rollout.fields, truth=truth)
+    predicted = predicted_trajectory(
+        model.scene,
+        start,
+        rollout.position,
+        origin,
+        fields=rollout.fields,
+        truth=None if window is None else window.recorded[:, : rollout.position.shape[1] + 2],
+        real=None if window is None else window.mask,
+        obstacle_frames=None if window is None else window.obstacle_frames,
+    )
     metadata = described_metadata(predicted.attributes, options.out, len(predicted.position))
     file = write_trajectory(options.out, predicted, metadata)
     frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
@@ -182,7 +195,7 @@ def _print_errors(model: Pretrained, window: Window, rollout: Rollout, options: 
     from nmpm.metrics import MSE
 
     frames = min(window.target.shape[1], rollout.position.shape[1])
-    comparison = Comparison(model.scene, [MSE()])
+    comparison = Comparison(model.scene, [MSE()], model.emulator.frames)
     fields = {name: values[:, :frames] for name, values in rollout.fields.items()}
     comparison.update(window.first(frames + 2), rollout.position[:, :frames], fields)
     figures = {name: float(value) for name, value in comparison.compute().items()}

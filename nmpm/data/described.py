@@ -16,7 +16,7 @@ from nmpm.scene import Scene
 
 
 def description(trajectory: Trajectory, metadata: Metadata, particle_volume: float) -> dict[str, Any]:
-    """The attributes `scene` and `particle_types`, in JSON, and `static_types`, of a trajectory of a dataset."""
+    """The attributes `scene`, `particle_types`, in JSON, and ids of types of a trajectory of a dataset."""
     types = np.unique(trajectory.particle_type).tolist()
     scene = Scene(
         bounds=metadata.bounds,
@@ -28,16 +28,22 @@ def description(trajectory: Trajectory, metadata: Metadata, particle_volume: flo
         gravity=metadata.gravity,
         gravity_varies="gravity" in trajectory.attributes,
         obstacles=bool(metadata.obstacle_types & set(types)),
+        moving_obstacles=bool(metadata.prescribed_types & set(types)),
     )
-    return {
+    prescribed = np.array(sorted(metadata.prescribed_types), dtype=np.int64)
+    return ({"prescribed_types": prescribed} if len(prescribed) else {}) | {
         "scene": json.dumps(scene.to_dict()),
         "particle_types": json.dumps({i: name for i, name in metadata.particle_types.items() if i in types}),
         "static_types": np.array(sorted(metadata.static_types), dtype=np.int64),
     }
 
 
-def read_description(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, dict[int, str], frozenset[int]]:
-    """The scene, the names of the type ids, and the ids that do not move, of a trajectory with a description.
+def read_description(
+    attributes: Mapping[str, Any], path: Path
+) -> tuple[Scene, dict[int, str], frozenset[int], frozenset[int]]:
+    """The scene, the names of the type ids, the ids that do not move, and those that move as prescribed.
+
+    Of a trajectory with a description.
 
     Raises:
         DataError: naming the file, if an attribute is missing or wrong.
@@ -47,17 +53,19 @@ def read_description(attributes: Mapping[str, Any], path: Path) -> tuple[Scene, 
         raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
     plain, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
     static = np.asarray(attributes.get("static_types")).tolist()
-    keys = JsonKeys(path, {"particle_types": names, "static_types": static})
+    prescribed = np.asarray(attributes.get("prescribed_types", [])).tolist()
+    keys = JsonKeys(path, {"particle_types": names, "static_types": static, "prescribed_types": prescribed})
     try:
         scene = Scene.from_dict(plain)
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from error
-    return scene, keys.take("particle_types", parse_names), keys.take("static_types", parse_ids)
+    ids = (keys.take(key, parse_ids) for key in ("static_types", "prescribed_types"))
+    return scene, keys.take("particle_types", parse_names), *ids
 
 
 def described_metadata(attributes: Mapping[str, Any], path: Path, frames: int) -> Metadata:
     """The metadata of a dataset of trajectories with this description, of so many frames; see `read_description`."""
-    scene, names, static = read_description(attributes, path)
+    scene, names, static, prescribed = read_description(attributes, path)
     return Metadata(
         bounds=scene.bounds,
         dt=scene.dt,
@@ -65,6 +73,7 @@ def described_metadata(attributes: Mapping[str, Any], path: Path, frames: int) -
         sequence_length=frames - 1,
         particle_types=names,
         static_types=static,
+        prescribed_types=prescribed,
         boundary=scene.boundary,
         domain=scene.domain,
         gravity=scene.gravity,

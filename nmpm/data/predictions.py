@@ -18,6 +18,7 @@ from nmpm.particles import Particles
 from nmpm.scene import Scene
 
 BOUNDARY = 3  # DeepMind's id of particles that do not move
+MOVING_WALL = 2  # LagrangeBench's id of those that move as prescribed
 
 
 def predicted_trajectory(
@@ -28,19 +29,24 @@ def predicted_trajectory(
     index: int = 0,
     fields: Mapping[str, Tensor] | None = None,
     truth: Tensor | None = None,
+    real: Tensor | None = None,
+    obstacle_frames: Tensor | None = None,
 ) -> Trajectory:
     """One scene of a batch: the two frames that the rollout started from, then the prediction.
 
     Args:
         scene: The facts of the scenes; stored beside the positions.
         state: The states that the rollouts started from.
-        predicted: (B, T, N, D) positions in domain length.
+        predicted: (B, T, N, D) positions in domain length, NaN where a particle is not there.
         model: What predicted, in words.
         index: Which scene of the batch.
         fields: (B, T, N) predicted fields by name; stored as further datasets (T + 2, N), NaN for obstacles. The first
             two frames have the state's values, the first predicted ones where the state lacks them.
         truth: (B, T', N, D) recorded positions from the first of these two frames on, in domain length; stored as the
             dataset `truth`, which `nmpm view` and `nmpm render` show beside the prediction.
+        real: (B, N) bool, which particles are written; those of the states when left out.
+        obstacle_frames: (B, T'', M, D) positions of obstacles that move, from the first of these two frames on; in
+            later frames they are where they were last.
 
     Raises:
         DataError: if the state has bodies, which no file can hold as such.
@@ -50,9 +56,12 @@ def predicted_trajectory(
             "The state has obstacles as bodies, of which a file could hold no shapes: fill them with particles,"
             " state(…, obstacle=body.particles(spacing)), and predict again."
         )
-    real = state.mask[index]
+    real = (state.mask if real is None else real)[index]
     start = torch.stack([state.position[index] - state.velocity[index], state.position[index]])
-    obstacle = state.obstacle[index, state.obstacle_mask[index]].cpu().numpy()
+    start = start.where(state.mask[index].unsqueeze(-1), torch.nan)
+    moves = obstacle_frames is not None
+    obstacles = state.obstacle.unsqueeze(1) if obstacle_frames is None else obstacle_frames
+    obstacle = obstacles[index][:, state.obstacle_mask[index]].cpu().numpy()
     position = _with_obstacle(torch.cat([start, predicted[index]])[:, real], obstacle)
     # DeepMind's ids; beyond 100 for materials that it does not have.
     ids = {name: number for number, name in FAMILIES["deepmind"].types.items()}
@@ -61,14 +70,16 @@ def predicted_trajectory(
     attributes: dict[str, Any] = {
         "generator": f"nmpm {__version__}, predicted by {model}",
         "scene": json.dumps(scene.to_dict()),
-        "particle_types": json.dumps({**types, BOUNDARY: "boundary"}),
+        "particle_types": json.dumps({**types, BOUNDARY: "boundary"} | ({MOVING_WALL: "moving wall"} if moves else {})),
         "static_types": np.array([BOUNDARY]),
     }
+    if moves:
+        attributes["prescribed_types"] = np.array([MOVING_WALL])
     if scene.gravity_varies:
         attributes["gravity"] = (state.gravity[index].double() / scene.dt**2).cpu().numpy()
-    particle_type = np.concatenate([moving, np.full(len(obstacle), BOUNDARY)])
+    particle_type = np.concatenate([moving, np.full(obstacle.shape[1], MOVING_WALL if moves else BOUNDARY)])
     stored = {
-        name: _field_frames(state.fields.get(name, values[:, 0])[index], values[index], real, len(obstacle))
+        name: _field_frames(state.fields.get(name, values[:, 0])[index], values[index], real, obstacle.shape[1])
         for name, values in (fields or {}).items()
     }
     if truth is not None:
@@ -77,9 +88,9 @@ def predicted_trajectory(
 
 
 def _with_obstacle(moving: Tensor, obstacle: np.ndarray) -> np.ndarray:
-    """(T, N + M, D) positions: those of the particles that move, then those of the obstacle (M, D)."""
-    resting = np.broadcast_to(obstacle, (len(moving), *obstacle.shape))
-    return np.concatenate([moving.cpu().numpy(), resting], axis=1)
+    """(T, N + M, D) positions: those of the particles, then those of the obstacle (F, M, D), which then stays."""
+    frames = np.minimum(np.arange(len(moving)), len(obstacle) - 1)
+    return np.concatenate([moving.cpu().numpy(), obstacle[frames]], axis=1)
 
 
 def _field_frames(start: Tensor, predicted: Tensor, real: Tensor, obstacles: int) -> np.ndarray:

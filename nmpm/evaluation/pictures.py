@@ -23,9 +23,11 @@ def labelled_trajectories(scene: Scene, window: Window, predicted: Tensor, title
         title: Of the picture.
     """
     real = window.mask[0]
-    truth = window.frames[0][:, real]
+    truth = window.recorded[0][:, real]
     prediction = torch.cat([truth[:2], predicted[0][:, real]])
     broken = ~prediction.isfinite().flatten(1).all(1)
+    if window.present is not None:  # (NaN where a particle is absent)
+        broken = prediction.isinf().flatten(1).any(1) | prediction.isnan().flatten(1).all(1)
     frames = int(broken.int().argmax()) if broken.any() else len(prediction)
     rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()

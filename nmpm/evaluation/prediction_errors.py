@@ -58,17 +58,26 @@ class Measures:
 
 
 def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Measures) -> dict[str, float]:
-    """Errors of a prediction (1, T, N, D) of the only scene of a window; all positions are finite."""
+    """Errors of a prediction (1, T, N, D) of the only scene of a window; all positions that count are finite.
+
+    Of particles that enter and leave, those that are present count, and energies and shapes are left out.
+    """
     moving = window.mask[0]
     material = window.material[0, moving]
+    volume = None if window.volume is None else window.volume[0, moving].double()
+    there = None if window.present is None else window.present[0, 2:, moving]
     ours, theirs = predicted[0, :, moving].double(), window.target[0, :, moving].double()
     curve = squared_errors(window, predicted)
-    errors = {"mse": float(curve.mean())}
-    errors |= {f"mse@{h}": float(curve[:h].mean()) for h in measures.horizons if h <= len(curve)}
-    errors["field"] = field_error(scene, ours, theirs, material)
+    errors = {"mse": _mean(curve)} | {f"mse@{h}": _mean(curve[:h]) for h in measures.horizons if h <= len(curve)}
+    errors["field"] = field_error(scene, ours, theirs, material, there, volume)
     if measures.emd_frames:
         frames = _evenly_spaced(len(ours), measures.emd_frames)
-        errors["emd"] = earth_mover_of_materials(ours[frames], theirs[frames], material, measures.emd_particles)
+        counts = None if there is None else there[frames]
+        errors["emd"] = earth_mover_of_materials(
+            ours[frames], theirs[frames], material, measures.emd_particles, counts, volume
+        )
+    if there is not None:
+        return errors
     kinetic, truth = (_energy(scene, *_path(window, positions))[0] for positions in (ours, theirs))
     errors["kinetic"] = float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))
     if bool((window.gravity != 0).any()):
@@ -80,12 +89,26 @@ def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Me
 
 
 def squared_errors(window: Window, predicted: Tensor) -> Tensor:
-    """Mean over particles and dimensions of the squared position error of each frame, (T,), in length²."""
+    """Mean over particles and dimensions of the squared position error of each frame, (T,), in length².
+
+    Of the particles that are present; NaN where none is.
+    """
     moving = window.mask[0]
-    return (predicted[0, :, moving].double() - window.target[0, :, moving].double()).square().mean((1, 2))
+    squared = (predicted[0, :, moving].double() - window.target[0, :, moving].double()).square()
+    if window.present is None:
+        return squared.mean((1, 2))
+    there = window.present[0, 2:, moving]
+    return torch.where(there, squared.mean(2), 0.0).sum(1) / there.sum(1)
 
 
-def field_error(scene: Scene, ours: Tensor, theirs: Tensor, material: Tensor) -> float:
+def field_error(
+    scene: Scene,
+    ours: Tensor,
+    theirs: Tensor,
+    material: Tensor,
+    there: Tensor | None = None,
+    volume: Tensor | None = None,
+) -> float:
     """Share of the material that another prediction has in other cells, from 0 (the same field) to 1 (none in common).
 
     Σ |φ̂ − φ| / Σ (φ̂ + φ) over cells, with φ the linear volume fraction of each material. Unlike the position error it
@@ -96,16 +119,29 @@ def field_error(scene: Scene, ours: Tensor, theirs: Tensor, material: Tensor) ->
         ours: (T, N, D) positions; those outside of the domain count as `into_domain` moves them.
         theirs: (T, N, D) likewise.
         material: (N,) index into the scene's materials.
+        there: (T, N) bool, which particles count in each frame; all when left out.
+        volume: (N,) of each particle, in any unit; all the same when left out.
     """
     frames = _evenly_spaced(len(ours), _FIELD_FRAMES)
     grid, kinds = _counting_grid(scene), torch.nn.functional.one_hot(material, len(scene.materials)).to(ours.dtype)
+    kinds = kinds if volume is None else kinds * volume.to(kinds).unsqueeze(-1)
     values = kinds.expand(len(frames), -1, -1)
+    if there is not None:
+        values = values * there[frames].unsqueeze(-1)
+        ours, theirs = (
+            path.where(there.unsqueeze(-1), path.new_tensor(scene.domain).mean(1)) for path in (ours, theirs)
+        )
     first, second = (
         Linear().p2g(values, grid.to_cells(into_domain(scene, path[frames]), path.dtype), grid)
         for path in (ours, theirs)
     )
-    wrong = (first - second).abs().flatten(1).sum(1)
-    return float((wrong / (first + second).flatten(1).sum(1)).mean())
+    wrong, total = (each.flatten(1).sum(1) for each in ((first - second).abs(), first + second))
+    return _mean(wrong / total)
+
+
+def _mean(values: Tensor) -> float:
+    """The mean of (T,) values but those that are NaN, of frames without a particle that counts."""
+    return float(values[~values.isnan()].mean())
 
 
 def into_domain(scene: Scene, position: Tensor) -> Tensor:
@@ -126,28 +162,35 @@ def _counting_grid(scene: Scene) -> Grid:
     return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
 
 
-def _path(window: Window, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions (T + 2, N, D) from the window's first two frames on, materials and gravity of its moving particles."""
+def _path(window: Window, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Positions (T + 2, N, D) from the window's first two frames on, materials, gravity, volumes of its particles."""
     moving = window.mask[0]
     start = window.frames[0, :2, moving].double()
-    return torch.cat([start, positions.double()]), window.material[0, moving], window.gravity[0].double()
+    volume = None if window.volume is None else window.volume[0, moving].double()
+    return torch.cat([start, positions.double()]), window.material[0, moving], window.gravity[0].double(), volume
 
 
 def recorded_energy_gain(scene: Scene, window: Window, predicted: Tensor) -> float:
-    """`energy_gain` of a prediction (1, T, N, D) of the only scene of a window, from its first two frames on."""
+    """`energy_gain` of a prediction (1, T, N, D) of the only scene of a window, from its first two frames on.
+
+    It is 0 where energy may come in, by obstacles that move, open axes, or particles that enter.
+    """
+    if window.present is not None or not scene.is_closed:
+        return 0.0
     return energy_gain(scene, *_path(window, predicted[0, :, window.mask[0]]))
 
 
-def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> float:
+def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor, volume: Tensor | None = None) -> float:
     """Most energy in a path beyond that between its first two frames, as a share of that; 0 where that has none.
 
     Args:
         scene: Gives bounds and densities.
-        path: (T, N, D) positions of all moving particles, which have the same volume.
+        path: (T, N, D) positions of all moving particles.
         material: (N,) index into the scene's materials.
         gravity: (D,) in length per frame squared.
+        volume: (N,) of each particle, in any unit; all the same when left out.
     """
-    total = _energy(scene, path.double(), material, gravity.double())[1]
+    total = _energy(scene, path.double(), material, gravity.double(), volume)[1]
     initial = float(total[0])
     return float(total.max() / initial - 1) if initial > 0 else 0.0
 
@@ -157,9 +200,12 @@ def instability(gain: float) -> str:
     return f"gains {gain:.0%} of energy" if gain > _MOST_GAIN else ""
 
 
-def _energy(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
+def _energy(
+    scene: Scene, path: Tensor, material: Tensor, gravity: Tensor, volume: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Kinetic, and kinetic and potential energy per mass between frames, (T - 1,), of a path (T, N, D)."""
     mass = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)[material]
+    mass = mass if volume is None else mass * volume
     share = mass / mass.sum()
     steps = path.diff(dim=0)
     kinetic = (steps.square().sum(-1) * share).sum(-1) / 2
@@ -181,21 +227,21 @@ def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) 
     Returns:
         (B,) each: `height`, the mean above the lowest bound against gravity, in domain length; `occupied`, the cells
         that hold a particle; `crowding`, the particles per occupied cell; `peak_crowding`, those per cell in the most
-        crowded twentieth of the occupied cells.
+        crowded twentieth of the occupied cells. Particles of several sizes count by their volume.
     """
-    mask = state.mask.unsqueeze(-1)
+    volume = state.present_volume
     up = -torch.nn.functional.normalize(state.gravity, dim=-1)
     low, high = position.new_tensor(scene.bounds).T
     floor = torch.minimum(up * low, up * high).sum(-1)
     heights = (position * up.unsqueeze(1)).sum(-1) - floor.unsqueeze(1)
-    real = state.mask.sum(1)
-    counts = Nearest().p2g(mask.to(position.dtype), grid.to_cells(position), grid).flatten(1)
+    real = volume.sum(1)
+    counts = Nearest().p2g(volume.unsqueeze(-1).to(position.dtype), grid.to_cells(position), grid).flatten(1)
     occupied = (counts > 0).sum(1)
     ranked = counts.sort(dim=1, descending=True).values
     kept = (_MOST_CROWDED * occupied).ceil().clamp(min=1)
     first = torch.arange(ranked.shape[1], device=ranked.device) < kept.unsqueeze(1)
     return {
-        "height": (heights * state.mask).sum(1) / real,
+        "height": (heights * volume).sum(1) / real,
         "occupied": occupied.to(position.dtype),
         "crowding": real / occupied,
         "peak_crowding": (ranked * first).sum(1) / kept,

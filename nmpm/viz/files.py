@@ -37,7 +37,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
     if not 0 <= index < len(split):
         raise DataError(f"{split.path} contains trajectories 0 … {len(split) - 1}, not {index}.")
     trajectory = split.read(index)
-    scene, names, static, label = _describe(split, trajectory, family)
+    scene, names, static, prescribed, label = _describe(split, trajectory, family)
     moving = ~np.isin(trajectory.particle_type, sorted(static))
     fields = read_fields(split, index, scene.particle_fields)
     position = trajectory.position
@@ -63,6 +63,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         gravity=trajectory_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
         title=f"{split.path.name}, trajectory {index}",
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
+        prescribed=frozenset(names[number] for number in prescribed),
     )
 
 
@@ -72,6 +73,7 @@ def label_trajectory(
     """One trajectory of a dataset, to be drawn; raises a DataError if a position or its gravity is wrong."""
     types = trajectory.particle_type
     moving, static = metadata.is_moving(types), metadata.is_static(types)
+    moving = moving | np.isin(types, list(metadata.prescribed_types))
     return LabelledTrajectories(
         positions={label: trajectory.position[:, moving]},
         material=material_names(types[moving], metadata.particle_types),
@@ -109,7 +111,7 @@ def combine(
     if not np.array_equal(reference.material, other.material):
         raise DataError(f"{both} do not show the same particles: their materials differ.")
     sides = np.ptp(np.array(reference.outer_bounds), axis=1)
-    apart = float(np.abs((first[0] - second[0]) / sides).max())
+    apart = float(np.nan_to_num(np.abs((first[0] - second[0]) / sides)).max())
     if apart > TOLERANCE:
         raise DataError(
             f"{both} do not start at the same positions: a particle is {apart:.2g} of the box's side apart. Is it the"
@@ -132,8 +134,10 @@ def combine(
 
 def _describe(
     split: Split, trajectory: Trajectory, family: str | None
-) -> tuple[Scene, dict[int, str], frozenset[int], str]:
-    """Scene, names of type ids, ids that do not move, and label, from metadata.json or a prediction's attributes.
+) -> tuple[Scene, dict[int, str], frozenset[int], frozenset[int], str]:
+    """Scene, names of type ids, ids that do not move and those that move as prescribed, and label.
+
+    From metadata.json or a prediction's attributes.
 
     `nmpm.data.predictions` and `nmpm.data.described` store these attributes.
     """
@@ -141,7 +145,7 @@ def _describe(
     if "scene" not in attributes:
         metadata = read_metadata(path.parent, family)
         label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
-        return infer_scene(path.parent, Options(family)), dict(metadata.particle_types), metadata.static_types, label
-    scene, names, static = read_description(attributes, path)
+        scene, names = infer_scene(path.parent, Options(family)), dict(metadata.particle_types)
+        return scene, names, metadata.static_types, metadata.prescribed_types, label
     label = "prediction" if "predicted by" in str(attributes.get("generator")) else "recorded"
-    return scene, names, static, label
+    return *read_description(attributes, path), label

@@ -53,7 +53,7 @@ class PanelRenderer:
         self.width = width
         self.height = max(1, round(width * self.camera.height / self.camera.width))
         self._scale = SUPERSAMPLING * width / self.camera.width
-        spacing = particle_spacing(next(iter(trajectories.positions.values()))[0])
+        spacing = particle_spacing(trajectories.fullest_frame)
         diameter = float(np.clip(DISC_DIAMETER * spacing * width / self.camera.width, *DIAMETER_LIMITS))
         self._disc = _disc_offsets(SUPERSAMPLING * diameter / 2)
         colours = material_colours(trajectories.materials)
@@ -66,7 +66,8 @@ class PanelRenderer:
         """Draws one frame.
 
         Args:
-            position: (N, D) in domain length; particles outside of the window are omitted (see `count_outside`).
+            position: (N, D) in domain length; particles that are not there, NaN, or outside of the window are omitted
+                (see `count_outside`).
 
         Returns:
             (height, width, 3), top row first.
@@ -87,7 +88,8 @@ class PanelRenderer:
 
     def count_outside(self, position: Floats) -> int:
         """Counts the particles (N, D) outside of the window."""
-        return int((~self._inside(self.camera.project(self.trajectories.wrap(position)))).sum())
+        there = position[~np.isnan(position[:, 0])]
+        return int((~self._inside(self.camera.project(self.trajectories.wrap(there)))).sum())
 
     def _inside(self, projected: NDArray[np.float64]) -> NDArray[np.bool_]:
         right, up = projected[:, 0], projected[:, 1]
@@ -172,11 +174,11 @@ def particle_spacing(position: Floats) -> float:
         position: (N, D), one frame; D is 2 or 3.
 
     Returns:
-        The spacing; infinite for a single particle.
+        The spacing; infinite for a single particle, or none.
     """
     count, dim = position.shape
     neighbours = min(NEIGHBOURS[dim], count - 1)
-    if neighbours == 0:
+    if neighbours <= 0:
         return math.inf
     sample = position[np.linspace(0, count - 1, min(SAMPLES, count)).astype(int)].astype(np.float64)
     # One axis at a time, because the differences of all axes together exceed the cache.

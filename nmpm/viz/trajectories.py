@@ -26,6 +26,7 @@ class LabelledTrajectories:
 
     Args:
         positions: Positions (T, N, D) by label, in domain length; D is 2 or 3. The first is the reference for errors.
+            Particles that are not there in a frame are NaN.
         material: (N,) name of each particle's material, see `material_names`.
         bounds: Region of the particles, (lower, upper) per axis, in domain length.
         dt: Time between frames, in seconds.
@@ -37,9 +38,10 @@ class LabelledTrajectories:
         title: Title of the picture.
         fields: Further numbers of the particles by name and label, (T, N), or (1, N) if constant in time; a trajectory
             may lack one. The viewer colours by them.
+        prescribed: Names of materials that are not predicted, so that errors leave them out.
 
     Raises:
-        DataError: if shapes do not match, or a position or a field is not finite.
+        DataError: if shapes do not match, or a position or a field is not finite; positions may be NaN on all axes.
     """
 
     positions: Mapping[str, Floats]
@@ -52,6 +54,7 @@ class LabelledTrajectories:
     gravity: tuple[float, ...] | None = None
     title: str = ""
     fields: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    prescribed: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "material", np.asarray(self.material, dtype=np.str_))
@@ -143,17 +146,30 @@ class LabelledTrajectories:
         return [int(frame) for frame in np.round(indices)]
 
     def rms_errors(self) -> dict[str, NDArray[np.float64]]:
-        """Root mean square position error of each later trajectory against the first, (T,) in domain length."""
+        """Root mean square position error of each later trajectory against the first, (T,) in domain length.
+
+        Of the particles that are there in both; 0 where none is.
+        """
         reference, *others = self.positions
         errors = {label: np.zeros(self.frame_count) for label in others}
+        predicted = ~np.isin(self.material, list(self.prescribed))
         for label, squares in errors.items():
             for axis, period in enumerate(self.periods):
-                first = self.positions[reference][..., axis]
-                difference = self.positions[label][..., axis].astype(np.float64) - first
+                first = self.positions[reference][:, predicted, axis]
+                difference = self.positions[label][:, predicted, axis].astype(np.float64) - first
                 if period:
                     difference -= period * np.round(difference / period)
-                squares += np.square(difference).mean(axis=1)
+                there = ~np.isnan(difference)
+                squares += np.square(np.where(there, difference, 0.0)).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
         return {label: np.sqrt(squares) for label, squares in errors.items()}
+
+    @property
+    def fullest_frame(self) -> Floats:
+        """The positions (N', D) in the first trajectory's frame with the most particles, of those there."""
+        first = next(iter(self.positions.values()))
+        there = ~np.isnan(first[..., 0])
+        frame = int(there.sum(axis=1).argmax())
+        return np.asarray(first[frame, there[frame]])
 
     def wrap(self, position: Floats) -> Floats:
         """Wraps positions (..., D) into the box along the periodic axes."""
@@ -176,7 +192,8 @@ class LabelledTrajectories:
                     f"Trajectory {label!r} has shape {position.shape}, but {first!r} has {shape}: reduce both to the"
                     " same frames and particles."
                 )
-            _check_finite(f"trajectory {label!r}", position)
+            absent = np.isnan(position).all(axis=2, keepdims=True)
+            _check_finite(f"trajectory {label!r}", np.where(absent, 0.0, position))
         if self.material.shape != shape[1:2]:
             raise DataError(
                 f"Materials have shape {self.material.shape}, expected one name for each of {shape[1]} particles."
@@ -193,7 +210,8 @@ class LabelledTrajectories:
                         f"The field {name} of {label!r} has shape {values.shape}, expected {shape} (frames, particles)"
                         f" or (1, {shape[1]})."
                     )
-                _check_finite(f"the field {name} of {label!r}", values)
+                absent = np.isnan(self.positions[label][..., 0]) if values.shape == shape else False
+                _check_finite(f"the field {name} of {label!r}", np.where(absent, 0.0, values))
 
     def _check_box(self) -> None:
         for name, box in {"bounds": self.bounds, "domain": self.outer_bounds}.items():

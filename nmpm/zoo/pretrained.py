@@ -15,7 +15,14 @@ from torch import Tensor
 from nmpm._support.devices import find_device
 from nmpm._support.numbers import check_whole
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Rollout, differentiable_rollout, predict_rollout
+from nmpm.emulator import (
+    NETWORK_PRECISIONS,
+    Emulator,
+    Prescribed,
+    Rollout,
+    differentiable_rollout,
+    predict_rollout,
+)
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.runtimes import Runtime
@@ -207,19 +214,26 @@ class Pretrained:
             return self
         return dataclasses.replace(self, emulator=copy.deepcopy(self.emulator).to(target))
 
-    def rollout(self, state: Particles, frames: int) -> Tensor:
+    def rollout(self, state: Particles, frames: int, prescribed: Prescribed | None = None) -> Tensor:
         """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
+
+        Args:
+            state: From `state`, or a window's `initial`.
+            frames: How many.
+            prescribed: Obstacles that move, `Prescribed.obstacles(positions)`, or particles that enter and leave too,
+                `Prescribed.of(window)`. Positions of particles that are not there are NaN, as are those of particles
+                that have left through an open axis.
 
         Warns:
             UserWarning: if particles start outside of the bounds, into which the first frame moves them.
         """
-        return self.predict(state, frames).position
+        return self.predict(state, frames, prescribed).position
 
-    def predict(self, state: Particles, frames: int) -> Rollout:
+    def predict(self, state: Particles, frames: int, prescribed: Prescribed | None = None) -> Rollout:
         """As `rollout`, with the evolving fields of the particles, such as a temperature, beside their positions."""
-        there = state.to(self.emulator.device)
+        there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
         warn_of_start_outside(self.emulator, there)
-        return predict_rollout(self.emulator, there, frames)
+        return predict_rollout(self.emulator, there, frames, prescribed=given)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
         """As `rollout`, with gradients to the state, see `nmpm.emulator.differentiable_rollout`.

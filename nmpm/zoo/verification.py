@@ -18,7 +18,8 @@ from torch import Tensor
 from nmpm._support.messages import one_line
 from nmpm._support.numbers import is_number
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import Emulator, rollout
+from nmpm.emulator import Emulator, Prescribed, rollout
+from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
@@ -95,7 +96,8 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
     metric = MSE()
     for window in iterate_test_scenes(f"Verifying {model.name}", model, data, count, frames):
-        metric.update(window, model.rollout(window.initial, window.target.shape[1]).cpu())
+        predicted = model.rollout(window.initial, window.target.shape[1], Prescribed.of(window)).cpu()
+        metric.update(with_predicted(window, model.emulator.frames), predicted)
     compare = _means if full else _scenes
     checks = list(compare(rows, metric.per_trajectory()))
     if not checks:

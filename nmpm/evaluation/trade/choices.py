@@ -18,7 +18,8 @@ from torch import Tensor
 
 from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
-from nmpm.emulator import Emulator, rollout
+from nmpm.emulator import Emulator, Prescribed, rollout
+from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.prediction_errors import energy_gain, recorded_energy_gain
 from nmpm.evaluation.trade.scenes import Scenes
@@ -64,6 +65,11 @@ class Choice(ABC):
     device: torch.device = CPU
 
     @property
+    def bundle(self) -> int:
+        """Frames predicted at once: particles that enter count from the start of the next bundle on."""
+        return 1
+
+    @property
     @abstractmethod
     def identity(self) -> Mapping[str, Any]:
         """Plain data on which its predictions depend, beside the scenes: the key of stored measurements."""
@@ -84,13 +90,17 @@ class Choice(ABC):
         """Predict all frames of one scene, which is not timed.
 
         Returns:
-            (1, T, N, D) positions of the recorded particles, and the prediction's `energy_gain`.
+            (1, T, N, D) positions of the recorded particles, of any value where one does not count, and the
+            prediction's `energy_gain`.
 
         Raises:
             NmpmError: if it fails; a DataError if positions are not finite.
         """
-        position = require_finite(self.prepare(scenes, [index])(scenes.frames(index)).cpu().float())
-        return position, recorded_energy_gain(scenes.scene, scenes.window([index]), position)
+        position = self.prepare(scenes, [index])(scenes.frames(index)).cpu().float()
+        window = with_predicted(scenes.window([index]), self.bundle)
+        counts = None if window.present is None else window.present[:, 2:].unsqueeze(-1)
+        require_finite(position if counts is None else position.where(counts, 0.0))
+        return position, recorded_energy_gain(scenes.scene, window, position)
 
 
 def digest(plain: Any) -> str:
@@ -114,6 +124,10 @@ class ModelChoice(Choice):
     kind: Kind = Kind.MODEL
 
     @property
+    def bundle(self) -> int:
+        return self.emulator.frames
+
+    @property
     def identity(self) -> Mapping[str, Any]:
         return {
             "recipe": self.emulator.recipe.to_dict(),
@@ -123,8 +137,10 @@ class ModelChoice(Choice):
         }
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
-        state = scenes.window(indices, 0).to(self.device).initial
-        return lambda frames: rollout(self.emulator, state, frames)
+        window = scenes.window(indices)
+        state, prescribed = window.initial.to(self.device), Prescribed.of(window)
+        given = prescribed and prescribed.to(self.device)
+        return lambda frames: rollout(self.emulator, state, frames, prescribed=given)
 
     def computed_frames(self, frames: int) -> int:
         return -(-frames // self.emulator.frames) * self.emulator.frames  # whole bundles
@@ -216,20 +232,34 @@ class Predictor(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictorChoice(Choice):
-    """A trivial predictor, or one of another package: from particles and a number of frames to positions."""
+    """A trivial predictor, or one of another package: from particles and a number of frames to positions.
+
+    Args:
+        predictor: Predicts on its own from the frame in which particles enter.
+        enter_every: Frames between these, as of the models that it stands beside.
+    """
 
     predictor: Callable[[Particles, int], Tensor]
+    enter_every: int = 1
+
+    @property
+    def bundle(self) -> int:
+        return self.enter_every
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        return {self.kind.value: self.name}
+        return {self.kind.value: self.name} | ({"enter_every": self.enter_every} if self.enter_every > 1 else {})
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
-        state = scenes.window(indices, 0).initial
-        batch, count, dim = state.position.shape
+        window = scenes.window(indices)
+        batch, _, count, dim = window.frames.shape
 
         def predict(frames: int) -> Tensor:
-            position, shape = self.predictor(state, frames), (batch, frames, count, dim)
+            if window.present is None:
+                position = self.predictor(window.initial, frames)
+            else:
+                position = predict_from_entries(self.predictor, window.first(frames + 2), self.bundle)
+            shape = (batch, frames, count, dim)
             if tuple(position.shape) != shape:
                 raise DataError(f"{self.name} returns {tuple(position.shape)} positions, not {shape}.")
             return position

@@ -15,6 +15,7 @@ import torch
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import one_line
 from nmpm._support.progress import Step, progress_bar
+from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import NmpmError
 from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, peak_bytes
 from nmpm.evaluation.prediction_errors import Measures, instability, into_domain, measure_errors, squared_errors
@@ -108,7 +109,7 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
     A prediction that gains energy has both: "failed" with the reason, and errors. Frames (F, N, D) are base64 of
     little-endian float32.
     """
-    window = scenes.window([index])
+    window = with_predicted(scenes.window([index]), choice.bundle)
     try:
         predicted, gain = choice.predict(scenes, index)
     except NmpmError as error:

@@ -82,6 +82,8 @@ class Scenes:
             digest = hashlib.sha256(json.dumps(self.scene.to_dict(), sort_keys=True).encode())
             tensors = {name: getattr(recording, name) for name in ("frames", "material", "obstacle", "gravity")}
             tensors |= {f"field {name}": values for name, values in sorted(recording.fields.items())}
+            optional = {name: getattr(recording, name) for name in ("present", "obstacle_frames", "volume")}
+            tensors |= {name: values for name, values in optional.items() if values is not None}
             for name, values in tensors.items():
                 digest.update(f";{name} {values.dtype} {tuple(values.shape)};".encode())
                 digest.update(values.contiguous().numpy().tobytes())

@@ -162,12 +162,15 @@ def make_choices(
         choices += _simulator_choices(sweep.simulator, scenes.preset)
     for name, emulator in models.items():
         choices += _model_choices(sweep.models, name, emulator, scenes, device)
+    some_enter = any(recording.present is not None for recording in scenes.recordings)
+    bundles = [emulator.frames for emulator in models.values()] if some_enter else []
+    predict_by = partial(PredictorChoice, enter_every=max(bundles, default=1))
     for predictor in (make(scenes.scene) for make in predictors):
         settings = {"model": predictor.name}
-        choices.append(PredictorChoice(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor))
+        choices.append(predict_by(kind=Kind.OTHER, name=predictor.name, settings=settings, predictor=predictor))
     choices += [
-        PredictorChoice(kind=Kind.TRIVIAL, name="nothing moves", predictor=still),
-        PredictorChoice(kind=Kind.TRIVIAL, name="free fall", predictor=partial(free_fall, scenes.scene)),
+        predict_by(kind=Kind.TRIVIAL, name="nothing moves", predictor=still),
+        predict_by(kind=Kind.TRIVIAL, name="free fall", predictor=partial(free_fall, scenes.scene)),
     ]
     names = [choice.name for choice in choices]
     if repeated := next((name for name in names if names.count(name) > 1), None):

@@ -215,7 +215,14 @@ class PredictionWriter(BasePredictionWriter):
         rollout = prediction if isinstance(prediction, Rollout) else Rollout(prediction, {})
         for row, index in enumerate(self._split_indices(trainer.predict_dataloaders, number, len(rollout.position))):
             self._predicted[index] = predicted_trajectory(
-                scene, batch.initial, rollout.position, source, row, rollout.fields
+                scene,
+                batch.initial,
+                rollout.position,
+                source,
+                row,
+                rollout.fields,
+                real=batch.mask,
+                obstacle_frames=batch.obstacle_frames,
             )
 
     def _split_indices(self, loader: object, batch: int, count: int) -> Sequence[int]:

@@ -7,12 +7,14 @@ uniform mat4 view; uniform vec3 low, extent, period; uniform vec4 plain;
 uniform float diameter, top; uniform int mode;   // see MODES below; 3 is the colour \`plain\`
 uniform highp sampler2D scale;
 out vec4 colour;
+bool absent(vec3 p) { return p.x > 0.999993; }  // ABSENT of page.py
 vec3 nearest(vec3 d) { return d - period * round(d / mix(vec3(1.0), period, step(1e-20, period))); }
 void main() {
   vec3 x = low + extent * position;
-  gl_Position = view * vec4(x, 1.0);
+  gl_Position = absent(position) ? vec4(2.0, 2.0, 2.0, 1.0) : view * vec4(x, 1.0);  // outside of the clip volume
   gl_PointSize = max(diameter / gl_Position.w, 1.5);
   float value = mode == 4 ? field
+    : absent(mode == 1 ? previous : reference) ? 0.0
     : length(nearest(extent * (mode == 1 ? position - previous : position - reference))) / top;
   colour = mode == 0 ? vec4(material, 1.0) : mode == 3 ? plain
     : vec4(texture(scale, vec2(clamp(value, 0.002, 0.998), 0.5)).rgb, 1.0);

@@ -31,8 +31,10 @@ TOP_PERCENTILE = 99.5
 FIELD_PERCENTILES = (0.5, 99.5)
 """Of a field's values: what the ends of the colour scale stand for."""
 SAMPLED_FRAMES = 50
-STEPS = 65535
-"""Steps from the lowest to the highest position along an axis: an error of at most 1 / 131070 of the box."""
+STEPS = 65534
+"""Steps from the lowest to the highest position along an axis: an error of at most 1 / 131068 of the box."""
+ABSENT = 65535
+"""Stands for the position of a particle that is not there."""
 
 
 class ViewerPage:
@@ -109,7 +111,7 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         "period": list(trajectories.periods),
         "up": vertical_axis(trajectories),
         "tilt": trajectories.tilt,
-        "spacing": min(particle_spacing(first[0]), longest / 20),
+        "spacing": min(particle_spacing(trajectories.fullest_frame), longest / 20),
         "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
         "colours": pack_bytes(rgb),
         "scale": [hex_code((red, green, blue)) for red, green, blue, _ in scale],
@@ -125,13 +127,13 @@ def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Fl
     obstacles = trajectories.obstacles.astype(np.float64)
     corners = np.array(trajectories.outer_bounds).T
     points = np.concatenate([corners, obstacles, *(each.reshape(-1, trajectories.dim) for each in positions.values())])
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     frames = len(next(iter(positions.values())))
     errors = {label: curve[::every] for label, curve in trajectories.rms_errors().items()}
     return {
         "frames": frames,
         "low": low.tolist(),
-        "high": high.tolist(),
+        "high": (low + (high - low) * ABSENT / STEPS).tolist(),
         "obstacles": pack_positions(quantize(obstacles, low, high)[None]),
         "trajectories": [
             {
@@ -148,11 +150,13 @@ def _describe_field(trajectories: LabelledTrajectories, name: str, every: int) -
     """Values as 65535ths of the colour scale, packed like positions; null for a trajectory without the field."""
     by_label = trajectories.fields[name]
     values = np.concatenate([each.ravel() for each in by_label.values()]).astype(np.float64)
-    low, high = np.percentile(values, FIELD_PERCENTILES)
+    low, high = np.percentile(values[np.isfinite(values)], FIELD_PERCENTILES)
     ends = np.array(low), np.array(high if high > low else low + 1.0)
     shape = trajectories.frame_count, len(trajectories.material)
     packed = {
-        label: pack_positions(quantize(np.broadcast_to(each, shape)[::every].clip(*ends), *ends))
+        label: pack_positions(
+            quantize(np.nan_to_num(np.broadcast_to(each, shape)[::every], nan=low).clip(*ends), *ends)
+        )
         for label, each in by_label.items()
     }
     shown = [packed.get(label) for label in trajectories.positions]
@@ -166,12 +170,13 @@ def _nearly_largest(trajectories: LabelledTrajectories, differences: list[Floats
     period, stacked = np.array(trajectories.periods), np.concatenate(differences)
     stacked = stacked - period * np.round(stacked / np.where(period > 0, period, 1.0))
     lengths = np.sqrt(np.square(stacked).sum(axis=-1))
+    lengths = lengths[~np.isnan(lengths)]
     return (float(np.percentile(lengths, TOP_PERCENTILE)) if lengths.size else 0.0) or 1.0
 
 
 def quantize(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Positions (..., D) as multiples of (high - low) / 65535 above `low`, (D,) each."""
-    return np.round((position - low) / (high - low) * STEPS).astype(np.uint16)
+    """Positions (..., D) as multiples of (high - low) / `STEPS` above `low`, (D,) each; NaN as `ABSENT`."""
+    return np.where(np.isnan(position), ABSENT, np.round((position - low) / (high - low) * STEPS)).astype(np.uint16)
 
 
 def pack_positions(steps: NDArray[np.uint16]) -> str:

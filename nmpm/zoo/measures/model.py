@@ -9,6 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from nmpm._support.progress import progress_bar
+from nmpm.emulator import Prescribed
+from nmpm.emulator.prescribed import with_predicted
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
@@ -36,8 +38,9 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     rows: list[dict[str, float]] = []
     worst: tuple[Window, Tensor] | None = None
     for window in iterate_test_scenes(f"quality of {model.name}", model, data):
-        predicted = model.rollout(window.initial, window.target.shape[1]).cpu()
-        rows.append(measure_errors(model.scene, window, predicted, Measures((), EMD_FRAMES)))
+        predicted = model.rollout(window.initial, window.target.shape[1], Prescribed.of(window)).cpu()
+        scored = with_predicted(window, model.emulator.frames)
+        rows.append(measure_errors(model.scene, scored, predicted, Measures((), EMD_FRAMES)))
         if len(rows) == 1:
             write_snapshots(labelled_trajectories(model.scene, window, predicted), folder / FIRST)
         if worst is None or rows[-1]["mse"] >= max(row["mse"] for row in rows):
