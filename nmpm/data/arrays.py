@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nmpm.data.array_checks import check_axes
+from nmpm.data.convert.base import make_options
+from nmpm.data.convert.conversion import write_native
+from nmpm.data.convert.runs_in_memory import Runs, open_runs
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.statistics import first_outside
 from nmpm.errors import ConfigError, DataError
@@ -17,27 +22,49 @@ from nmpm.scene import Scene
 STATIC_NAME = "boundary"
 
 
-def write_trajectories(path: str | Path, trajectories: Iterable[Trajectory | np.ndarray], scene: Scene) -> None:
-    """Writes one split of a dataset, and the metadata beside it.
+def write_trajectories(
+    path: str | Path, trajectories: Runs | Mapping[str, Runs], scene: Scene | None = None, **facts: Any
+) -> None:
+    """Writes a dataset from arrays; or, for a scene that you state, one split of it.
 
-    Call it once per split, for example with "mydata/train.h5", "mydata/valid.h5" and "mydata/test.h5"; then
-    `nmpm fit --data.path mydata` trains on them. Trajectories are written one by one and can come from a
-    generator.
+    `nmpm.write_trajectories("grains", runs, dt=0.004)` writes the folder "grains": the last tenths of the runs test and
+    validate, and what is not stated is found in the arrays and printed. Then `nmpm fit --data.path grains` trains on
+    them.
+
+    With a scene, call it once per split, for example with "mydata/train.h5", "mydata/valid.h5" and "mydata/test.h5".
+    Trajectories are then written one by one and can come from a generator.
 
     Args:
-        path: The file to write; its name states the split.
-        trajectories: In each, `particle_type` i means `scene.materials[i]`, and the id after the last material,
-            `len(scene.materials)`, means static particles. A bare (T, N, D) array of positions, in domain length,
-            suffices for a scene with one material and no obstacles. Attributes (`gravity`, in length/s²) and
-            further fields are kept.
-        scene: The trajectories' scene.
+        path: A folder that does not exist yet or is empty; with a scene, the file of a split.
+        trajectories: Runs, each a (T, N, D) array of positions in domain length; a dict of arrays under usual names,
+            such as {"position": …, "types": …, "velocity": …}; or a `Trajectory`. A (R, T, N, D) array holds R runs, a
+            dict of such lists by "train", "valid" and "test" states the splits. NaN, a type of -1, and 0 in an array
+            "active" mean that a particle is absent. With a scene, `particle_type` i of a `Trajectory` means
+            `scene.materials[i]`, and the id after the last material, `len(scene.materials)`, static particles; bare
+            arrays suffice for one material and no obstacles.
+        scene: The trajectories' scene; left out, it is estimated.
+        facts: Without a scene, what you know: `dt`, `gravity`, `bounds`, `boundary`, `types` (names by id), `static`
+            (ids), and the other fields of `nmpm.data.convert.Options`.
 
     Raises:
-        ConfigError: if the file is not named after a split.
-        DataError: if a trajectory does not fit the scene, its axes look swapped, existing metadata state another scene,
-            or writing fails.
+        ConfigError: if the file is not named after a split, or a fact is invalid.
+        DataError: if arrays do not fit together or the scene, their axes look swapped, existing metadata state another
+            scene, or writing fails.
     """
-    path, types = Path(path), _types(scene)
+    if scene is None:
+        dataset = open_runs(trajectories, make_options(facts))
+        for note in write_native(dataset, Path(path)):
+            sys.stdout.write(f"- {note}\n")
+        return
+    if facts:
+        raise ConfigError(f"{', '.join(facts)}: the scene states these facts; leave them out, or the scene.")
+    if isinstance(trajectories, Mapping):
+        raise ConfigError("With a scene, give the runs of one split; without one, a dict of splits.")
+    _write_split(Path(path), trajectories, scene)
+
+
+def _write_split(path: Path, trajectories: Runs, scene: Scene) -> None:
+    types = _types(scene)
     metadata = scene_metadata(scene, types, len(scene.materials) if scene.obstacles else None)
     if path.name not in {f"{split}.h5" for split in SPLITS}:
         raise ConfigError(f"{path}: the file must be named {', '.join(f'{s}.h5' for s in SPLITS[:-1])} or test.h5.")
@@ -52,12 +79,12 @@ def write_trajectories(path: str | Path, trajectories: Iterable[Trajectory | np.
     write_metadata(path.parent, replace(metadata, sequence_length=longest))
 
 
-def _check_trajectories(
-    trajectories: Iterable[Trajectory | np.ndarray], scene: Scene, path: Path, lengths: list[int]
-) -> Iterator[Trajectory]:
+def _check_trajectories(trajectories: Runs, scene: Scene, path: Path, lengths: list[int]) -> Iterator[Trajectory]:
     kinds = len(scene.materials) + scene.obstacles
     for index, item in enumerate(trajectories):
         where = f"{path}: trajectory {index}"
+        if isinstance(item, Mapping):
+            raise DataError(f"{where} is a dict: with a scene, give a Trajectory.")
         trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
         position, types = trajectory.position, np.unique(trajectory.particle_type)
         check_axes(position, position.shape[1] if isinstance(item, Trajectory) else None, where)

@@ -57,6 +57,7 @@ class Trajectory:
         particle_type: (N,) int64 type ids.
         attributes: Further facts by name, e.g. `gravity` (D,) in length/s², `seed`.
         fields: Further arrays of numbers by name, of any shape and unit, e.g. `temperature` (T, N).
+        metadata: Facts about its dataset, such as the names of types; None where they are not known.
 
     Raises:
         DataError: if the shapes do not fit together, a position is infinite or NaN in some coordinates only, or a field
@@ -67,6 +68,7 @@ class Trajectory:
     particle_type: np.ndarray
     attributes: dict[str, Any] = field(default_factory=dict)
     fields: dict[str, np.ndarray] = field(default_factory=dict)
+    metadata: Metadata | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_arrays(self.position, self.particle_type, "trajectory")

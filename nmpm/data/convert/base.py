@@ -5,11 +5,12 @@ from __future__ import annotations
 import abc
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
+from nmpm._support.messages import suggestion
 from nmpm.data.format import OTHER_NAMES, SPLITS, Metadata, Trajectory
 from nmpm.data.metadata import STATIC_NAMES
 from nmpm.errors import ConfigError, DataError
@@ -86,6 +87,16 @@ class Options:
         if self.fields is not None:
             changes["fields"] = tuple(self.fields)
         return replace(metadata, **{name: value for name, value in changes.items() if value is not None})
+
+
+def make_options(facts: Mapping[str, Any]) -> Options:
+    """The options of these names; raises a ConfigError for a name that is none of them."""
+    names = [field.name for field in fields(Options)]
+    unknown = next((name for name in facts if name not in names), None)
+    if unknown is not None:
+        raise ConfigError(f"{unknown} is no fact; known: {', '.join(names)}.{suggestion(unknown, names)}")
+    sets = {name: frozenset(value) for name, value in facts.items() if name in ("static", "prescribed") and value}
+    return Options(**{**facts, **sets})
 
 
 @dataclass(frozen=True)

@@ -80,3 +80,52 @@ def test_splits_of_different_scenes_do_not_mix(tmp_path):
         nmpm.write_trajectories(tmp_path / "test.h5", [np.zeros((3, 2, 2))], ONE)
     with pytest.raises(ConfigError, match="must be named train"):
         nmpm.write_trajectories(tmp_path / "mine.h5", runs(), SCENE)
+
+
+def wandering(count: int, frames: int = 30) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    start = rng.uniform(0.2, 0.8, (count, 1, 40, 2))
+    return (start + 1e-3 * rng.normal(size=(count, frames, 40, 2)).cumsum(axis=1)).astype(np.float32)
+
+
+@pytest.mark.usefixtures("home")
+def test_arrays_alone_become_a_dataset(tmp_path, capsys):
+    position = wandering(10)
+    types = np.arange(40) % 2
+    runs = [{"position": run, "types": types, "heat": np.ones(40)} for run in position]
+    nmpm.write_trajectories(tmp_path / "grains", runs, dt=0.004, types={1: "sand"}, gravity=[0.0, -9.81])
+    printed = capsys.readouterr().out
+    assert "8 train, 1 valid, 1 test" in printed
+    assert "bounds" in printed
+    assert "dt" not in [line.split()[1] for line in printed.splitlines()]  # it was stated
+    metadata = read_metadata(tmp_path / "grains")
+    assert (metadata.dt, metadata.gravity, metadata.particle_types[1]) == (0.004, (0.0, -9.81), "sand")
+    np.testing.assert_array_equal(Split(tmp_path / "grains" / "test.h5").read(0).position, position[9])
+    data = nmpm.load_trajectories(tmp_path / "grains")
+    assert [len(part) for part in data.splits.values()] == [8, 1, 1]
+    np.testing.assert_array_equal(data.train[-1].position, position[7])
+    assert [run.fields["heat"].shape for run in data.train[:2]] == [(40,), (40,)]
+    assert data.train[3].metadata.particle_types[1] == "sand"
+    assert data.scene.dt == 0.004
+
+
+@pytest.mark.usefixtures("home")
+def test_arrays_in_other_shapes_and_other_files_are_loaded(tmp_path):
+    position = wandering(4)
+    nmpm.write_trajectories(tmp_path / "stacked", position)
+    nmpm.write_trajectories(tmp_path / "parts", {"train": position[:3], "test": [position[3]]}, dt=0.1)
+    assert len(nmpm.load_trajectories(tmp_path / "stacked").train) == 2
+    np.savez(tmp_path / "runs.npz", position=position)
+    data = nmpm.load_trajectories(tmp_path / "runs.npz", dt=0.25)
+    assert data.metadata.dt == 0.25
+    np.testing.assert_array_equal(data.valid[0].position, position[2])
+    nmpm.write_trajectories(tmp_path / "again", list(data.train))  # with the facts of its dataset
+    assert read_metadata(tmp_path / "again").dt == 0.25
+    with pytest.raises(DataError, match=r"no valid\.h5 there"):
+        _ = nmpm.load_trajectories(tmp_path / "parts").valid
+    with pytest.raises(DataError, match="nowhere: no such file or folder"):
+        nmpm.load_trajectories(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match=r"gravitation is no fact; known: .*Did you mean gravity\?"):
+        nmpm.write_trajectories(tmp_path / "new", position, gravitation=9.81)
+    with pytest.raises(DataError, match=r"run 1: none of the arrays is \(T, N, D\).*position \(30, 40\)"):
+        nmpm.write_trajectories(tmp_path / "new", [position[0], position[0, ..., 0]])
