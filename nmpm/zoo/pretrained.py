@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm._support.numbers import check_whole
+from nmpm.data.format import Trajectory
 from nmpm.data.initial_states import thrown_blocks
 from nmpm.emulator import (
     NETWORK_PRECISIONS,
@@ -31,6 +32,7 @@ from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.card import preset_of
 from nmpm.zoo.optimization import AUTO, optimize
+from nmpm.zoo.starts import state_of
 from nmpm.zoo.states import Bodies, StateBuilder
 
 _EXAMPLE = 300
@@ -118,6 +120,27 @@ class Pretrained:
         """
         builder = StateBuilder(self.emulator, position, dtype)
         return builder.build(velocity, material, obstacle, gravity, fields, bodies).to(self.emulator.device)
+
+    def start(self, trajectory: Trajectory, frame: int = 1, materials: Mapping[str, str] | None = None) -> Particles:
+        """The state of a recorded trajectory at a frame, to start a rollout from.
+
+            data = nmpm.load_trajectories("grains")
+            model.rollout(model.start(data.test[0]), frames=100)
+
+        Velocities are those from the frame before, obstacles are taken apart, and particles that are absent in one of
+        these two frames are left out.
+
+        Args:
+            trajectory: From `nmpm.load_trajectories`, which knows the names of its types; one made of arrays suffices
+                for a model of one material.
+            frame: 1 or later.
+            materials: The model's material by name of the trajectory's, where they differ.
+
+        Raises:
+            DataError: if the trajectory's materials are not the model's, no particle is there, or as for `state`.
+            ConfigError: if there is no such frame.
+        """
+        return state_of(self, trajectory, frame, materials)
 
     def example(
         self,

@@ -1,0 +1,110 @@
+"""States to start a rollout from, taken out of recorded trajectories."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from nmpm._support.messages import suggestion
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.statistics import displacements
+from nmpm.errors import ConfigError, DataError
+from nmpm.particles import Particles
+
+if TYPE_CHECKING:
+    from nmpm.zoo.pretrained import Pretrained
+
+_SAME_GRAVITY = 0.05
+
+
+def state_of(
+    model: Pretrained, trajectory: Trajectory, frame: int = 1, materials: Mapping[str, str] | None = None
+) -> Particles:
+    """The state of a trajectory at a frame, for a model; see `Pretrained.start`."""
+    metadata = _metadata(model, trajectory)
+    frames = len(trajectory.position)
+    if not 1 <= frame < frames:
+        raise ConfigError(f"frame = {frame} must be 1 … {frames - 1}: velocities need the frame before it.")
+    if metadata.dim != model.scene.dim:
+        raise DataError(f"The trajectory has {metadata.dim} axes, the model {model.scene.dim}.")
+    pair = trajectory.position[frame - 1 : frame + 1]
+    present = ~np.isnan(pair[..., 0]).any(axis=0)
+    types = trajectory.particle_type
+    moving, obstacle = metadata.is_moving(types) & present, np.isin(types, list(metadata.obstacle_types)) & present
+    if not moving.any():
+        raise DataError(f"No particle that moves is there in frames {frame - 1} and {frame} of the trajectory.")
+    velocity = displacements(pair, metadata)[0] / metadata.dt
+    state = model.state(
+        pair[1, moving],
+        velocity=velocity[moving],
+        material=_materials(model, metadata, types[moving], materials or {}),
+        obstacle=pair[1, obstacle] if obstacle.any() else None,
+        gravity=_gravity(model, trajectory, metadata),
+        fields=_fields(model, trajectory, frame, moving),
+    )
+    if not model.scene.moving_obstacles or not obstacle.any():
+        return state
+    moved = torch.from_numpy(velocity[obstacle]).to(state.obstacle) * model.scene.dt
+    return dataclasses.replace(state, obstacle_velocity=moved[None])
+
+
+def _metadata(model: Pretrained, trajectory: Trajectory) -> Metadata:
+    """The trajectory's; without, all particles are the model's only material."""
+    if trajectory.metadata is not None:
+        return trajectory.metadata
+    scene, kinds = model.scene, np.unique(trajectory.particle_type)
+    if len(scene.materials) > 1 or len(kinds) > 1:
+        raise DataError(
+            f"The trajectory does not say what its particle types {kinds.tolist()} are. Take it from"
+            " nmpm.load_trajectories, which knows their names."
+        )
+    return Metadata(
+        bounds=scene.bounds,
+        dt=scene.dt,
+        dim=trajectory.position.shape[2],
+        sequence_length=1,
+        particle_types={int(kinds[0]): scene.materials[0]},
+        boundary=scene.boundary,
+    )
+
+
+def _materials(model: Pretrained, metadata: Metadata, types: np.ndarray, renamed: Mapping[str, str]) -> list[str]:
+    """Names of the particles' materials, of the model's."""
+    ids = np.unique(types).tolist()
+    names = {i: renamed.get(metadata.particle_types[i], metadata.particle_types[i]) for i in ids}
+    theirs = model.scene.materials
+    unknown = sorted({name for name in names.values() if name not in theirs})
+    if unknown:
+        raise DataError(
+            f"The trajectory has {', '.join(unknown)}, the model {', '.join(theirs)}.{suggestion(unknown[0], theirs)}"
+            f" State which is which: start(…, materials={{{unknown[0]!r}: {theirs[0]!r}}})."
+        )
+    return [names[i] for i in types.tolist()]
+
+
+def _gravity(model: Pretrained, trajectory: Trajectory, metadata: Metadata) -> Any:
+    """The trajectory's gravity where the model needs one, or knows another than this."""
+    scene, gravity = model.scene, trajectory_gravity(trajectory.attributes, metadata, "the trajectory")
+    if scene.gravity_varies or gravity is None or scene.gravity is None:
+        return gravity if scene.gravity_varies else None
+    limit = _SAME_GRAVITY * float(np.abs(scene.gravity).max())  # it may be measured
+    return None if np.allclose(gravity, scene.gravity, rtol=0, atol=limit) else gravity
+
+
+def _fields(model: Pretrained, trajectory: Trajectory, frame: int, moving: np.ndarray) -> dict[str, Any]:
+    """Fields of the model's scene that the trajectory has, at a frame."""
+    frames, particles = trajectory.position.shape[:2]
+    fields: dict[str, Any] = {}
+    for name in model.scene.fields:
+        values = trajectory.fields.get(name, trajectory.attributes.get(name))
+        if values is None:
+            continue
+        values = np.asarray(values)
+        values = values[frame] if values.shape == (frames, particles) else values
+        fields[name] = values[moving] if values.shape == (particles,) else values.reshape(())
+    return fields

@@ -1,0 +1,66 @@
+"""States taken out of recorded trajectories."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes import box
+
+from nmpm.data.arrays import scene_metadata
+from nmpm.data.format import Trajectory
+from nmpm.errors import ConfigError, DataError
+from tests.zoo.test_states import model_of
+
+SCENE = box(materials=("water", "sand"), obstacles=True)
+TYPES = {0: "sand", 1: "water", 2: "wall"}
+
+
+def recorded(metadata=None, **changes) -> Trajectory:
+    rng = np.random.default_rng(0)
+    position = rng.uniform(0.3, 0.7, (1, 6, 2)) + np.zeros((5, 1, 1))
+    position[:, :4, 0] += 0.002 * np.arange(5)[:, None]
+    position[2, 1] = np.nan
+    metadata = metadata or scene_metadata(SCENE, TYPES, 2)
+    return Trajectory(position, np.array([0, 0, 1, 1, 2, 2]), metadata=dataclasses.replace(metadata, **changes))
+
+
+@pytest.fixture
+def model():
+    return model_of(SCENE)
+
+
+def test_obstacles_and_absent_particles_are_taken_apart(model):
+    trajectory = recorded(gravity=(0.0, -9.7))  # as measured
+    state = model.start(trajectory, frame=3)
+    assert state.position.shape == (1, 3, 2)  # particle 1 was absent in frame 2
+    np.testing.assert_array_equal(state.position[0], trajectory.position[3, [0, 2, 3]])
+    torch.testing.assert_close(state.velocity[0, :, 0], torch.full((3,), 0.002), atol=1e-6, rtol=0)
+    assert state.material.tolist() == [[1, 0, 0]]
+    np.testing.assert_array_equal(state.obstacle[0], trajectory.position[3, 4:])
+    assert model.rollout(state, 2).shape == (1, 2, 3, 2)
+
+
+def test_data_of_another_time_step_have_the_same_velocity_in_seconds(model):
+    state = model.start(recorded(dt=2 * SCENE.dt), frame=1)
+    torch.testing.assert_close(state.velocity[0, :, 0], torch.full((4,), 0.001), atol=1e-6, rtol=0)
+
+
+def test_materials_of_other_names_are_refused_unless_stated(model):
+    trajectory = recorded(particle_types={0: "sand", 1: "watr", 2: "wall"})
+    with pytest.raises(DataError, match=r"has watr, the model water, sand\. Did you mean water\?.*materials="):
+        model.start(trajectory)
+    assert model.start(trajectory, materials={"watr": "water"}).material.tolist() == [[1, 1, 0, 0]]
+    bare = dataclasses.replace(trajectory, metadata=None)
+    with pytest.raises(DataError, match=r"does not say what its particle types \[0, 1, 2\] are"):
+        model.start(bare)
+    only = Trajectory(bare.position[:, :1], np.array([7]))
+    assert model_of(box()).start(only).material.tolist() == [[0]]
+
+
+def test_frames_and_gravity_that_do_not_fit_are_refused(model):
+    for frame in (0, 5, -1):
+        with pytest.raises(ConfigError, match=rf"frame = {frame} must be 1 … 4"):
+            model.start(recorded(), frame)
+    with pytest.raises(DataError, match="the model knows only"):
+        model.start(recorded(gravity=(0.0, 9.81)))
