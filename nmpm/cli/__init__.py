@@ -18,6 +18,7 @@ COMMANDS = {
     "predict": ("nmpm.cli.training", "Roll a checkpoint out over the test split and write the trajectories."),
     "simulate": ("nmpm.cli.simulate", "Simulate a dataset of one of the shipped scenes, or of one's own."),
     "convert": ("nmpm.cli.convert", "Convert a dataset of another format to the native layout."),
+    "init": ("nmpm.cli.init", "Write a configuration for a dataset, chosen by what its trajectories show."),
     "inspect": ("nmpm.cli.inspect", "Summarise a dataset on one screen, with anything odd about it."),
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
@@ -41,8 +42,8 @@ first steps:
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --resume runs/goop                  go on after an interruption
   nmpm inspect FOLDER                          summarise recorded data of any format known
-  nmpm fit --config waterdrop.yaml --data.path FOLDER
-                                               train on recorded data
+  nmpm init FOLDER                             write a configuration for it: FOLDER.yaml
+  nmpm fit --config FOLDER.yaml                train on it; or at once: nmpm fit --data.path FOLDER
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
   nmpm render out.h5                           draw the rollout
   nmpm view out.h5                             play it in a browser

@@ -43,12 +43,38 @@ def run(words: list[str]) -> int:
         options = read_options(["--help" if word == "--help_all" else word for word in words[1:]])
         options, note = expand_run(command, options)
         check_options(options)
+        options = add_configuration(options) if command == "fit" else options
         from nmpm.cli.run_training import run_command
 
         return run_command([command, *map(str, options)], note)
     except UsageError as error:
         sys.stderr.write(f"nmpm {command}: {error}\n")
         return 2
+
+
+def add_configuration(options: Sequence[Option]) -> list[Option]:
+    """The options with a configuration that is written for --data.path, where they name none."""
+    given = {option.name: option.value for option in options}
+    path = given.get("--data.path")
+    if path is None or "--config" in given or "--print_config" in given:
+        return list(options)
+    from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
+    from nmpm.data.convert import Options
+    from nmpm.data.new_configuration import OPTIONS
+
+    stated = {name: yaml.safe_load(given.get(f"--data.{name}") or "null") for name in OPTIONS}
+    root = Path(given.get(ROOT) or f"runs/{dataset_name(Path(path))}")
+    minutes = _minutes(given.get("--trainer.max_time") or "") or MINUTES
+    return [Option("--config", str(write_for_fit(Path(path), Options(**stated), root, minutes))), *options]
+
+
+def _minutes(time: str) -> float | None:
+    """The minutes of DD:HH:MM:SS; None for another form."""
+    parts = re.fullmatch(r"(\d+):(\d+):(\d+):(\d+)", time)
+    if parts is None:
+        return None
+    days, hours, minutes, seconds = map(int, parts.groups())
+    return 1440 * days + 60 * hours + minutes + seconds / 60
 
 
 def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], str]:

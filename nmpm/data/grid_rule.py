@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nmpm.scene import Interval
 
@@ -32,7 +32,7 @@ TRAINING_SHARE = 0.8
 """Of a training's time that its steps take; validations take the rest."""
 MEMORY_SHARE = 0.7
 """Of the free memory that a training may take."""
-_FINEST, _COARSEST, _CANDIDATES = 1.25, 8.0, 8  # spacings of particles to a cell
+_FINEST, _COARSEST, _CANDIDATES = 1.25, 8.0, 12  # spacings of particles to a cell
 _CELL_SECONDS = {1: 1.6e-9, 2: 4.7e-9, 3: 12.5e-9}  # of a core, by dimension; times width²
 _PARTICLE_SECONDS = 1.7e-6
 _BYTES, _BASE_BYTES = {1: 75, 2: 75, 3: 115}, 0.4e9  # of a cell, times width
@@ -62,6 +62,10 @@ class TrainingSize:
     def of(cls, dim: int) -> TrainingSize:
         """That of the shipped configurations in so many dimensions."""
         return cls(4, 2, 24) if dim == 3 else cls(8, 4, 32)
+
+    def with_unroll(self, unroll: int) -> TrainingSize:
+        """The same for another number of bundles."""
+        return replace(self, unroll=unroll)
 
     def seconds(self, shape: Sequence[int], particles: int) -> float:
         """Seconds of a step on one core of an AMD EPYC in float32, to 30%; other machines differ by a factor."""
@@ -107,6 +111,13 @@ def grid_cost(shape: Sequence[int], particles: int, machine: Machine, size: Trai
     return GridCost(seconds, machine.steps(seconds), memory, memory <= MEMORY_SHARE * machine.memory)
 
 
+def training_size(shape: Sequence[int], particles: int, machine: Machine) -> TrainingSize:
+    """That of the shipped configurations, in 3-D two thirds as wide where the steps would be too few otherwise."""
+    usual = TrainingSize.of(len(shape))
+    narrow = replace(usual, width=16) if len(shape) == 3 else usual
+    return usual if grid_cost(shape, particles, machine, usual).steps >= LEAST_STEPS else narrow
+
+
 def recommended_cells(grids: Sequence[GridFacts], particles: int, machine: Machine | None = None) -> int:
     """The cells along the longest side, of those of some grids, that the rule recommends.
 
@@ -117,10 +128,9 @@ def recommended_cells(grids: Sequence[GridFacts], particles: int, machine: Machi
     """
     machine, dim = machine or Machine(), len(grids[0].shape)
     target = (PER_AXIS * (machine.minutes / MINUTES) ** -GROWTH) ** dim
-    costs = {grid.cells: grid_cost(grid.shape, particles, machine) for grid in grids}
 
     def suits(grid: GridFacts) -> bool:
-        cost = costs[grid.cells]
+        cost = grid_cost(grid.shape, particles, machine, training_size(grid.shape, particles, machine))
         enough = grid.cells >= LEAST_CELLS[dim] and grid.high_speed <= MOST_SPEED
         return enough and cost.fits and cost.steps >= LEAST_STEPS
 

@@ -1,0 +1,111 @@
+"""`nmpm init PATH`, and the configuration that `nmpm fit --data.path PATH` makes where it is given none."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nmpm.cli.options import HelpFormatter, add_data_options, check_output, data_options
+from nmpm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from nmpm.data.convert import Options
+
+MINUTES = 15.0
+_DESCRIPTION = """\
+Write a configuration for a dataset of any format that nmpm convert reads, to train on it by nmpm fit.
+
+What the trajectories show is written beside each value: how many particles an occupied cell has, whether energy comes
+in, whether scenes come to rest, how gravity and walls were found and how sure that is. The rules are those of the
+shipped configurations (docs/recipes.md); the speed of this machine is measured for a second.
+"""
+_EXAMPLES = """\
+examples:
+  nmpm init grains                              writes grains.yaml; look at it, then:
+  nmpm fit --config grains.yaml                 train, test, draw
+  nmpm init run.npz --out long.yaml --minutes 120
+                                                a finer grid for a longer training
+  nmpm init grains --gravity 0,-9.81            what you know better than the data show
+  nmpm fit --data.path grains                   all at once, into runs/grains
+
+What a configuration cannot state, such as names of types and the time step, goes into a copy of the data:
+  nmpm convert grains NEW --types 1=steel,2=glass --dt 0.004
+  nmpm init NEW
+"""
+_SHOWN = ("max_steps:", "cells:", "constraints:", "gravity:", "# dt ")
+"""Beginnings of the lines that `nmpm fit` prints of a configuration."""
+
+
+def run(words: list[str]) -> None:
+    """Run the command, e.g. ["init", "grains"]."""
+    parser = argparse.ArgumentParser(
+        prog="nmpm init", description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
+    )
+    parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: NAME.yaml)")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="of the training (default: 15)")
+    add_data_options(parser)
+    arguments = parser.parse_args(words[1:])
+    options = data_options(arguments)
+    for name in ("types", "static", "dt"):
+        if getattr(options, name) is not None:
+            raise ConfigError(
+                f"--{name}: a configuration cannot state it; write it into a copy of the data: nmpm convert"
+                f" {arguments.path} NEW --{name} {getattr(arguments, name)}, then nmpm init NEW."
+            )
+    if not arguments.minutes > 0:
+        raise ConfigError(f"--minutes {arguments.minutes:g}: it must be positive.")
+    name = dataset_name(arguments.path)
+    out = arguments.out or Path(f"{name}.yaml")
+    if out.exists():
+        raise ConfigError(f"{out} exists already: delete it, or choose another file with --out.")
+    check_output("--out", out)
+    _write(arguments.path, options, out, f"runs/{name}", arguments.minutes)
+    sys.stdout.write(f"wrote {out}; to train by it: nmpm fit --config {out}\n")
+
+
+def write_for_fit(path: Path, options: Options, root: Path, minutes: float) -> Path:
+    """Write the configuration of a training without one into its run's folder, and print its most important lines.
+
+    Raises:
+        ConfigError: if the folder already holds a run.
+    """
+    from nmpm.cli.run_folder import RunFolder
+
+    RunFolder.of(root, {}).check_new()
+    root.mkdir(parents=True, exist_ok=True)
+    out = root / "init.yaml"
+    lines = _write(path, options, out, str(root), minutes)
+    shown = [line.strip() for line in lines if line.strip().startswith(_SHOWN)]
+    sys.stdout.write(f"No --config: wrote {out} for these data, {minutes:.3g} minutes:\n")
+    sys.stdout.writelines(f"  {line}\n" for line in shown)
+    sys.stdout.flush()
+    return out
+
+
+def _write(path: Path, options: Options, out: Path, root: str, minutes: float) -> Sequence[str]:
+    """Write a configuration for a dataset, and return its lines."""
+    from nmpm._support.atomic import atomic_write
+    from nmpm.data.loading.sources import FolderSource
+    from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration, survey
+    from nmpm.evaluation.pace import measure_machine
+
+    if not path.exists():
+        raise ConfigError(f"{path}: there is no such file or folder.")
+    source = CompletedSource.of(FolderSource(path, options))
+    scene, facts = source.data.scene, survey(source.data)
+    choice = Choice.of(scene, facts, measure_machine(scene.dim, minutes))
+    text = render_configuration(str(path), source, choice, root)
+    with atomic_write(out) as part:
+        part.write_text(text, encoding="utf-8")
+    return text.splitlines()
+
+
+def dataset_name(path: Path) -> str:
+    """A name for files and runs of a dataset."""
+    path = path.resolve()
+    name = path.stem if path.is_file() else path.name
+    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name) or "dataset"

@@ -1,0 +1,48 @@
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from nmpm.cli import main
+
+TINY = [
+    *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
+    *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
+]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+
+
+def test_fit_without_a_configuration_writes_and_takes_that_of_init(make_dataset, capsys):
+    folder = str(make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),)))
+    assert main(["init", folder, "--out", "made.yaml"]) == 0
+    assert "nmpm fit --config made.yaml" in capsys.readouterr().out
+    fit = ["fit", "--data.path", folder, *TINY, "--trainer.default_root_dir", "run"]
+    assert main(fit) == 0
+    assert "No --config: wrote run/init.yaml" in capsys.readouterr().out
+    assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 2  # options override
+    one, other = (yaml.safe_load(Path(file).read_text()) for file in ("made.yaml", "run/init.yaml"))
+    assert one["data"] == other["data"]
+    assert main(fit) == 1
+    assert "run already holds a run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "nowhere: there is no such file or folder."),
+        (["data", "--out", "there.yaml"], "there.yaml exists already"),
+        (["data", "--dt", "0.1"], "--dt: a configuration cannot state it; write it into a copy of the data"),
+        (["data", "--minutes", "0"], "--minutes 0: it must be positive."),
+    ],
+)
+def test_mistakes_are_told_before_the_work(words, message, capsys):
+    Path("data").mkdir()
+    Path("there.yaml").touch()
+    assert main(["init", *words]) == 1
+    assert message in capsys.readouterr().err
