@@ -14,6 +14,9 @@ from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
+DESCRIPTION = ("scene", "particle_types", "static_types")
+"""Names of these attributes."""
+
 
 def description(trajectory: Trajectory, metadata: Metadata, particle_volume: float) -> dict[str, Any]:
     """The attributes `scene`, `particle_types`, in JSON, and ids of types of a trajectory of a dataset."""
@@ -33,7 +36,7 @@ def description(trajectory: Trajectory, metadata: Metadata, particle_volume: flo
     prescribed = np.array(sorted(metadata.prescribed_types), dtype=np.int64)
     return ({"prescribed_types": prescribed} if len(prescribed) else {}) | {
         "scene": json.dumps(scene.to_dict()),
-        "particle_types": json.dumps({i: name for i, name in metadata.particle_types.items() if i in types}),
+        "particle_types": json.dumps(metadata.particle_types),
         "static_types": np.array(sorted(metadata.static_types), dtype=np.int64),
     }
 

@@ -22,7 +22,7 @@ from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.lammps import Lammps
-from nmpm.data.convert.native import Native
+from nmpm.data.convert.native import Native, NativeFiles
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.rollout_pickle import RolloutPickle
 from nmpm.data.convert.tracks import Tracks
@@ -36,6 +36,7 @@ _log = logging.getLogger(__name__)
 
 FORMATS: tuple[DatasetFormat, ...] = (
     Native(),
+    NativeFiles(),
     DeepMind(),
     GnsNpz(),
     NeuralMpm(),
@@ -110,7 +111,7 @@ def convert(
     return write_native(renumber_types(dataset, ids) if ids else dataset, destination, problems)
 
 
-def native_folder(path: Path, options: Options | None = None) -> Path:
+def native_folder(path: Path, options: Options | None = None, format_name: str | None = None) -> Path:
     """A folder in the native layout with the same data, converted in the cache now or by an earlier call.
 
     The dataset is converted again when the size or time of a source file, or an option, has changed.
@@ -121,20 +122,20 @@ def native_folder(path: Path, options: Options | None = None) -> Path:
     """
     path, options = Path(path).resolve(), options or Options()
     if options.gravity is not None:
-        stated = open_dataset(path, options=replace(options, gravity=None))
+        stated = open_dataset(path, format_name, replace(options, gravity=None))
         if "gravity" not in stated.assumed | stated.unknown:
             metadata = (path if path.is_dir() else path.parent) / METADATA_FILE
             check_gravity(options.gravity, stated.metadata.gravity, metadata if metadata.is_file() else path)
     cache = user_home() / "converted"
-    folder = cache / f"{path.stem}-{_fingerprint(path, options)}"
+    folder = cache / f"{path.stem}-{_fingerprint(path, options, format_name)}"
     with lock_folder(cache):
         if not (folder / METADATA_FILE).is_file():
-            for note in convert(path, folder, options=options):
+            for note in convert(path, folder, format_name, options):
                 _log.info("%s: %s", path.name, note)
     return folder
 
 
-def _fingerprint(path: Path, options: Options) -> str:
+def _fingerprint(path: Path, options: Options, format_name: str | None) -> str:
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     states = [(str(file.relative_to(path)), file.stat()) for file in files if file.is_file()]
     stamps = [(name, state.st_size, state.st_mtime_ns) for name, state in states]
@@ -145,5 +146,5 @@ def _fingerprint(path: Path, options: Options) -> str:
         else value
         for value in vars(options).values()
     ]
-    identity = repr((str(path), ordered, stamps))
+    identity = repr((str(path), ordered, stamps, *([format_name] if format_name else [])))
     return hashlib.sha256(identity.encode()).hexdigest()[:10]

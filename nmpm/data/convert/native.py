@@ -1,14 +1,22 @@
-"""The native layout, which LagrangeBench shares; converting it writes the user's options into its metadata."""
+"""The native layout, which LagrangeBench shares; converting it writes the user's options into its metadata.
+
+And files of it alone: rollouts, predictions and whatever else brings its scene along, or has metadata beside it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options
-from nmpm.data.format import METADATA_FILE, Split, Trajectory, read_metadata, split_paths
+from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files
+from nmpm.data.described import DESCRIPTION, described_metadata
+from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata, split_paths
+from nmpm.errors import DataError, NmpmError
+
+_PATTERNS = ("*.h5", "*.vtkhdf")
 
 
 class Native(DatasetFormat):
@@ -32,6 +40,44 @@ class Native(DatasetFormat):
             notes=(note,) if options.family else (),
             counts={name: len(split) for name, split in splits.items()},
         )
+
+
+class NativeFiles(DatasetFormat):
+    """HDF5 files of the native layout whose trajectories describe their scene, or a split's file of a dataset."""
+
+    name: ClassVar[str] = "native-files"
+    summary: ClassVar[str] = "rollouts, predictions and other single HDF5 files of nmpm"
+
+    def recognises(self, path: Path) -> bool:
+        files = split_files(path, *_PATTERNS)
+        try:
+            return bool(files) and bool(_file_metadata(Split(next(iter(files.values()))[0]), None))
+        except (NmpmError, OSError):
+            return False
+
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        splits = {name: [Split(file) for file in files] for name, files in split_files(path, *_PATTERNS).items()}
+        if not splits:
+            raise DataError(f"{path}: no file {' or '.join(_PATTERNS)} there.")
+        return ForeignDataset(
+            metadata=options.apply_to(_file_metadata(next(iter(splits.values()))[0], options.family)),
+            splits={name: partial(_read_files, files) for name, files in splits.items()},
+            counts={name: sum(map(len, files)) for name, files in splits.items()},
+        )
+
+
+def _file_metadata(split: Split, family: str | None) -> Metadata:
+    attributes = split.attributes(0)
+    if "scene" in attributes:
+        return described_metadata(attributes, split.path, split.frames(0))
+    return read_metadata(split.path.parent, family)
+
+
+def _read_files(splits: list[Split]) -> Iterator[Trajectory]:
+    for split in splits:
+        for trajectory in _read(split):
+            attributes = {name: value for name, value in trajectory.attributes.items() if name not in DESCRIPTION}
+            yield replace(trajectory, attributes=attributes)
 
 
 def _read(split: Split) -> Iterator[Trajectory]:

@@ -22,6 +22,11 @@ WRITERS: tuple[TrajectoryWriter, ...] = (NativeHdf5(), VtkHdf(), VtpSeries(), Us
 SUFFIXES = ", ".join(writer.suffixes[0] for writer in WRITERS)
 
 
+def is_written_by_suffix(path: Path) -> bool:
+    """Whether there is a writer for a path's suffix."""
+    return any(path.suffix.lower() in writer.suffixes for writer in WRITERS)
+
+
 def find_writer(option: str, path: Path) -> TrajectoryWriter:
     """The writer for a path's suffix.
 

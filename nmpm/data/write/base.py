@@ -21,10 +21,12 @@ class TrajectoryWriter(abc.ABC):
     Attributes:
         suffixes: Of the files' names, in lower case.
         readers: Programs that open the file, in words.
+        holds_all_fields: Also those that are not of particles.
     """
 
     suffixes: ClassVar[tuple[str, ...]]
     readers: ClassVar[str]
+    holds_all_fields: ClassVar[bool] = False
 
     @abc.abstractmethod
     def write(

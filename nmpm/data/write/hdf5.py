@@ -21,6 +21,7 @@ class NativeHdf5(TrajectoryWriter):
 
     suffixes: ClassVar[tuple[str, ...]] = (".h5",)
     readers: ClassVar[str] = "nmpm view, ParaView"
+    holds_all_fields: ClassVar[bool] = True
 
     def write(
         self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step

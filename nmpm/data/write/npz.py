@@ -15,10 +15,11 @@ from nmpm.data.write.frames import frame_times
 
 
 class Npz(TrajectoryWriter):
-    """`position` (T, N, D), `particle_type` (N,), `time` (T,), every field, and facts of the scene by their names."""
+    """`position` (T, N, D), `particle_type` (N,), `time` (T,), every field, and facts of the scene; `type_names` by type id."""
 
     suffixes: ClassVar[tuple[str, ...]] = (".npz",)
     readers: ClassVar[str] = "NumPy"
+    holds_all_fields: ClassVar[bool] = True
 
     def write(
         self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
@@ -30,8 +31,7 @@ class Npz(TrajectoryWriter):
             "gravity": trajectory.attributes.get("gravity", metadata.gravity),
             "particle_volume": metadata.particle_volume,
             "static_types": sorted(metadata.static_types),
-            "type_ids": list(metadata.particle_types),
-            "type_names": list(metadata.particle_types.values()),
+            "type_names": [metadata.particle_types.get(i, "") for i in range(1 + max(metadata.particle_types))],
         }
         arrays = {
             **{name: np.array(value) for name, value in facts.items() if value is not None},
