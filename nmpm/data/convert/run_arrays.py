@@ -122,7 +122,7 @@ class RunArrays:
         types, names = self.roles.get("types"), self.fact("type_names")
         if types is not None and self.arrays[types].dtype.kind in "SUO":
             return dict(enumerate(sorted(set(as_text(self.arrays[types][()]).flat))))
-        return {} if names is None else dict(enumerate(as_text(names).tolist()))
+        return {} if names is None else {i: name for i, name in enumerate(as_text(names).tolist()) if name}
 
     def notes(self) -> tuple[str, ...]:
         """Sentences on what the arrays are taken for."""

@@ -15,7 +15,7 @@ from nmpm.data.write.frames import frame_times
 
 
 class Npz(TrajectoryWriter):
-    """`position` (T, N, D), `particle_type` (N,), `time` (T,), every field, and facts of the scene; `type_names` by type id."""
+    """`position` (T, N, D), `particle_type` (N,), `time` (T,), fields, and facts of the scene; `type_names` by id."""
 
     suffixes: ClassVar[tuple[str, ...]] = (".npz",)
     readers: ClassVar[str] = "NumPy"
