@@ -40,7 +40,7 @@ examples:
   nmpm convert datasets/WaterRamps water                 DeepMind's TFRecords
   nmpm convert flume/test.npz flume --types 1=debris --bounds 0.02:1,0:0.2
   nmpm convert heated-channel channel --family jax-sph --boundary periodic,wall
-  nmpm convert out.h5 out.vtkhdf                         a rollout for ParaView; .usda for Blender, …
+  nmpm convert out.h5 out.vtkhdf                         a rollout for ParaView; .usda: Blender
   nmpm convert water splash.csv --trajectory 3           one trajectory of a dataset, of its tests
   nmpm convert ramps ramps-for-lagrangebench --ids 5=0,3=1   LagrangeBench: 0 fluid, 1 wall
 """

@@ -33,7 +33,7 @@ class ArrayFiles(RunFiles):
     """Files of arrays: positions (T, N, D) or (R, T, N, D), and whatever fits them."""
 
     name: ClassVar[str] = "arrays"
-    summary: ClassVar[str] = "arrays of positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, with usual names"
+    summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, by usual names"
     patterns: ClassVar[tuple[str, ...]] = ("*.npz", "*.npy", "*.h5", "*.hdf5")
 
     def recognises(self, path: Path) -> bool:

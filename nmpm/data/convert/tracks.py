@@ -118,7 +118,7 @@ class Tracks(RunFiles):
     """Tables of tracks; particles that are in no row of a frame are absent in it."""
 
     name: ClassVar[str] = "tracks"
-    summary: ClassVar[str] = "tables of tracks (.csv, .tsv, .txt, also .gz; .parquet): frame or time, id, x, y, z"
+    summary: ClassVar[str] = "tables of tracks (.csv, .tsv, .txt, .gz, .parquet): frame or time, id, x, y, z"
     patterns: ClassVar[tuple[str, ...]] = SUFFIXES
 
     def recognises(self, path: Path) -> bool:
