@@ -56,7 +56,7 @@ def test_fields_that_a_form_cannot_hold_are_named(dataset, capsys):
     assert "- Not of particles, so left out: noise" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("suffix", [".h5", ".vtkhdf", ".npz", ".csv", ".pvd"])
+@pytest.mark.parametrize("suffix", [".h5", ".vtkhdf", ".npz", ".csv", ".pvd", ".lammpstrj"])
 def test_there_and_back_again(dataset, tmp_path, suffix):
     """Positions, types and times survive every form that is read, bit by bit."""
     if suffix == ".pvd":

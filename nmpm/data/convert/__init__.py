@@ -36,12 +36,12 @@ _log = logging.getLogger(__name__)
 
 FORMATS: tuple[DatasetFormat, ...] = (
     Native(),
-    NativeFiles(),
     DeepMind(),
     GnsNpz(),
     NeuralMpm(),
     Dmcf(),
     RolloutPickle(),
+    NativeFiles(),
     ArrayFiles(),
     Tracks(),
     Vtk(),
