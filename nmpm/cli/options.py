@@ -155,6 +155,15 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--boundary", metavar="KIND,...", help='"wall", "periodic" or "open" per axis, e.g. periodic,wall'
     )
+    changes = parser.add_argument_group("changes of positions")
+    changes.add_argument("--resample", type=float, metavar="DT", help="interpolate to frames that are DT apart in time")
+    changes.add_argument(
+        "--smooth",
+        type=int,
+        metavar="FRAMES",
+        help="of measured tracks: replace positions by local quadratic fits to so many frames, e.g. 5; errors are then"
+        " against the smoothed tracks",
+    )
     group.add_argument("--fields", metavar="NAME,...", help="fields that are inputs of models, e.g. temperature")
 
 
@@ -175,6 +184,8 @@ def data_options(options: argparse.Namespace) -> Options:
         gravity=gravity_option(options.gravity),
         boundary=options.boundary and options.boundary.split(","),
         fields=_parse("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
+        resample=options.resample,
+        smooth=options.smooth,
     )
 
 

@@ -67,6 +67,9 @@ class TrajectoryDataModule(LightningDataModule):
         fields: Names of fields that are inputs of the model, such as [temperature], instead of those that the metadata
             of recorded data declare; [] for none. Those that evolve are predicted.
         prescribed: Ids of the types in recorded data that are obstacles and move as recorded, such as [2] for a paddle.
+        resample: Time between frames that the positions of recorded data are interpolated to, where theirs are uneven.
+        smooth: Frames of local quadratic fits that replace measured positions, such as 5, against their noise; errors
+            are then against the smoothed tracks.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
@@ -98,6 +101,8 @@ class TrajectoryDataModule(LightningDataModule):
         bounds: list[tuple[float, float]] | None = None,
         fields: list[str] | None = None,
         prescribed: list[int] | None = None,
+        resample: float | None = None,
+        smooth: int | None = None,
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
@@ -110,6 +115,8 @@ class TrajectoryDataModule(LightningDataModule):
             gravity=gravity,
             boundary=boundary,
             fields=fields,
+            resample=resample,
+            smooth=smooth,
         )
         self.data_source = make_source(path, name, source, options, generate)
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):

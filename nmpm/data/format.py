@@ -177,6 +177,16 @@ class Split:
         with open_hdf5(self.path) as file:
             return np.asarray(file[self._entries[index].name]["particle_type"][()], dtype=np.int64)
 
+    def time(self, index: int) -> np.ndarray | None:
+        """The (T,) float64 times of a trajectory's frames, its field `time`; None where it has none."""
+        entry = self._entries[index]
+        with open_hdf5(self.path) as file:
+            time = file[entry.name].get("time")
+            if not isinstance(time, h5py.Dataset) or time.shape != (entry.frames,) or time.dtype.kind not in "iuf":
+                return None
+            check_stored_size(time, f"{self.where(index)}: time")
+            return np.asarray(time[()], dtype=np.float64)
+
     def attributes(self, index: int) -> dict[str, Any]:
         """The attributes of a trajectory."""
         with open_hdf5(self.path) as file:

@@ -24,6 +24,7 @@ from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native, NativeFiles
 from nmpm.data.convert.neuralmpm import NeuralMpm
+from nmpm.data.convert.retiming import retime
 from nmpm.data.convert.rollout_pickle import RolloutPickle
 from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
@@ -58,8 +59,9 @@ def open_dataset(path: Path, format_name: str | None = None, options: Options | 
         ConfigError: if there is no format of that name, or an option is invalid.
     """
     options = options or Options()
-    dataset = _find_format(Path(path), format_name).open(Path(path), options)
-    return replace(dataset, unknown=dataset.unknown - options.stated)
+    as_stored = replace(options, resample=None, smooth=None)
+    dataset = _find_format(Path(path), format_name).open(Path(path), as_stored)
+    return retime(replace(dataset, unknown=dataset.unknown - as_stored.stated), options)
 
 
 def _find_format(path: Path, name: str | None) -> DatasetFormat:

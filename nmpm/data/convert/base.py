@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -39,11 +40,27 @@ class Options:
     gravity: Sequence[float] | None = None  # acceleration in length/s² per axis
     boundary: Sequence[Boundary] | None = None  # "wall", "periodic" or "open" per axis
     fields: Sequence[str] | None = None  # names of the fields that are inputs of models
+    resample: float | None = None  # time between frames that positions are interpolated to
+    smooth: int | None = None  # frames of the local quadratic fit that replaces positions
 
     def __post_init__(self) -> None:
         if self.boundary is not None and not set(self.boundary) <= set(get_args(Boundary)):
             raise ConfigError(f"boundary = {list(self.boundary)} must be {', '.join(get_args(Boundary))} per axis.")
         check_field_names(self.fields or ())
+        if self.resample is not None and not 0 < self.resample < math.inf:
+            raise ConfigError(f"resample = {self.resample} must be positive: the time between the new frames.")
+        if self.smooth is not None and (self.smooth < 5 or self.smooth % 2 == 0):
+            raise ConfigError(f"smooth = {self.smooth} must be an odd number of frames, 5 or more.")
+
+    @property
+    def changes_positions(self) -> bool:
+        """Whether files in the native layout cannot be used as they are."""
+        return self.resample is not None or self.smooth is not None
+
+    @property
+    def of_converted(self) -> Options:
+        """The same for data that are resampled and smoothed already."""
+        return replace(self, dt=self.resample or self.dt, resample=None, smooth=None)
 
     @property
     def stated(self) -> frozenset[str]:
@@ -76,7 +93,8 @@ class Options:
             metadata = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
         if self.static:
             metadata = replace(metadata, prescribed_types=metadata.prescribed_types - self.static)
-        changes: dict[str, Any] = {"static_types": self.static, "prescribed_types": self.prescribed, "dt": self.dt}
+        changes: dict[str, Any] = {"static_types": self.static, "prescribed_types": self.prescribed}
+        changes["dt"] = self.resample or self.dt
         if self.bounds is not None:
             changes |= {"bounds": tuple((float(low), float(high)) for low, high in self.bounds)}
             metadata = replace(metadata, domain=None)

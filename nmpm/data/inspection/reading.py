@@ -31,6 +31,8 @@ class OpenedDataset:
 def open_dataset(source: FolderSource) -> OpenedDataset:
     """Opens a dataset as far as it can be read; raises a DataError if no split can be opened."""
     folder, problems = source.folder, list[str]()
+    if source.options.changes_positions:
+        source = FolderSource(folder, source.options.of_converted)
     splits: dict[str, Split] = {}
     for name, path in split_paths(folder).items():
         try:

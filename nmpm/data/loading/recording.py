@@ -23,6 +23,7 @@ from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence
 from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
+from nmpm.data.times import check_times
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -208,9 +209,14 @@ class SplitRecordings(Sequence[Recording]):
         return recordings
 
     def check_ends(self) -> None:
-        """Checks the first and the last frame of each trajectory, and that it has the fields, as reading all would."""
+        """Checks the times and the first and the last frame of each trajectory, and that it has the fields.
+
+        Raises:
+            DataError: if they are not as reading all would need them, or the steps in time of one are uneven.
+        """
         require_fields(self.split, self.reader.metadata.fields)
         for index in self.indices:
+            check_times(self.split.time(index), self.split.where(index))
             for frame in sorted({0, self.split.frames(index) - 1}):
                 self.reader.check(self.split.read(index, frame, frame + 1), self.split.where(index), frame)
 

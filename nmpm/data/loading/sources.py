@@ -67,7 +67,10 @@ class DataSource(abc.ABC):
 
 @dataclass(frozen=True)
 class FolderSource(DataSource):
-    """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads."""
+    """Recorded data: a dataset in the native layout, or in any format that `nmpm convert` reads.
+
+    Data in the native layout are used as they are, except where they are resampled or smoothed: then a converted copy.
+    """
 
     path: Path
     options: Options = field(default_factory=Options)
@@ -78,7 +81,7 @@ class FolderSource(DataSource):
 
     @cached_property
     def folder(self) -> Path:
-        if not self.path.exists() or split_paths(self.path):
+        if not self.path.exists() or (split_paths(self.path) and not self.options.changes_positions):
             return self.path
         return native_folder(self.path, self.options)
 

@@ -1,0 +1,210 @@
+"""Trajectories at even times, and with less measurement noise.
+
+Both work on the pieces of a particle's track between absences, each for itself: nothing is interpolated across a gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+
+from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.errors import DataError
+
+_GAP = 2.5  # longer steps in time, in usual or new ones, are gaps
+_TOLERANCE = 0.05  # of a step: further from a piece's ends than that, there is no particle
+_ORDER = 2  # of the polynomials of smoothing
+_VALUES = 2**22  # numbers that are interpolated at once
+
+Piece = tuple[int, int]
+"""First frame, and the frame after the last."""
+
+
+def retime(dataset: ForeignDataset, options: Options) -> ForeignDataset:
+    """The dataset at the even times and with the smoothing that a user asks for.
+
+    Raises:
+        DataError: on reading, if there are no times to resample.
+    """
+    metadata, notes = dataset.metadata, dataset.notes
+    changes = list[Callable[[Trajectory], Trajectory]]()
+    if options.resample is not None:
+        dt = None if "dt" in dataset.unknown else metadata.dt
+        changes.append(partial(_resample_stored, dt=dt, step=options.resample, metadata=metadata))
+        metadata = replace(metadata, dt=options.resample, sequence_length=UNKNOWN_LENGTH)
+        notes = (*notes, f"Positions are interpolated to frames that are {options.resample:g} apart in time.")
+    if options.smooth is not None:
+        changes.append(partial(smooth, frames=options.smooth, metadata=metadata))
+        notes = (
+            *notes,
+            f"Positions are smoothed by quadratic fits to {options.smooth} frames; errors are against these.",
+        )
+    return replace(
+        dataset,
+        metadata=metadata,
+        notes=notes,
+        splits={name: partial(_apply, start, changes) for name, start in dataset.splits.items()},
+        unknown=dataset.unknown - ({"dt"} if options.resample is not None else set()),
+    )
+
+
+def _apply(
+    start: Callable[[], Iterator[Trajectory]], changes: list[Callable[[Trajectory], Trajectory]]
+) -> Iterator[Trajectory]:
+    for trajectory in start():
+        for change in changes:
+            trajectory = change(trajectory)
+        yield trajectory
+
+
+def _resample_stored(trajectory: Trajectory, dt: float | None, step: float, metadata: Metadata) -> Trajectory:
+    frames = len(trajectory.position)
+    time = trajectory.fields.get("time")
+    if time is None or time.shape != (frames,):
+        if dt is None:
+            raise DataError("Frames without times cannot be resampled: state the time between them (--dt).")
+        time = dt * np.arange(frames)
+    return resample(trajectory, np.asarray(time, dtype=np.float64), step, metadata)
+
+
+def resample(trajectory: Trajectory, time: np.ndarray, step: float, metadata: Metadata) -> Trajectory:
+    """The trajectory at even times, by cubic splines through the frames of each particle, never across gaps.
+
+    Gaps are frames in which a particle is absent, and times between frames that are longer than 2.5 usual or new steps.
+    Fields of particles that are no floats have the value of the nearest frame.
+
+    Args:
+        trajectory: The trajectory.
+        time: (T,) times of its frames.
+        step: Time between the new frames; the first is the first that is recorded.
+        metadata: The dataset's; on periodic axes splines go the short way across the border.
+
+    Raises:
+        DataError: if the times do not increase, or are shorter than two steps.
+    """
+    steps, (frames, particles) = np.diff(time), trajectory.position.shape[:2]
+    if not (steps > 0).all():
+        frame = int(np.argmin(steps > 0)) + 1
+        raise DataError(f"The times of frames must increase to be resampled; that of frame {frame} is {time[frame]:g}.")
+    new = time[0] + step * np.arange(int((time[-1] - time[0]) / step + _TOLERANCE) + 1)
+    if len(new) < 2:
+        raise DataError(f"Frames from {time[0]:g} to {time[-1]:g} cannot be resampled to steps of {step:g}.")
+    breaks = 1 + np.flatnonzero(steps > _GAP * max(float(np.median(steps)), step))
+    nearest = np.abs(time[:, None] - new).argmin(axis=0)
+
+    def at_new_times(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
+        def spline(piece: Piece, tracks: np.ndarray) -> tuple[slice, np.ndarray]:
+            return _spline(time[slice(*piece)], tracks, new, _TOLERANCE * step)
+
+        return _by_pieces(values, breaks, len(new), periods, spline)
+
+    position = _wrapped(trajectory.position, metadata, at_new_times)
+    end = int(np.flatnonzero(~np.isnan(position[..., 0]).all(axis=1))[-1]) + 1
+    fields = {"time": new[:end]}
+    for name, values in trajectory.fields.items():
+        if values.shape[:2] == (frames, particles) and values.dtype.kind == "f":
+            fields[name] = at_new_times(values, np.zeros(int(np.prod(values.shape[2:]))))[:end]
+        elif values.shape[:2] == (frames, particles) or (values.shape == (frames,) and frames != particles):
+            fields.setdefault(name, values[nearest][:end])
+        else:
+            fields.setdefault(name, values)
+    return replace(trajectory, position=position[:end], fields=fields)
+
+
+def smooth(trajectory: Trajectory, frames: int, metadata: Metadata) -> Trajectory:
+    """The trajectory with each position replaced by a quadratic fit to the frames around it (Savitzky and Golay).
+
+    At the ends of tracks and at gaps the fits are one-sided; pieces with fewer frames are one parabola, those with
+    three or less stay as they are. Fields are not smoothed.
+    """
+
+    def smoothed(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
+        def fit(piece: Piece, tracks: np.ndarray) -> tuple[slice, np.ndarray]:
+            return slice(*piece), _fit(tracks, frames)
+
+        return _by_pieces(values, np.empty(0, int), len(values), periods, fit)
+
+    return replace(trajectory, position=_wrapped(trajectory.position, metadata, smoothed))
+
+
+def _spline(time: np.ndarray, tracks: np.ndarray, new: np.ndarray, tolerance: float) -> tuple[slice, np.ndarray]:
+    """The new frames within a piece of (n, C) tracks, and the values there."""
+    first, last = np.searchsorted(new, [time[0] - tolerance, time[-1] + tolerance])
+    within = slice(int(first), int(last))
+    if len(time) == 1:
+        return within, np.broadcast_to(tracks, (within.stop - within.start, *tracks.shape[1:]))
+    return within, CubicSpline(time, tracks)(new[within])
+
+
+def _fit(tracks: np.ndarray, frames: int) -> np.ndarray:
+    """(n, C) tracks after local quadratic fits."""
+    if len(tracks) >= frames:
+        return np.asarray(savgol_filter(tracks, frames, _ORDER, axis=0, mode="interp"))
+    if len(tracks) <= _ORDER + 1:
+        return tracks
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, len(tracks)), _ORDER + 1))
+    return np.asarray(basis @ (basis.T @ tracks))
+
+
+def _by_pieces(
+    values: np.ndarray,
+    breaks: np.ndarray,
+    length: int,
+    periods: np.ndarray,
+    change: Callable[[Piece, np.ndarray], tuple[slice, np.ndarray]],
+) -> np.ndarray:
+    """(T', N, …) values of the same type: the pieces of (T, N, …) ones, each changed; NaN between them.
+
+    Args:
+        values: NaN where a particle is absent.
+        breaks: Frames at which pieces end also where the particle is there.
+        length: T'.
+        periods: (C,) periods of the C components, 0 for none; jumps across their borders are removed.
+        change: Called with a piece and its (n, N' C) float64 values; returns which frames it gives, and their values.
+    """
+    frames, particles = values.shape[:2]
+    flat = values.reshape(frames, particles, -1)
+    result = np.full((length, particles, flat.shape[2]), np.nan, values.dtype)
+    for piece, index in _pieces(~np.isnan(flat[..., 0]), breaks):
+        most = max(1, _VALUES // (max(piece[1] - piece[0], length) * flat.shape[2]))
+        for some in np.split(index, range(most, len(index), most)):
+            tracks = flat[piece[0] : piece[1], some].astype(np.float64)
+            for component in np.flatnonzero(periods):
+                tracks[..., component] = np.unwrap(tracks[..., component], period=periods[component], axis=0)
+            target, changed = change(piece, tracks.reshape(len(tracks), -1))
+            result[target, some] = changed.reshape(len(changed), len(some), -1)
+    return result.reshape(length, particles, *values.shape[2:])
+
+
+def _pieces(present: np.ndarray, breaks: np.ndarray) -> Iterator[tuple[Piece, np.ndarray]]:
+    """The pieces of the tracks by (T, N) presence, and the particles that have each."""
+    first, last = present.copy(), present.copy()
+    first[1:] &= ~present[:-1]
+    last[:-1] &= ~present[1:]
+    first[breaks] = present[breaks]
+    last[breaks - 1] = present[breaks - 1]
+    particle, start = np.nonzero(first.T)
+    _, end = np.nonzero(last.T)
+    pieces, number = np.unique(np.stack([start, end + 1], axis=1), axis=0, return_inverse=True)
+    order = np.argsort(number.reshape(-1), kind="stable")
+    bounds = np.searchsorted(number.reshape(-1)[order], np.arange(len(pieces) + 1))
+    for (begin, stop), low, high in zip(pieces.tolist(), bounds[:-1], bounds[1:], strict=True):
+        yield (begin, stop), particle[order[low:high]]
+
+
+def _wrapped(
+    position: np.ndarray, metadata: Metadata, change: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Changed (T, N, D) positions, within the bounds of periodic axes."""
+    lower, upper = np.asarray(metadata.bounds).T
+    periods = np.where(metadata.periodic, upper - lower, 0.0)
+    changed = change(position, periods)
+    for axis in np.flatnonzero(periods):
+        changed[..., axis] = lower[axis] + np.mod(changed[..., axis] - lower[axis], periods[axis])
+    return changed
