@@ -19,6 +19,8 @@ from nmpm.data.facts.parabolas import AGREE, Flight, fit_parabolas, join, shared
 _FRAMES = (8, 4)  # of a parabola
 _LONG = 32  # frames in which a flight must be straight
 _SHARE = 0.2  # of the particles that move, that must be in free flight
+_CLEAR = 0.5  # the same where flights that differ show that gravity does
+_MOST = 0.6  # of the trajectories must agree
 _MEAN_AGREE = 0.05  # of gravity
 _LATER, _LATER_FRAMES, _LATER_SHARE = 24, 5, 0.05  # parabolas over a whole trajectory, their frames, share that agrees
 _EXACT = 0.01  # of gravity: smaller components are none
@@ -58,8 +60,9 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
         return _no_gravity(straight, number, spacing, dt)
     if alike := _agreeing([flight.acceleration for flight in free], AGREE):
         return _from_flights([free[index] for index in alike], number, dt)
-    if len(free) >= 3 and 2 * len(free) >= number:
-        return _differing(free, number, dt)
+    clear = [flight for flight in free if flight.share > _CLEAR]
+    if len(clear) >= 2 and 2 * len(clear) >= number:
+        return _differing(clear, number, dt)
     means = [flight.mean for flight in flights]
     if len(means) >= 3 and len(_agreeing(means, _MEAN_AGREE)) == len(means):
         how = f"the mean acceleration of all particles in first frames, in {len(means)} of {number} trajectories"
@@ -106,12 +109,12 @@ def _later_flight(track: Track, spacing: float) -> Flight | None:
 
 
 def _agreeing(vectors: Sequence[np.ndarray], tolerance: float) -> list[int]:
-    """Indices of the vectors that agree with the median of all, if they are half of them or more."""
+    """Indices of the vectors that agree with the median of all, if they are most of them."""
     if not vectors:
         return []
     median = np.median(vectors, axis=0)
     agree = np.linalg.norm(np.stack(vectors) - median, axis=1) <= tolerance * np.linalg.norm(median)
-    return np.flatnonzero(agree).tolist() if 2 * agree.sum() >= len(vectors) else []
+    return np.flatnonzero(agree).tolist() if agree.mean() > _MOST else []
 
 
 def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[float, ...] | None]:
