@@ -141,6 +141,7 @@ class _Log:
         self._facts = [
             f"{name} {_short(getattr(self.metadata, name))} ({how.rstrip('.')})."
             for name, how in self.metadata.extra[FOUND].items()
+            if getattr(self.metadata, name) != frozenset() and name != "sequence_length"
         ]
         if self.unknown & _MOVE_STATISTICS:
             self.motion = MotionStatistics(self.metadata)

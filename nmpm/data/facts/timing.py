@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,7 +12,8 @@ from nmpm.data.facts.sample import Sample
 
 _EVEN = 0.01  # of a step
 _ALIKE = 0.02  # of the time step: another differs by more
-_CORRELATED = 0.99  # displacements and velocities that belong together
+_RATIOS = 20  # displacements over velocities
+_ROUNDED = 1e-3  # of the time step
 
 
 class TimeSteps:
@@ -40,8 +40,9 @@ class TimeSteps:
         if not self._medians:
             if by_velocity is not None and not per_frame:
                 return Fact(by_velocity, "displacements over recorded velocities.", "measured")
-            how = "no times are recorded, so times are in frames, velocities in length per frame."
-            return Fact(1.0, how, "likely" if per_frame else "guessed")
+            if per_frame:
+                return Fact(1.0, "displacements between frames equal the recorded velocities.", "measured")
+            return Fact(1.0, "no times are recorded, so the unit of time is the frame.", "guessed")
         step = float(np.median(self._medians))
         step = roundest(step * (1 - 1e-6), step * (1 + 1e-6))
         if by_velocity is not None and not per_frame and abs(by_velocity / step - 1) > _ALIKE:
@@ -58,18 +59,26 @@ class TimeSteps:
 
 
 def _step_by_velocities(samples: Sequence[Sample]) -> float | None:
-    """Displacements over velocities of moving particles, or None where they do not belong together."""
-    sums = np.zeros(3)  # of squares of displacements, products, squares of velocities
-    for sample in samples:
-        if sample.velocity is None or len(sample.position) < 3:
-            continue
-        move = (sample.position[2:].astype(np.float64) - sample.position[:-2]) / 2
-        velocity = sample.velocity[1:-1].astype(np.float64)
-        there = np.isfinite(move) & np.isfinite(velocity)
-        # Jumps across periodic axes and collisions aside.
-        there &= np.abs(move) <= 4 * np.median(np.abs(move[there])) if there.any() else False
-        sums += [(move[there] ** 2).sum(), (move[there] * velocity[there]).sum(), (velocity[there] ** 2).sum()]
-    if not sums.all() or sums[1] < _CORRELATED * math.sqrt(sums[0] * sums[2]):
+    """Displacements over velocities of moving particles, their median; None where they do not belong together."""
+    ratios = np.concatenate([np.empty(0), *(_ratios(sample) for sample in samples)])
+    if len(ratios) < _RATIOS:
         return None
-    step = float(sums[1] / sums[2])
-    return roundest(step * 0.998, step * 1.002)
+    step = float(np.median(ratios))
+    # Collisions within a step, and jumps across periodic axes, leave at least half of the ratios alone.
+    if not step > 0 or float(np.median(np.abs(ratios - step))) > _ALIKE * step:
+        return None
+    return roundest(step * (1 - _ROUNDED), step * (1 + _ROUNDED))
+
+
+def _ratios(sample: Sample) -> np.ndarray:
+    """Displacements along the velocity over the velocity, of particles faster than the median, at inner frames."""
+    if sample.velocity is None or len(sample.position) < 3:
+        return np.empty(0)
+    move = (sample.position[2:].astype(np.float64) - sample.position[:-2]) / 2
+    velocity = sample.velocity[1:-1].astype(np.float64)
+    square, along = (velocity**2).sum(axis=2), (velocity * move).sum(axis=2)
+    there = np.isfinite(along) & (square > 0)
+    if not there.any():
+        return np.empty(0)
+    there &= square >= np.median(square[there])
+    return np.asarray(along[there] / square[there])
