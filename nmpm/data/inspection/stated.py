@@ -1,0 +1,198 @@
+"""Compares what a dataset's metadata state with what is measured in its trajectories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.inspection.findings import Finding, Severity
+from nmpm.data.inspection.motion import Motion, spacing_of
+
+_FIRST_STEPS = 10  # in which particles are looked for that fall freely
+_LEAST_PARTICLES = 8
+_FALLING = 0.7  # of the particles
+_SAME_FALL = 0.1  # of the acceleration
+_ROUNDED = 32.0  # times the rounding of coordinates: smaller accelerations are not seen
+_DIFFERENT = 1.2  # factor of a gravity
+_UNEVEN = 0.01  # of a step of time
+_VOLUME = (2.5, 4.0)  # factors by which a stated particle volume may be too large and too small
+_VOLUME_FRAMES = 4
+_EARTH = 9.81
+_PARALLEL = 0.9  # cosine of the angle between a stated and a measured gravity
+_SAME_NUMBER = 0.03
+_PART = 0.02  # of the largest component; smaller ones are rounded to zero
+_ROUND_FACTORS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0, 20.0, 25.0, 50.0, 100.0, 1000.0)
+
+
+def free_fall(motion: Motion) -> tuple[float, ...] | None:
+    """The acceleration (D,) in length per frame² that most particles have in the first frames; None where none have."""
+    if len(motion.index) < _LEAST_PARTICLES or len(motion.step) < 2:
+        return None
+    falls = []
+    for acceleration in np.diff(motion.step[: _FIRST_STEPS + 1], axis=0):
+        there = acceleration[~np.isnan(acceleration[:, 0])]
+        if len(there) < _LEAST_PARTICLES:
+            continue
+        middle = np.median(there, axis=0)
+        tolerance = max(_SAME_FALL * float(np.linalg.norm(middle)), 4 * motion.rounding)
+        together = float((np.linalg.norm(there - middle, axis=1) < tolerance).mean())
+        if together > _FALLING and np.linalg.norm(middle) > _ROUNDED * motion.rounding:
+            falls.append(middle)
+    if not falls:
+        return None
+    fall = np.median(falls, axis=0)
+    same = np.linalg.norm(falls - fall, axis=1) < 2 * _SAME_FALL * np.linalg.norm(fall)
+    return tuple(fall.tolist()) if same.mean() > 0.5 else None
+
+
+def check_stated(motion: Motion) -> Iterator[Finding]:
+    """Yields contradictions between the metadata and one trajectory: time step, gravity, particle volume."""
+    yield from check_times(motion)
+    yield from check_gravity(motion)
+    yield from check_volume(motion)
+
+
+def recorded_dt(motion: Motion) -> float | None:
+    """The median step of the recorded times; None where none are recorded."""
+    time = np.asarray(motion.trajectory.fields.get("time", ()), dtype=np.float64)
+    if time.ndim != 1 or len(time) != len(motion.trajectory.position) or len(time) < 2 or not np.isfinite(time).all():
+        return None
+    dt = float(np.median(np.diff(time)))
+    return dt if dt > 0 else None
+
+
+def check_times(motion: Motion) -> Iterator[Finding]:
+    """Yields findings about the recorded times of frames: uneven steps, or another one than stated."""
+    dt = recorded_dt(motion)
+    if dt is None:
+        return
+    steps = np.diff(np.asarray(motion.trajectory.fields["time"], dtype=np.float64))
+    off = np.abs(steps / dt - 1)
+    if off.max() > _UNEVEN:
+        frame = int(np.argmax(off))
+        yield Finding(
+            "uneven time steps",
+            Severity.CONTRADICTION,
+            f"{int((off > _UNEVEN).sum())} of {len(steps)} time steps differ from the usual {dt:.4g}; this frame is"
+            f" {steps[frame] / dt:.3g} of them after the one before.",
+            motion.where,
+            f"frame {frame + 1}",
+            float(steps[frame] / dt),
+            badness=float(off.max()),
+        )
+    factor = motion.metadata.dt / dt
+    if abs(factor - 1) > _UNEVEN:
+        yield Finding(
+            "dt",
+            Severity.CONTRADICTION,
+            f"dt is stated as {motion.metadata.dt:.4g}, {too(factor)}: the recorded times of frames are {dt:.4g} apart."
+            f" {correction(f'--dt {dt:.6g}')}",
+            motion.where,
+            factor=factor,
+            badness=abs(math.log(factor)),
+        )
+
+
+def check_gravity(motion: Motion) -> Iterator[Finding]:
+    """Yields a finding if particles do not fall freely by the stated gravity; then it is wrong, or dt is."""
+    stated, fall = trajectory_gravity(motion.trajectory.attributes, motion.metadata, motion.where), free_fall(motion)
+    if stated is None or fall is None:
+        return
+    recorded = recorded_dt(motion)
+    dt = recorded or motion.metadata.dt
+    measured = np.asarray(fall) / dt**2
+    factor = float(np.linalg.norm(stated) / np.linalg.norm(measured))
+    turned, resized = _compare_directions(stated, measured), _compare_sizes(factor)
+    if not turned and not resized:
+        return
+    falls = f"in free fall particles accelerate by {_vector(measured)}"
+    if not turned and recorded is None and _suggests_dt(stated, measured, math.sqrt(factor)):
+        kind, number = "dt", math.sqrt(factor)
+        sentence = (
+            f"dt is stated as {dt:.4g}, {too(number)} if gravity is {_vector(stated)}: {falls}."
+            f" {correction(f'--dt {dt / number:.4g}')} Else gravity is {too(factor)}."
+        )
+    else:
+        kind, number = "gravity", factor
+        values = np.where(np.abs(measured) > _PART * np.abs(measured).max(), measured, 0.0)
+        sentence = (
+            f"gravity is stated as {_vector(stated)}, {' and '.join(filter(None, (turned, resized)))}: {falls}."
+            f" {correction(f'--gravity={_comma(values)}')}"
+        )
+    badness = abs(math.log(factor)) if factor else math.inf
+    yield Finding(kind, Severity.CONTRADICTION, sentence, motion.where, factor=number or None, badness=badness)
+
+
+def _compare_directions(stated: Sequence[float], measured: np.ndarray) -> str:
+    """What is wrong with the direction or presence of a stated gravity; empty if nothing is."""
+    size = float(np.linalg.norm(stated))
+    if not size:
+        return "but there is one"
+    cosine = float(np.dot(stated, measured)) / (size * float(np.linalg.norm(measured)))
+    if cosine > _PARALLEL:
+        return ""
+    if cosine < -_PARALLEL:
+        return "the opposite direction"
+    axes = ["xyz"[int(np.argmax(np.abs(vector)))] for vector in (stated, measured)]
+    return f"along {axes[0]} in place of {axes[1]}" if axes[0] != axes[1] else "another direction"
+
+
+def _compare_sizes(factor: float) -> str:
+    """What is wrong with the size of a stated gravity that is not zero; empty if nothing is."""
+    return "" if not factor or 1 / _DIFFERENT < factor < _DIFFERENT else too(factor)
+
+
+def _suggests_dt(stated: Sequence[float], measured: np.ndarray, ratio: float) -> bool:
+    """Whether a wrong dt is more likely than a wrong gravity: its factor is round, and the gravity is the Earth's."""
+    simple = any(abs(max(ratio, 1 / ratio) / number - 1) < _SAME_NUMBER for number in _ROUND_FACTORS)
+    return simple and (_is_earth(stated) or not _is_earth(measured))
+
+
+def _is_earth(gravity: Sequence[float] | np.ndarray) -> bool:
+    """Whether a gravity is the Earth's, in units that are powers of ten."""
+    power = math.log10(float(np.linalg.norm(gravity)) / _EARTH)
+    return abs(power - round(power)) < math.log10(1 + _SAME_NUMBER)
+
+
+def check_volume(motion: Motion) -> Iterator[Finding]:
+    """Yields a finding if the stated particle volume is far from that of the densest of some frames."""
+    stated, dim = motion.metadata.particle_volume, motion.metadata.dim
+    if stated is None or len(motion.index) < _LEAST_PARTICLES:
+        return
+    frames = np.unique(np.linspace(0, len(motion.position) - 1, _VOLUME_FRAMES).astype(int))
+    spacings = [spacing_of(motion.position[frame], motion.metadata) for frame in frames]
+    spacing = min((value for value in spacings if value), default=0.0)
+    factor = stated / spacing**dim if spacing else 1.0
+    too_large, too_small = _VOLUME
+    if 1 / too_small < factor < too_large:
+        return
+    yield Finding(
+        "particle volume",
+        Severity.CONTRADICTION,
+        f"particle_volume is stated as {stated:.3g}, {too(factor)}: particles are {spacing:.3g} apart, which makes"
+        f" {spacing**dim:.3g}. Correct it in metadata.json, or remove it, so that it is measured.",
+        motion.where,
+        factor=factor,
+        badness=abs(math.log(factor)),
+    )
+
+
+def too(factor: float) -> str:
+    """In words by how much a value is too large, or too small for a factor below 1."""
+    return f"{factor:.4g} times too large" if factor > 1 else f"{1 / factor:.4g} times too small"
+
+
+def correction(option: str) -> str:
+    """The sentence that says how an option corrects the metadata."""
+    return f"Correct it: nmpm convert FOLDER NEW {option}."
+
+
+def _vector(values: Sequence[float] | np.ndarray) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in values)})"
+
+
+def _comma(values: np.ndarray) -> str:
+    return ",".join(f"{value:.3g}" for value in values)
