@@ -1,37 +1,100 @@
-"""Checks all trajectories of a dataset, one at a time, and compares them with one another and with the metadata."""
+"""Checks the trajectories of a dataset one after the other, then compares them with one another and the metadata."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections import Counter
 
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.inspection.findings import Finding, Severity
+from nmpm.data.inspection import comparisons
+from nmpm.data.inspection.findings import Finding
 from nmpm.data.inspection.irregular_motion import find_irregular_motion
-from nmpm.data.inspection.motion import Motion
+from nmpm.data.inspection.motion import Motion, spacing_of
 from nmpm.data.inspection.particles import find_odd_particles, never_moving
-from nmpm.data.inspection.stated import check_stated, correction, free_fall, recorded_dt, too
-from nmpm.data.statistics import Extent
+from nmpm.data.inspection.stated import check_stated, free_fall, recorded_dt
+from nmpm.data.statistics import Extent, extent_of
+from nmpm.errors import DataError
+from nmpm.scene import Interval
 
-_MIXED = 1.1  # factor between time steps
-_RESOLUTIONS = 1.3  # factor between spacings
-_LEAST_PARTICLES = 32
-_FINE = 1000.0  # roundings of a coordinate to a spacing
-_WALL_LAYER = 0.025  # of the bounds: beyond that, they are not the walls
-_TOO_LARGE = 3.0  # times the extent of the positions
-_AT_THE_END = 1.0  # spacings from the end of an axis
-_WINDOW = 18  # frames of a training window of the shipped configurations
-_WALL_NAMES = ("wall", "boundary", "static", "obstacle", "fixed", "frozen")
+WINDOW = 18
+"""Frames of a training window of the shipped configurations."""
+_LEAST_PARTICLES = 32  # of which a spacing is compared
 
 
-@dataclass
 class DatasetChecks:
-    """Findings about the trajectories that were added; those of the dataset as a whole come at the end."""
+    """Collects findings about the trajectories that are added, and what is to be compared between them."""
 
-    metadata: Metadata
-    findings: list[Finding] = field(default_factory=list)
-    trajectories: int = 0
+    def __init__(self, metadata: Metadata) -> None:
+        self.metadata = metadata
+        self.trajectories = 0
+        self.findings: list[Finding] = []  # about single trajectories
+        self._steps: dict[bool, dict[str, float]] = {True: {}, False: {}}  # time steps: recorded, or from free fall
+        self._spacings: dict[str, tuple[float, float]] = {}
+        self._extents: dict[str, tuple[Interval, ...]] = {}
+        self._extent, self._spacing, self._rounding = Extent(metadata.dim), math.inf, 0.0
+        self._frames, self._still, self._moving = Counter[int](), Counter[int](), Counter[int]()
+        self._crossings, self._wraps, self._bounces = np.zeros((3, metadata.dim), dtype=int)
+
+    def add(self, trajectory: Trajectory, where: str) -> None:
+        """Adds a trajectory with its fields, called `where`."""
+        motion = Motion(trajectory, self.metadata, where)
+        self.trajectories += 1
+        self._frames[len(trajectory.position)] += 1
+        self.findings += find_odd_particles(motion)
+        self._extent.add(trajectory.position[:, self.metadata.is_static(trajectory.particle_type)])
+        if not motion.present.any():
+            return
+        self._extent.add(motion.position)
+        irregular = list(find_irregular_motion(motion))
+        self.findings += irregular
+        if not any(finding.kind == "particle order" for finding in irregular):  # else measurements mean nothing
+            try:
+                self.findings += check_stated(motion)
+                self._measure(motion)
+            except DataError:  # a wrong gravity is named elsewhere
+                return
+
+    def _measure(self, motion: Motion) -> None:
+        dt = recorded_dt(motion) or _dt_of_fall(motion)
+        if dt is not None:
+            self._steps[recorded_dt(motion) is not None][motion.where] = dt
+        if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
+            later = spacing_of(motion.position[len(motion.position) // 2], self.metadata)
+            self._spacings[motion.where] = motion.spacing, later or motion.spacing
+            self._extents[motion.where] = extent_of(motion.position).intervals
+        self._spacing = min(self._spacing, motion.spacing or math.inf)
+        self._rounding = max(self._rounding, motion.rounding)
+        types, still = motion.trajectory.particle_type[motion.index], never_moving(motion)
+        self._still.update(types[still].tolist())
+        self._moving.update(types[~still].tolist())
+        self._crossings += motion.crossings.sum(axis=(0, 1))
+        self._wraps += motion.wraps.sum(axis=(0, 1))
+        self._bounces += motion.bounces.sum(axis=(0, 1))
+
+    def compare(self) -> list[Finding]:
+        """Findings about all trajectories together."""
+        findings: list[Finding] = []
+        for steps in self._steps.values():
+            findings += comparisons.compare_time_steps(steps)
+        findings += comparisons.check_precision(self._spacing, self._rounding, self._extent)
+        findings += comparisons.check_boundary(self.metadata, self._crossings, self._wraps, self._bounces)
+        findings += comparisons.check_types(self.metadata, self._still, self._moving)
+        findings += comparisons.compare_spacings(self._spacings)
+        findings += comparisons.compare_domains(self._extents, self._spacing)
+        if np.isfinite(self._extent.lower).all():
+            findings += comparisons.compare_bounds(self._extent, self.metadata)
+        findings += comparisons.check_lengths(self._frames, WINDOW)
+        return findings
+
+
+def _dt_of_fall(motion: Motion) -> float | None:
+    """The time step by which particles fall freely by the stated gravity, or by 1 where none is stated."""
+    fall = free_fall(motion)
+    if fall is None:
+        return None
+    stated = trajectory_gravity(motion.trajectory.attributes, motion.metadata, motion.where)
+    gravity = float(np.linalg.norm(stated)) if stated is not None else 1.0
+    return math.sqrt(float(np.linalg.norm(fall)) / gravity) if gravity else None

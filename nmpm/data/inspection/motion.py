@@ -58,10 +58,33 @@ class Motion:
         return np.asarray(np.sqrt(np.nansum(self.speed**2, axis=1) / count))
 
     @cached_property
+    def present(self) -> np.ndarray:
+        """(T, N) whether each particle is there."""
+        return ~np.isnan(self.position[..., 0])
+
+    @cached_property
     def crossings(self) -> np.ndarray:
-        """(T - 1, N, D) whether a step leads from one end of all positions to the other, on walled axes."""
-        extent = np.nanmax(self.position, axis=(0, 1)) - np.nanmin(self.position, axis=(0, 1))
+        """(T - 1, N, D) whether a step leads from one end of all positions to the other, on axes that do not wrap."""
+        extent = np.fmax.reduce(self.position, axis=(0, 1)) - np.fmin.reduce(self.position, axis=(0, 1))
         return np.asarray((np.abs(self.step) > _CROSSING * extent) & ~np.asarray(self.metadata.periodic))
+
+    @cached_property
+    def wraps(self) -> np.ndarray:
+        """(T - 1, N, D) whether a step leads across the ends of a periodic axis, in coordinates that wrap or do not."""
+        lower, upper = np.asarray(self.metadata.bounds).T
+        periods = np.floor((self.position - lower) / (upper - lower))
+        return np.asarray(
+            (np.diff(periods, axis=0) != 0) | (np.abs(np.diff(self.position, axis=0)) > (upper - lower) / 2)
+        ) & np.asarray(self.metadata.periodic)
+
+    @cached_property
+    def bounces(self) -> np.ndarray:
+        """(T - 2, N, D) whether a particle on its way across an end of a periodic axis stays within."""
+        lower, upper = np.asarray(self.metadata.bounds).T
+        ahead, inside = self.position[1:-1] + self.step[:-1], (self.position >= lower) & (self.position <= upper)
+        return np.asarray(
+            ((ahead < lower) | (ahead > upper)) & inside[1:-1] & inside[2:] & ~self.wraps[1:]
+        ) & np.asarray(self.metadata.periodic)
 
     @cached_property
     def rounding(self) -> float:
@@ -76,11 +99,11 @@ class Motion:
     @cached_property
     def fullest(self) -> int:
         """The first frame of those with the most particles."""
-        return int(np.argmax((~np.isnan(self.position[..., 0])).sum(axis=1))) if self.position.size else 0
+        return int(np.argmax(self.present.sum(axis=1))) if self.position.size else 0
 
     def tree(self, frame: int) -> tuple[cKDTree, np.ndarray]:
         """A search tree of the particles of a frame, and their indices among the N."""
-        there = np.flatnonzero(~np.isnan(self.position[frame, :, 0]))
+        there = np.flatnonzero(self.present[frame])
         return neighbour_tree(self.position[frame, there], self.metadata), there
 
 

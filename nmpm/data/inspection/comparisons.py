@@ -1,0 +1,219 @@
+"""Compares the trajectories of a dataset with one another, and what all of them show with the metadata."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from nmpm.data.format import Metadata
+from nmpm.data.inspection.findings import Finding, Severity
+from nmpm.data.inspection.stated import correction
+from nmpm.data.statistics import Extent
+from nmpm.scene import Interval
+
+_MIXED = 1.1  # factor between time steps
+_RESOLUTIONS = 1.3  # factor between spacings
+_FINE = 1000.0  # roundings of coordinates in a spacing
+_WALL_LAYER = 0.025  # of the bounds: positions beyond it are not in a wall layer
+_TOO_LARGE, _FAR_TOO_LARGE = 3.0, 10.0  # times the extent of all positions
+_FEW_CROSSINGS, _FEW_BOUNCES = 3, 3
+_STILL_SHARE = 0.01  # of the particles of a type
+_SAME_END = 2.0  # spacings between the ends of trajectories that end at the same wall
+_END_SHARE = 0.4  # of the trajectories that end at a wall
+_BEYOND = 0.1  # of the extent, beyond such a wall
+_WALL_NAMES = ("wall", "boundary", "static", "obstacle", "fixed", "frozen")
+
+
+def compare_time_steps(steps: Mapping[str, float]) -> Iterator[Finding]:
+    """Yields a finding if time steps, by trajectory, differ; they may have any unit, which is the same for all."""
+    if not steps:
+        return
+    values = np.array(list(steps.values()))
+    usual = float(np.median(values))
+    ratios = values / usual
+    odd = int(np.argmax(np.abs(np.log(ratios))))
+    if 1 / _MIXED < ratios[odd] < _MIXED:
+        return
+    many = int((np.abs(np.log(ratios)) > np.log(_MIXED)).sum())
+    yield Finding(
+        "mixed time steps",
+        Severity.CONTRADICTION,
+        f"the time step of {many} of {len(values)} trajectories differs from the others', e.g. in {list(steps)[odd]} it"
+        f" is {ratios[odd]:.3g} times as long. Make a dataset of each, or leave frames out.",
+        factor=float(ratios[odd]),
+    )
+
+
+def compare_spacings(spacings: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+    """Yields a finding if the spacings of particles, in two frames of each trajectory, differ between trajectories."""
+    if not spacings:
+        return
+    names, values = list(spacings), np.array(list(spacings.values()))
+    fine, coarse = int(np.argmin(values[:, 0])), int(np.argmax(values[:, 0]))
+    factor = float((values[coarse] / values[fine]).min())
+    if factor > _RESOLUTIONS:
+        yield Finding(
+            "different resolution",
+            Severity.CONTRADICTION,
+            f"particles are {values[coarse, 0]:.3g} apart in {names[coarse]} and {values[fine, 0]:.3g} in {names[fine]},"
+            f" {factor:.3g} times less. Make a dataset of each resolution.",
+            factor=factor,
+        )
+
+
+def compare_domains(extents: Mapping[str, tuple[Interval, ...]], spacing: float) -> Iterator[Finding]:
+    """Yields a finding if trajectories go far beyond a place at which many others end, as at a wall."""
+    if len(extents) < 3:
+        return
+    names, values = list(extents), np.array(list(extents.values()))  # (trajectories, D, 2)
+    sizes = np.median(values[..., 1] - values[..., 0], axis=0)
+    for axis, end in np.ndindex(values.shape[1:]):
+        outward = values[:, axis, end] * (1 if end else -1)
+        wall = float(np.median(outward))
+        share = (np.abs(outward - wall) < _SAME_END * spacing).mean()
+        beyond = outward - wall > max(_BEYOND * sizes[axis], 2 * _SAME_END * spacing)
+        if share > _END_SHARE and beyond.any():
+            odd = int(np.argmax(outward))
+            yield Finding(
+                "different domains",
+                Severity.CONTRADICTION,
+                f"in {int(beyond.sum())} of {len(names)} trajectories particles reach {'xyz'[axis]} ="
+                f" {values[odd, axis, end]:.4g}, e.g. in {names[odd]}; in the others they stop at"
+                f" {wall if end else -wall:.4g}. Make a dataset of each domain.",
+                factor=float((values[odd, axis, 1] - values[odd, axis, 0]) / sizes[axis]),
+            )
+            return
+
+
+def compare_bounds(extent: Extent, metadata: Metadata) -> Iterator[Finding]:
+    """Yields findings if positions lie beyond the stated bounds, or the bounds are far larger than their extent."""
+    lower, upper = np.asarray(metadata.bounds).T
+    size, seen, walled = upper - lower, extent.upper - extent.lower, ~np.asarray(metadata.periodic)
+    beyond = np.maximum(lower - extent.lower, extent.upper - upper) / size * walled
+    larger = np.where(walled, size / np.maximum(seen, 1e-12 * size), 0.0)
+    axis = int(np.argmax(beyond))
+    if beyond[axis] > 0:
+        serious = beyond[axis] > _WALL_LAYER
+        mend = f" {correction(f'--bounds {_option(extent.intervals)}')}" if serious else " The domain contains them."
+        yield Finding(
+            "bounds",
+            Severity.CONTRADICTION if serious else Severity.NOTE,
+            f"along {_axes(beyond > 0)} positions lie beyond the stated bounds, most along {'xyz'[axis]}:"
+            f" {_span(extent.intervals[axis])} in bounds of {_span(metadata.bounds[axis])},"
+            f" {beyond[axis]:.2g} of their size.{mend}",
+            factor=float(seen[axis] / size[axis]),
+        )
+    axis = int(np.argmax(larger))
+    if larger[axis] > _TOO_LARGE:
+        yield Finding(
+            "bounds far away",
+            Severity.CONTRADICTION if larger[axis] > _FAR_TOO_LARGE else Severity.ODDITY,
+            f"along {_axes(larger > _TOO_LARGE)} the stated bounds are far larger than where particles ever are, most"
+            f" along {'xyz'[axis]}: {_span(metadata.bounds[axis])} is {larger[axis]:.3g} times"
+            f" {_span(extent.intervals[axis])}.",
+            factor=float(larger[axis]),
+        )
+
+
+def check_boundary(
+    metadata: Metadata, crossings: np.ndarray, wraps: np.ndarray, bounces: np.ndarray
+) -> Iterator[Finding]:
+    """Yields a finding if particles cross walls, or never cross the ends of periodic axes.
+
+    Args:
+        metadata: As stated.
+        crossings: (D,) steps that lead from one end of all positions to the other, on axes that do not wrap.
+        wraps: (D,) the same on axes that wrap.
+        bounces: (D,) particles that would cross an end of a periodic axis in the next step, but stay.
+    """
+    crossed = (crossings >= _FEW_CROSSINGS) & ~np.asarray(metadata.periodic)
+    bounced = (wraps == 0) & (bounces >= _FEW_BOUNCES) & np.asarray(metadata.periodic)
+    for axes, stated, what, kind in (
+        (
+            crossed,
+            "not periodic",
+            f"{int(crossings.sum())} times a particle leaves at one end and is at the other",
+            "periodic",
+        ),
+        (
+            bounced,
+            "periodic",
+            f"nobody ever crosses the ends, and {int(bounces.sum())} times a particle turns there",
+            "wall",
+        ),
+    ):
+        if axes.any():
+            right = [kind if axis else old for axis, old in zip(axes, metadata.boundary, strict=True)]
+            yield Finding(
+                "boundary",
+                Severity.CONTRADICTION,
+                f"{_axes(axes)} is stated as {stated}, but {what}. {correction(f'--boundary {",".join(right)}')}",
+            )
+
+
+def check_precision(spacing: float, rounding: float, extent: Extent) -> Iterator[Finding]:
+    """Yields a finding if float32 resolves coordinates too coarsely for the spacing of particles."""
+    if spacing < _FINE * rounding:
+        yield Finding(
+            "float32",
+            Severity.CONTRADICTION,
+            f"coordinates are so far from the origin that float32 has only {spacing / rounding:.3g} steps between"
+            f" neighbours ({_FINE:g} are enough). Subtract about ({', '.join(f'{low:.4g}' for low in extent.lower)})"
+            " from positions and bounds, in float64.",
+            factor=_FINE * rounding / spacing,
+        )
+
+
+def check_types(metadata: Metadata, still: Mapping[int, int], moving: Mapping[int, int]) -> Iterator[Finding]:
+    """Yields findings if particles of a material never move, or those of a wall do; from their numbers by type."""
+    shares = {i: count / (count + moving.get(i, 0)) for i, count in still.items()}
+    resting = [i for i in sorted(shares) if shares[i] >= _STILL_SHARE and still[i] > 1]
+    if resting and any(moving.values()):
+        many = ", ".join(
+            f"{still[i]} of {still[i] + moving.get(i, 0)} of {metadata.particle_types[i]}" for i in resting
+        )
+        whole = [i for i in resting if shares[i] == 1.0]
+        ids = ",".join(map(str, sorted(metadata.static_types | set(whole))))
+        mend = correction(f"--static {ids}") if whole else "Give them a type of their own, which is static."
+        yield Finding(
+            "particles that never move",
+            Severity.CONTRADICTION,
+            f"particles never move, while others do: {many}. Are they walls? {mend}",
+            factor=max(shares[i] for i in resting),
+        )
+    names = metadata.particle_types
+    walls = [i for i in sorted(moving) if moving[i] and any(word in names[i].lower() for word in _WALL_NAMES)]
+    if walls:
+        yield Finding(
+            "walls that are predicted",
+            Severity.CONTRADICTION,
+            f"type {', '.join(f'{i}, {names[i]},' for i in walls)} moves and counts as a material. If its motion is"
+            " prescribed, name it in prescribed_types of metadata.json.",
+        )
+
+
+def check_lengths(frames: Counter[int], window: int) -> Iterator[Finding]:
+    """Yields a finding if trajectories have fewer frames than a training window."""
+    short = sum(count for number, count in frames.items() if number < window)
+    if short:
+        yield Finding(
+            "short trajectories",
+            Severity.ODDITY,
+            f"{short} of {frames.total()} trajectories have fewer than {window} frames (the shortest {min(frames)}), the"
+            " training window of the shipped configurations: a training leaves them out.",
+            factor=short / frames.total(),
+        )
+
+
+def _axes(mask: np.ndarray) -> str:
+    return " and ".join("xyz"[axis] for axis in np.flatnonzero(mask))
+
+
+def _span(interval: Interval) -> str:
+    return f"{interval[0]:.4g}…{interval[1]:.4g}"
+
+
+def _option(intervals: tuple[Interval, ...]) -> str:
+    return ",".join(f"{low:.4g}:{high:.4g}" for low, high in intervals)
