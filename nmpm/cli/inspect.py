@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.options import HelpFormatter, add_data_options, check_at_least, check_picture, data_options
+from nmpm.data.inspection.findings import Finding, Severity, merge_findings
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
+_MOST_FINDINGS = 9
+_TITLES = {"contradiction": "contradictions: models of these data will be wrong", "oddity": "odd: look at it"}
 _EXAMPLES = """\
 examples:
   nmpm inspect ramps                                   a dataset in the native layout
@@ -61,7 +64,8 @@ def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namesp
     from nmpm.data.inspection import inspect
 
     inspection = inspect(source, arguments.trajectories)
-    inspection = replace(inspection, path=str(arguments.path), findings=(*damage, *inspection.findings))
+    damaged = (Finding("unreadable", Severity.CONTRADICTION, problem) for problem in damage)
+    inspection = replace(inspection, path=str(arguments.path), findings=(*damaged, *inspection.findings))
     if arguments.json:
         sys.stdout.write(json.dumps(asdict(inspection), indent=1) + "\n")
         return
@@ -124,6 +128,7 @@ def _dataset_of(path: Path) -> Path:
 def _lines(inspection: Inspection) -> Iterator[str]:
     """The lines of the summary, at most 100 characters wide."""
     yield f"{inspection.path}: {inspection.dim}-D, {inspection.dt:g} s between frames"
+    yield from _finding_lines(inspection)
     for name, split in inspection.splits.items():
         trajectories = "trajectory" if split.trajectories == 1 else "trajectories"
         read = "" if split.inspected == split.trajectories else f" ({split.inspected} read)"
@@ -163,11 +168,28 @@ def _lines(inspection: Inspection) -> Iterator[str]:
             f"  {shape:<14}{grid.per_cell:>10.2f}    {grid.median_speed:>9.3f}{grid.high_speed:>9.2f}"
             f"{grid.most_speed:>9.2f}{mark}"
         )
-    for title, items in (("notes", inspection.notes), ("suspicious", inspection.findings or ("nothing found",))):
-        if items:
+    notes = [*inspection.notes, *(str(note) for note in _merged(inspection) if note.severity == "note")]
+    if notes:
+        yield from ("", "  notes")
+    for note in notes:
+        yield from textwrap.wrap(note, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+
+
+def _finding_lines(inspection: Inspection) -> Iterator[str]:
+    """Contradictions, then oddities."""
+    findings = [finding for finding in _merged(inspection) if finding.severity != "note"]
+    for severity, title in _TITLES.items():
+        if some := [finding for finding in findings[:_MOST_FINDINGS] if finding.severity == severity]:
             yield from ("", f"  {title}")
-        for item in items:
-            yield from textwrap.wrap(item, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+            for finding in some:
+                yield from textwrap.wrap(str(finding), _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    if more := findings[_MOST_FINDINGS:]:
+        yield f"  … and {', '.join(finding.kind for finding in more)}: see --json."
+    yield from ("",) if findings else ("  nothing contradictory or odd found", "")
+
+
+def _merged(inspection: Inspection) -> tuple[Finding, ...]:
+    return merge_findings(inspection.findings, sum(split.inspected for split in inspection.splits.values()))
 
 
 def _span(values: Range) -> str:

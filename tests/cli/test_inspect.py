@@ -24,7 +24,7 @@ def test_one_screen_and_a_picture(dataset, tmp_path, capsys):
     assert max(len(line.replace(str(tmp_path), "")) for line in lines) <= 100
     assert "train     2 trajectories of 12 frames, 40-50 particles + 4 at rest" in said
     assert "<- recommended" in said
-    assert "nothing found" in said
+    assert "nothing contradictory or odd found" in said
     with Image.open(tmp_path / "look.png") as picture:
         assert min(picture.size) > 200
 
@@ -54,7 +54,9 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):
     records.write_records(tmp_path / "ramps" / "train.tfrecord", records.trajectory_record(*made()))
     (tmp_path / "ramps" / "metadata.json").write_text(json.dumps(METADATA))
     assert main(["inspect", str(tmp_path / "ramps"), "--json"]) == 0
-    assert re.search(r"file.*: cannot be written \(.*NMPM_HOME", json.loads(capsys.readouterr().out)["findings"][0])
+    assert re.search(
+        r"file.*: cannot be written \(.*NMPM_HOME", json.loads(capsys.readouterr().out)["findings"][0]["sentence"]
+    )
     with pytest.raises(DataError, match="NMPM_HOME"):
         native_folder(tmp_path / "ramps")
 

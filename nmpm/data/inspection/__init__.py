@@ -13,8 +13,11 @@ from nmpm.data.fields import FieldFacts, Kind, add_fields
 from nmpm.data.format import Metadata, Split
 from nmpm.data.gravity import distinct_gravities, trajectory_gravity
 from nmpm.data.grid_rule import GridFacts, candidates, recommended_cells
-from nmpm.data.inspection.measurements import Measurements, find_anomalies
+from nmpm.data.inspection.dataset_checks import DatasetChecks
+from nmpm.data.inspection.findings import Finding, Severity, sort_findings
+from nmpm.data.inspection.measurements import Measurements
 from nmpm.data.inspection.reading import open_dataset
+from nmpm.data.inspection.shared_runs import find_shared_runs
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.statistics import MotionStatistics, find_disagreements, neighbour_distance, notes_on_lengths
 from nmpm.errors import DataError, NmpmError
@@ -23,7 +26,6 @@ from nmpm.scene import Interval, Scene
 Range = tuple[int, int]
 """Smallest and largest value."""
 _BYTES = 2**28  # of positions per split that are read by default
-_MOST_FINDINGS = 12
 _DIFFERS: Mapping[Kind, str] = MappingProxyType(
     {
         "evolving": "evolves",
@@ -70,7 +72,7 @@ class Inspection:
     rest: tuple[int, int, int] | None  # first frame at rest: median, smallest, largest; None where none comes to rest
     restless: int  # trajectories that still move at their end
     notes: tuple[str, ...]  # they need no action
-    findings: tuple[str, ...]  # anomalies
+    findings: tuple[Finding, ...]  # contradictions first; of each trajectory
     channels: dict[str, str]  # for each field how it differs, and the input channels that it makes
 
 
@@ -85,16 +87,17 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         DataError: if there is no dataset, or no trajectory can be read.
     """
     data = open_dataset(source)
-    metadata, splits, findings = data.metadata, data.splits, list(data.problems)
+    metadata, splits = data.metadata, data.splits
+    problems = [Finding("metadata", Severity.CONTRADICTION, problem) for problem in data.problems]
     scene: Scene | None = None
     try:
         scene = data.source.scene
     except NmpmError as error:
         if not data.wrong_metadata:
-            findings.append(str(error))
+            problems.append(Finding("metadata", Severity.CONTRADICTION, str(error)))
     domain = scene.domain if scene else metadata.domain or metadata.bounds
     counts = _Counts(splits, metadata)
-    findings += counts.problems
+    problems += [Finding("metadata", Severity.CONTRADICTION, problem) for problem in counts.problems]
     samples = {
         name: split.sample(_BYTES) if trajectories is None else range(0, len(split), -(-len(split) // trajectories))
         for name, split in splits.items()
@@ -104,33 +107,35 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
     spacing = spacing or max(high - low for low, high in metadata.bounds) / 64
     numbers = candidates(domain, scene.particle_spacing if scene else spacing)
     measured, statistics = Measurements(metadata, domain, numbers), MotionStatistics(metadata)
+    checks = DatasetChecks(metadata)
     shapes: dict[str, tuple[int, ...]] = {}
     facts: dict[str, FieldFacts] = {}
     with progress_bar("Inspecting", sum(map(len, samples.values()))) as advance:
         for name, index in ((name, index) for name, sample in samples.items() for index in sample):
             split = splits[name]
             try:
-                trajectory = split.read(index)
-                stored = {key: values.shape for key, values in split.fields(index).items()}
+                trajectory = split.read_with_fields(index)
+                stored = {key: values.shape for key, values in trajectory.fields.items()}
                 shapes = shapes or stored
                 sizes = (split.frames(index), split.particles(index))
                 possible = [key for key, shape in stored.items() if shape in (sizes, sizes[1:], (1,), ())]
                 add_fields(facts, split, index, metadata, dict.fromkeys((*metadata.fields, *possible)))
-                findings += find_anomalies(trajectory, metadata, spacing, f"{name}, trajectory {split.names[index]}")
+                checks.add(trajectory, f"{name} {split.names[index]}")
                 measured.add(trajectory)
                 if name == first:
                     statistics.add(trajectory)
             except DataError as error:
-                findings.append(str(error))
+                problems.append(Finding("unreadable", Severity.CONTRADICTION, str(error)))
             advance()
     if not np.isfinite(measured.observed.lower).all():
-        raise DataError(f"{data.source.folder}: none of its trajectories could be read. {findings[0]}")
+        raise DataError(f"{data.source.folder}: none of its trajectories could be read. {problems[0].sentence}")
+    findings = [*problems, *checks.compare(), *find_shared_runs(splits, metadata, spacing), *checks.findings]
     if len(samples[first]) == len(splits[first]):  # stated are those of the whole first split
-        findings += find_disagreements(statistics.result(), metadata.extra)
+        differences = find_disagreements(statistics.result(), metadata.extra)
+        findings += [Finding("statistics", Severity.ODDITY, sentence) for sentence in differences]
     stated = [metadata.extra.get(f"sequence_length_{name}") for name in splits]
-    findings += notes_on_lengths(counts.frames, metadata, [length for length in stated if isinstance(length, int)])
-    if len(findings) > _MOST_FINDINGS:
-        findings = [*findings[:_MOST_FINDINGS], f"… and {len(findings) - _MOST_FINDINGS} more."]
+    lengths = notes_on_lengths(counts.frames, metadata, [length for length in stated if isinstance(length, int)])
+    findings += [Finding("sequence length", Severity.NOTE, sentence) for sentence in lengths]
     occupied, occupied_each = measured.occupied()
     fall = np.median(measured.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
     rests = [rest for rest in measured.rests if rest is not None]
@@ -156,8 +161,8 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         occupied_each=occupied_each,
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
         restless=len(measured.rests) - len(rests),
-        notes=tuple(_notes(source, data.source, measured, metadata)),
-        findings=tuple(findings),
+        notes=tuple(_notes(source, data.source, metadata)),
+        findings=sort_findings(findings),
         channels={name: _describe_channels(name, field, metadata, materials) for name, field in facts.items()},
     )
 
@@ -224,13 +229,12 @@ def _describe_channels(name: str, field: FieldFacts, metadata: Metadata, materia
     return f"{varies}: {channels}{', predicted' if field.kind == 'evolving' else ''}"
 
 
-def _notes(stated: FolderSource, source: FolderSource, measured: Measurements, metadata: Metadata) -> Iterator[str]:
+def _notes(stated: FolderSource, source: FolderSource, metadata: Metadata) -> Iterator[str]:
     family = source.options.family
     if family != stated.options.family:
         yield (
             f"The metadata do not state what the particle types mean; they are read as those of the {family} family, by"
             f" the ids that occur. If that is right, add --family {family}; nmpm fit needs --data.family {family}."
         )
-    yield from measured.observed.notes(metadata)
     notes = metadata.extra.get("conversion")
     yield from [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []

@@ -9,6 +9,7 @@ import numpy as np
 
 from nmpm.data.format import Metadata
 from nmpm.data.inspection.findings import Finding, Severity
+from nmpm.data.inspection.irregular_motion import FEW_CROSSINGS
 from nmpm.data.inspection.stated import correction
 from nmpm.data.statistics import Extent
 from nmpm.scene import Interval
@@ -18,10 +19,11 @@ _RESOLUTIONS = 1.3  # factor between spacings
 _FINE = 1000.0  # roundings of coordinates in a spacing
 _WALL_LAYER = 0.025  # of the bounds: positions beyond it are not in a wall layer
 _TOO_LARGE, _FAR_TOO_LARGE = 3.0, 10.0  # times the extent of all positions
-_FEW_CROSSINGS, _FEW_BOUNCES = 3, 3
+_FEW_BOUNCES = 3
 _STILL_SHARE = 0.01  # of the particles of a type
 _SAME_END = 2.0  # spacings between the ends of trajectories that end at the same wall
 _END_SHARE = 0.4  # of the trajectories that end at a wall
+_STAYS = 0.3  # of the frames: particles are at a wall
 _BEYOND = 0.1  # of the extent, beyond such a wall
 _WALL_NAMES = ("wall", "boundary", "static", "obstacle", "fixed", "frozen")
 
@@ -57,40 +59,50 @@ def compare_spacings(spacings: Mapping[str, tuple[float, float]]) -> Iterator[Fi
         yield Finding(
             "different resolution",
             Severity.CONTRADICTION,
-            f"particles are {values[coarse, 0]:.3g} apart in {names[coarse]} and {values[fine, 0]:.3g} in {names[fine]},"
-            f" {factor:.3g} times less. Make a dataset of each resolution.",
+            f"particles are {values[coarse, 0]:.3g} apart in {names[coarse]} and {values[fine, 0]:.3g} in"
+            f" {names[fine]}, {factor:.3g} times less. Make a dataset of each resolution.",
             factor=factor,
         )
 
 
-def compare_domains(extents: Mapping[str, tuple[Interval, ...]], spacing: float) -> Iterator[Finding]:
-    """Yields a finding if trajectories go far beyond a place at which many others end, as at a wall."""
+def compare_domains(
+    extents: Mapping[str, np.ndarray], stays: Mapping[str, np.ndarray], spacing: float
+) -> Iterator[Finding]:
+    """Yields a finding if particles of a trajectory stay far beyond a place at which those of many others end.
+
+    Args:
+        extents: (D, 2) lowest and highest coordinates, by trajectory.
+        stays: (D, 2) share of the frames in which a particle is near these.
+        spacing: Distance of particles.
+    """
     if len(extents) < 3:
         return
-    names, values = list(extents), np.array(list(extents.values()))  # (trajectories, D, 2)
+    names, values = list(extents), np.array(list(extents.values()))
+    near = np.array(list(stays.values())) > _STAYS
     sizes = np.median(values[..., 1] - values[..., 0], axis=0)
     for axis, end in np.ndindex(values.shape[1:]):
-        outward = values[:, axis, end] * (1 if end else -1)
+        outward, staying = values[:, axis, end] * (1 if end else -1), near[:, axis, end]
         wall = float(np.median(outward))
-        share = (np.abs(outward - wall) < _SAME_END * spacing).mean()
-        beyond = outward - wall > max(_BEYOND * sizes[axis], 2 * _SAME_END * spacing)
+        share = ((np.abs(outward - wall) < _SAME_END * spacing) & staying).mean()
+        beyond = staying & (outward - wall > max(_BEYOND * sizes[axis], 2 * _SAME_END * spacing))
         if share > _END_SHARE and beyond.any():
-            odd = int(np.argmax(outward))
+            odd = int(np.argmax(np.where(beyond, outward, -np.inf)))
             yield Finding(
                 "different domains",
                 Severity.CONTRADICTION,
-                f"in {int(beyond.sum())} of {len(names)} trajectories particles reach {'xyz'[axis]} ="
-                f" {values[odd, axis, end]:.4g}, e.g. in {names[odd]}; in the others they stop at"
+                f"in {int(beyond.sum())} of {len(names)} trajectories particles stay at {'xyz'[axis]} ="
+                f" {values[odd, axis, end]:.4g}, e.g. in {names[odd]}; in others they end at"
                 f" {wall if end else -wall:.4g}. Make a dataset of each domain.",
                 factor=float((values[odd, axis, 1] - values[odd, axis, 0]) / sizes[axis]),
             )
             return
 
 
-def compare_bounds(extent: Extent, metadata: Metadata) -> Iterator[Finding]:
-    """Yields findings if positions lie beyond the stated bounds, or the bounds are far larger than their extent."""
+def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterator[Finding]:
+    """Yields findings if particles move beyond the stated bounds, or these are far larger than where particles are."""
     lower, upper = np.asarray(metadata.bounds).T
-    size, seen, walled = upper - lower, extent.upper - extent.lower, ~np.asarray(metadata.periodic)
+    size, walled = upper - lower, np.asarray(metadata.boundary) == "wall"
+    seen = np.maximum(extent.upper, walls.upper) - np.minimum(extent.lower, walls.lower)
     beyond = np.maximum(lower - extent.lower, extent.upper - upper) / size * walled
     larger = np.where(walled, size / np.maximum(seen, 1e-12 * size), 0.0)
     axis = int(np.argmax(beyond))
@@ -100,19 +112,17 @@ def compare_bounds(extent: Extent, metadata: Metadata) -> Iterator[Finding]:
         yield Finding(
             "bounds",
             Severity.CONTRADICTION if serious else Severity.NOTE,
-            f"along {_axes(beyond > 0)} positions lie beyond the stated bounds, most along {'xyz'[axis]}:"
-            f" {_span(extent.intervals[axis])} in bounds of {_span(metadata.bounds[axis])},"
-            f" {beyond[axis]:.2g} of their size.{mend}",
+            f"along {_axes(beyond > 0)} positions reach beyond the stated ones, by up to {beyond[axis]:.2%} of their"
+            f" size: {'xyz'[axis]} is {_span(extent.intervals[axis])}, stated {_span(metadata.bounds[axis])}.{mend}",
             factor=float(seen[axis] / size[axis]),
         )
     axis = int(np.argmax(larger))
     if larger[axis] > _TOO_LARGE:
         yield Finding(
-            "bounds far away",
+            "far bounds",
             Severity.CONTRADICTION if larger[axis] > _FAR_TOO_LARGE else Severity.ODDITY,
-            f"along {_axes(larger > _TOO_LARGE)} the stated bounds are far larger than where particles ever are, most"
-            f" along {'xyz'[axis]}: {_span(metadata.bounds[axis])} is {larger[axis]:.3g} times"
-            f" {_span(extent.intervals[axis])}.",
+            f"along {_axes(larger > _TOO_LARGE)} they are up to {larger[axis]:.3g} times as large as where particles"
+            f" ever are: {'xyz'[axis]} is {_span(extent.intervals[axis])}, stated {_span(metadata.bounds[axis])}.",
             factor=float(larger[axis]),
         )
 
@@ -128,7 +138,7 @@ def check_boundary(
         wraps: (D,) the same on axes that wrap.
         bounces: (D,) particles that would cross an end of a periodic axis in the next step, but stay.
     """
-    crossed = (crossings >= _FEW_CROSSINGS) & ~np.asarray(metadata.periodic)
+    crossed = (crossings >= FEW_CROSSINGS) & ~np.asarray(metadata.periodic)
     bounced = (wraps == 0) & (bounces >= _FEW_BOUNCES) & np.asarray(metadata.periodic)
     for axes, stated, what, kind in (
         (
@@ -145,11 +155,11 @@ def check_boundary(
         ),
     ):
         if axes.any():
-            right = [kind if axis else old for axis, old in zip(axes, metadata.boundary, strict=True)]
+            right = ",".join(kind if axis else old for axis, old in zip(axes, metadata.boundary, strict=True))
             yield Finding(
                 "boundary",
                 Severity.CONTRADICTION,
-                f"{_axes(axes)} is stated as {stated}, but {what}. {correction(f'--boundary {",".join(right)}')}",
+                f"along {_axes(axes)} it is stated as {stated}, but {what}. {correction(f'--boundary {right}')}",
             )
 
 
@@ -168,22 +178,22 @@ def check_precision(spacing: float, rounding: float, extent: Extent) -> Iterator
 
 def check_types(metadata: Metadata, still: Mapping[int, int], moving: Mapping[int, int]) -> Iterator[Finding]:
     """Yields findings if particles of a material never move, or those of a wall do; from their numbers by type."""
+    names = metadata.particle_types
     shares = {i: count / (count + moving.get(i, 0)) for i, count in still.items()}
     resting = [i for i in sorted(shares) if shares[i] >= _STILL_SHARE and still[i] > 1]
     if resting and any(moving.values()):
         many = ", ".join(
-            f"{still[i]} of {still[i] + moving.get(i, 0)} of {metadata.particle_types[i]}" for i in resting
+            f"{still[i]} of {still[i] + moving.get(i, 0)} particles of type {i}, {names[i]}," for i in resting
         )
         whole = [i for i in resting if shares[i] == 1.0]
         ids = ",".join(map(str, sorted(metadata.static_types | set(whole))))
         mend = correction(f"--static {ids}") if whole else "Give them a type of their own, which is static."
         yield Finding(
-            "particles that never move",
+            "still particles",
             Severity.CONTRADICTION,
-            f"particles never move, while others do: {many}. Are they walls? {mend}",
+            f"{many} never move, while other particles do. Are they walls? {mend}",
             factor=max(shares[i] for i in resting),
         )
-    names = metadata.particle_types
     walls = [i for i in sorted(moving) if moving[i] and any(word in names[i].lower() for word in _WALL_NAMES)]
     if walls:
         yield Finding(
@@ -195,20 +205,21 @@ def check_types(metadata: Metadata, still: Mapping[int, int], moving: Mapping[in
 
 
 def check_lengths(frames: Counter[int], window: int) -> Iterator[Finding]:
-    """Yields a finding if trajectories have fewer frames than a training window."""
+    """Yields a finding if trajectories have fewer frames than a training window; a note if all have."""
     short = sum(count for number, count in frames.items() if number < window)
     if short:
+        some = short < frames.total()
         yield Finding(
             "short trajectories",
-            Severity.ODDITY,
-            f"{short} of {frames.total()} trajectories have fewer than {window} frames (the shortest {min(frames)}), the"
-            " training window of the shipped configurations: a training leaves them out.",
+            Severity.ODDITY if some else Severity.NOTE,
+            f"{short} of {frames.total()} trajectories have fewer than {window} frames (the shortest {min(frames)}), as"
+            f" training windows of the shipped configurations have{': a training leaves them out' if some else ''}.",
             factor=short / frames.total(),
         )
 
 
 def _axes(mask: np.ndarray) -> str:
-    return " and ".join("xyz"[axis] for axis in np.flatnonzero(mask))
+    return ", ".join("xyz"[axis] for axis in np.flatnonzero(mask))
 
 
 def _span(interval: Interval) -> str:

@@ -11,13 +11,12 @@ from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection import comparisons
 from nmpm.data.inspection.findings import Finding
-from nmpm.data.inspection.irregular_motion import find_irregular_motion
+from nmpm.data.inspection.irregular_motion import find_disorder, find_irregular_motion
 from nmpm.data.inspection.motion import Motion, spacing_of
 from nmpm.data.inspection.particles import find_odd_particles, never_moving
 from nmpm.data.inspection.stated import check_stated, free_fall, recorded_dt
-from nmpm.data.statistics import Extent, extent_of
+from nmpm.data.statistics import Extent
 from nmpm.errors import DataError
-from nmpm.scene import Interval
 
 WINDOW = 18
 """Frames of a training window of the shipped configurations."""
@@ -33,8 +32,10 @@ class DatasetChecks:
         self.findings: list[Finding] = []  # about single trajectories
         self._steps: dict[bool, dict[str, float]] = {True: {}, False: {}}  # time steps: recorded, or from free fall
         self._spacings: dict[str, tuple[float, float]] = {}
-        self._extents: dict[str, tuple[Interval, ...]] = {}
-        self._extent, self._spacing, self._rounding = Extent(metadata.dim), math.inf, 0.0
+        self._extents: dict[str, np.ndarray] = {}
+        self._stays: dict[str, np.ndarray] = {}
+        self._extent, self._walls = Extent(metadata.dim), Extent(metadata.dim)  # of moving and static particles
+        self._spacing, self._rounding = math.inf, 0.0
         self._frames, self._still, self._moving = Counter[int](), Counter[int](), Counter[int]()
         self._crossings, self._wraps, self._bounces = np.zeros((3, metadata.dim), dtype=int)
 
@@ -43,19 +44,19 @@ class DatasetChecks:
         motion = Motion(trajectory, self.metadata, where)
         self.trajectories += 1
         self._frames[len(trajectory.position)] += 1
-        self.findings += find_odd_particles(motion)
-        self._extent.add(trajectory.position[:, self.metadata.is_static(trajectory.particle_type)])
+        self._walls.add(trajectory.position[:, self.metadata.is_static(trajectory.particle_type)])
         if not motion.present.any():
             return
         self._extent.add(motion.position)
-        irregular = list(find_irregular_motion(motion))
-        self.findings += irregular
-        if not any(finding.kind == "particle order" for finding in irregular):  # else measurements mean nothing
-            try:
-                self.findings += check_stated(motion)
-                self._measure(motion)
-            except DataError:  # a wrong gravity is named elsewhere
-                return
+        if disorder := list(find_disorder(motion)):  # then everything else that would be found means nothing
+            self.findings += disorder
+            return
+        self.findings += [*find_odd_particles(motion), *find_irregular_motion(motion)]
+        try:
+            self.findings += check_stated(motion)
+            self._measure(motion)
+        except DataError:  # a wrong attribute, which is named elsewhere
+            return
 
     def _measure(self, motion: Motion) -> None:
         dt = recorded_dt(motion) or _dt_of_fall(motion)
@@ -64,15 +65,15 @@ class DatasetChecks:
         if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
             later = spacing_of(motion.position[len(motion.position) // 2], self.metadata)
             self._spacings[motion.where] = motion.spacing, later or motion.spacing
-            self._extents[motion.where] = extent_of(motion.position).intervals
+            self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
         self._spacing = min(self._spacing, motion.spacing or math.inf)
         self._rounding = max(self._rounding, motion.rounding)
         types, still = motion.trajectory.particle_type[motion.index], never_moving(motion)
         self._still.update(types[still].tolist())
         self._moving.update(types[~still].tolist())
-        self._crossings += motion.crossings.sum(axis=(0, 1))
-        self._wraps += motion.wraps.sum(axis=(0, 1))
-        self._bounces += motion.bounces.sum(axis=(0, 1))
+        self._crossings += motion.crossings.sum(axis=(1, 2))
+        self._wraps += motion.wraps
+        self._bounces += motion.bounces
 
     def compare(self) -> list[Finding]:
         """Findings about all trajectories together."""
@@ -83,9 +84,9 @@ class DatasetChecks:
         findings += comparisons.check_boundary(self.metadata, self._crossings, self._wraps, self._bounces)
         findings += comparisons.check_types(self.metadata, self._still, self._moving)
         findings += comparisons.compare_spacings(self._spacings)
-        findings += comparisons.compare_domains(self._extents, self._spacing)
+        findings += comparisons.compare_domains(self._extents, self._stays, self._spacing)
         if np.isfinite(self._extent.lower).all():
-            findings += comparisons.compare_bounds(self._extent, self.metadata)
+            findings += comparisons.compare_bounds(self._extent, self._walls, self.metadata)
         findings += comparisons.check_lengths(self._frames, WINDOW)
         return findings
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
 
 class Severity(StrEnum):
@@ -38,32 +37,28 @@ class Finding:
     factor: float | None = None
     badness: float = 0.0
 
-    def to_dict(self) -> dict[str, Any]:
-        """The finding as plain strings and numbers."""
-        return {name: value for name, value in vars(self).items() if name != "badness"}
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.sentence}"
 
 
-_ORDER = tuple(Severity)
+def sort_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The same findings, contradictions first and notes last."""
+    return tuple(sorted(findings, key=lambda finding: list(Severity).index(finding.severity)))
 
 
 def merge_findings(findings: Iterable[Finding], trajectories: int) -> tuple[Finding, ...]:
-    """One finding per kind and severity, worst first, which says where in how many of the `trajectories` it is worst.
-
-    Findings about the dataset, without a trajectory, stay as they are.
-    """
-    groups: dict[tuple[str, Severity], list[Finding]] = {}
+    """One finding of each kind, of the worst trajectory, that says in how many of `trajectories` it is; worst first."""
+    kinds: dict[tuple[str, Severity], list[Finding]] = {}
     for finding in findings:
-        groups.setdefault((finding.kind, finding.severity), []).append(finding)
-    merged = [
-        merged
-        for group in groups.values()
-        for merged in ([f for f in group if not f.where] or [_merge([f for f in group if f.where], trajectories)])
-    ]
-    return tuple(sorted(merged, key=lambda finding: _ORDER.index(finding.severity)))
+        kinds.setdefault((finding.kind, finding.severity), []).append(finding)
+    return sort_findings(_merge(group, trajectories) for group in kinds.values())
 
 
 def _merge(group: list[Finding], trajectories: int) -> Finding:
     worst = max(group, key=lambda finding: finding.badness)
+    if not worst.where:
+        more = f" … and {len(group) - 1} more." if len(group) > 1 else ""
+        return replace(worst, sentence=worst.sentence + more)
     count = len({finding.where for finding in group})
     many = f"in {count} of {trajectories} trajectories, worst in " if trajectories > 1 else ""
     details = f", {worst.details}" if worst.details else ""

@@ -7,13 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from nmpm.data.inspection.findings import Finding, Severity
-from nmpm.data.inspection.motion import Motion
+from nmpm.data.inspection.motion import Motion, lengths, relative_positions
 
+FEW_CROSSINGS = 3
+"""From one end of all positions to the other: fewer are jumps."""
 _JUMP = 5.0  # in spacings
 _CONTINUOUS = 4.0  # a jump is so many times larger than the change of velocity across it
 _SHARED = 0.5  # of a jump: neighbours that differ by less from it move along
 _COMPARED = 32  # jumps that are compared with their neighbours' motion
 _SHUFFLED_SHARE = 0.1  # of the particles
+_ALWAYS_SHARE = 0.6  # of the particles, which change places all the time
+_ONCE = 2.0  # times the motion before and after it
 _SHUFFLED_FRAMES = 4  # that are searched
 _MATCHED = 8.0  # the particles that change places move by so many times the distance to the next one in the last frame
 _STILL = 1e-6  # of the largest motion: less is none
@@ -25,12 +29,8 @@ _ALIKE = 0.2  # of the median; multiples of particles that differ by less are th
 
 
 def find_irregular_motion(motion: Motion) -> Iterator[Finding]:
-    """Yields findings about the order of particles or, where it is constant, about jumps and frames."""
-    if len(motion.step) < 2 or not motion.spacing:
-        return
-    disorder = list(find_disorder(motion))
-    yield from disorder
-    if not disorder:
+    """Yields findings about jumps, and about repeated and missing frames, of particles whose order is constant."""
+    if len(motion.step) > 1 and motion.spacing:
         yield from find_jumps(motion)
         yield from find_repeated_frames(motion)
         yield from find_missing_frames(motion)
@@ -38,25 +38,21 @@ def find_irregular_motion(motion: Motion) -> Iterator[Finding]:
 
 def find_disorder(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if between two frames many particles move to places where others were."""
-    change = np.linalg.norm(np.diff(motion.step, axis=0), axis=-1) > motion.spacing
+    if len(motion.step) < 2 or not motion.spacing:
+        return
+    change = lengths(np.diff(motion.step, axis=0)) > motion.spacing
     sudden = np.ones(motion.speed.shape, dtype=bool)  # acceleration before and after the step
     sudden[1:] &= change
     sudden[:-1] &= change
     share = sudden.mean(axis=1)
     for frame in np.argsort(-share, kind="stable")[:_SHUFFLED_FRAMES].tolist():
-        if share[frame] < _SHUFFLED_SHARE or sudden[frame].sum() < 2:
-            return
-        tree, _ = motion.tree(frame)
-        later, indices = motion.tree(frame + 1)
-        moved = sudden[frame, indices]
-        nearest = float(np.median(tree.query(later.data[moved])[0]))
-        typical = float(np.median(motion.speed[frame, indices[moved]]))
-        if typical > max(motion.spacing, _MATCHED * nearest) and nearest < 0.5 * motion.spacing:
+        if share[frame] > _SHUFFLED_SHARE and _is_shuffled(motion, frame, sudden[frame]):
+            moved = float(np.median(motion.speed[frame, sudden[frame]])) / motion.spacing
             yield Finding(
                 "particle order",
                 Severity.CONTRADICTION,
-                f"{share[frame]:.0%} of the particles move by {typical / motion.spacing:.2g} spacings, to where others"
-                " were: their order changes. Sort the particles of each frame by their id.",
+                f"{share[frame]:.0%} of the particles move by {moved:.2g} spacings, to where others were: their order"
+                " changes. Sort the particles of each frame by their id.",
                 motion.where,
                 f"frame {frame + 1}",
                 badness=float(share[frame]),
@@ -64,10 +60,25 @@ def find_disorder(motion: Motion) -> Iterator[Finding]:
             return
 
 
+def _is_shuffled(motion: Motion, frame: int, moved: np.ndarray) -> bool:
+    """Whether the (N,) particles that move suddenly come to places where, but for the mean motion, others were.
+
+    Those that do so once are much slower before and after; if all do so all the time, most move suddenly.
+    """
+    drift = np.nanmean(motion.step[frame], axis=0)
+    tree, _ = motion.tree(frame)
+    later = motion.position[frame + 1, moved] - drift
+    nearest = float(np.median(tree.query(relative_positions(later, motion.metadata))[0]))
+    around = motion.speed[[max(frame - 1, 0), min(frame + 1, len(motion.speed) - 1)]][:, moved]
+    distance = float(np.median(motion.speed[frame, moved]))
+    alone = distance > _ONCE * np.nanmedian(around) or moved.mean() > _ALWAYS_SHARE
+    return bool(alone and distance > max(motion.spacing, _MATCHED * nearest) and nearest < motion.spacing / 2)
+
+
 def find_jumps(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if particles are displaced, but neither their velocity nor their neighbours are."""
     jumps = _interrupted_paths(motion)
-    wraps = motion.crossings.any(axis=-1)
+    wraps = motion.crossings[motion.crossings.sum(axis=(1, 2)) >= FEW_CROSSINGS].any(axis=0)
     frames, indices = np.nonzero((jumps > _JUMP * motion.spacing) & ~wraps)
     order = np.argsort(-jumps[frames, indices], kind="stable")
     for place in order[:_COMPARED].tolist():
@@ -96,13 +107,13 @@ def _interrupted_paths(motion: Motion) -> np.ndarray:
     """
     step, jumps = motion.step, np.zeros(motion.speed.shape)
     if len(step) > 2:
-        away = np.linalg.norm(step[1:-1] - (step[:-2] + step[2:]) / 2, axis=-1)
-        jumps[1:-1] = np.where(away > _CONTINUOUS * np.linalg.norm(step[2:] - step[:-2], axis=-1), away, 0.0)
+        away = lengths(step[1:-1] - (step[:-2] + step[2:]) / 2)
+        jumps[1:-1] = np.where(away > _CONTINUOUS * lengths(step[2:] - step[:-2]), away, 0.0)
     if len(step) > 3:
         middle = (step[1:-2] + step[2:-1]) / 2
-        away = np.linalg.norm(step[1:-2] - middle, axis=-1)
-        rest = np.linalg.norm(middle - (step[:-3] + step[3:]) / 2, axis=-1)
-        rest = np.maximum(rest, np.linalg.norm(step[3:] - step[:-3], axis=-1))
+        away = lengths(step[1:-2] - middle)
+        rest = lengths(middle - (step[:-3] + step[3:]) / 2)
+        rest = np.maximum(rest, lengths(step[3:] - step[:-3]))
         jumps[1:-2] = np.maximum(jumps[1:-2], np.where(away > _CONTINUOUS * rest, away, 0.0))
     return jumps
 
@@ -113,7 +124,7 @@ def _neighbours_move_along(motion: Motion, frame: int, index: int) -> bool:
     if len(indices) < 2:
         return False
     near = tree.query(tree.data[np.searchsorted(indices, index)], k=range(2, min(8, len(indices)) + 1))[1]
-    difference = np.linalg.norm(motion.step[frame, indices[near]] - motion.step[frame, index], axis=-1)
+    difference = lengths(motion.step[frame, indices[near]] - motion.step[frame, index])
     return bool(np.nanmedian(difference) < _SHARED * motion.speed[frame, index])
 
 

@@ -1,21 +1,20 @@
-"""Measurements of trajectories, in memory that does not grow with the dataset, and anomalies found on the way."""
+"""Measurements of trajectories, in memory that does not grow with the dataset."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.grid_rule import GridFacts, grid_shape
-from nmpm.data.statistics import Extent, count_gone, displacements, first_moving_particle, first_outside
+from nmpm.data.statistics import Extent, displacements, without_those_gone
 from nmpm.scene import Interval
 
 _MASK_CELLS = 64
 _FRAMES_ON_GRIDS = 12
 _REST = 0.02  # of a trajectory's peak speed
-_JUMP = 5.0  # in spacings; a larger change between successive displacements of a particle is an anomaly
 _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 2.3% wide
 
 
@@ -51,19 +50,21 @@ class Measurements:
         types, position = trajectory.particle_type, trajectory.position
         moving = self.metadata.is_moving(types)
         self.observed.add(position[:, moving | self.metadata.is_obstacle(types)])
-        self.observed.gone += count_gone(position[:, moving], self.metadata)
-        if moving.any():
-            step = displacements(position[:, moving], self.metadata)
-            if len(step):
-                self._add_speeds(np.linalg.norm(step, axis=-1))
-            if len(step) > 1:
-                self.falls.append(np.median(np.diff(step[:4], axis=0), axis=(0, 1)))
-            self._add_cells(position[:, moving])
+        position = without_those_gone(position[:, moving], self.metadata)
+        if np.isfinite(position).any():
+            step = displacements(position, self.metadata)
+            speed = np.linalg.norm(step, axis=-1)
+            if np.isfinite(speed).any():
+                self._add_speeds(speed)
+            if np.isfinite(acceleration := np.diff(step[:4], axis=0)).any():
+                self.falls.append(np.nanmedian(acceleration, axis=(0, 1)))
+            self._add_cells(position)
 
     def _add_speeds(self, speed: np.ndarray) -> None:
-        self._counts += np.bincount(np.digitize(speed.ravel() / self.longest, _BINS), minlength=len(self._counts))
-        self._fastest = max(self._fastest, float(speed.max()))
-        quick = np.quantile(speed, 0.99, axis=1)
+        there = np.isfinite(speed)
+        self._counts += np.bincount(np.digitize(speed[there] / self.longest, _BINS), minlength=len(self._counts))
+        self._fastest = max(self._fastest, float(speed[there].max()))
+        quick = np.quantile(np.where(there, speed, 0.0), 0.99, axis=1)
         awake = np.flatnonzero(quick > _REST * quick.max())
         first = int(awake[-1]) + 1 if len(awake) else 0
         self.rests.append(first if first < len(speed) else None)
@@ -71,8 +72,8 @@ class Measurements:
     def _add_cells(self, position: np.ndarray) -> None:
         for cells in self._per_cell:
             for frame in np.unique(np.linspace(0, len(position) - 1, _FRAMES_ON_GRIDS).astype(int)):
-                index = self._cells(position[frame], cells)
-                self._per_cell[cells].append(len(index) / len(np.unique(index)))
+                if len(index := self._cells(position[frame], cells)):
+                    self._per_cell[cells].append(len(index) / len(np.unique(index)))
         occupied = np.zeros(self._mask.size, bool)
         for frame in position:
             occupied[self._cells(frame, _MASK_CELLS)] = True
@@ -80,8 +81,9 @@ class Measurements:
         self._mask |= occupied
 
     def _cells(self, position: np.ndarray, cells: int) -> np.ndarray:
-        """Flat index of the cell that contains each of (N, D) particles, (N,)."""
+        """Flat index of the cell that contains each of (N, D) particles that are there, (N',)."""
         shape = np.array(self.shape(cells))
+        position = position[~np.isnan(position[:, 0])]
         index = np.floor((position - self.low) / self.extent * shape).astype(int)
         index = np.where(self.metadata.periodic, index % shape, np.clip(index, 0, shape - 1))
         return np.asarray(np.ravel_multi_index(tuple(index.T), tuple(shape)))
@@ -105,35 +107,3 @@ class Measurements:
     def occupied(self) -> tuple[float, float]:
         """Share of the domain ever occupied, in all trajectories together and in one of them (median)."""
         return float(self._mask.mean()), float(np.median(self._shares)) if self._shares else 0.0
-
-
-def find_anomalies(trajectory: Trajectory, metadata: Metadata, spacing: float, where: str) -> Iterator[str]:
-    """Yields the anomalies of one trajectory, as sentences that name `where`, frame and particle.
-
-    `spacing` is the typical distance between neighbours, in domain length.
-    """
-    types, position = trajectory.particle_type, trajectory.position
-    moving = np.flatnonzero(metadata.is_moving(types))
-    if metadata.domain is not None and (outside := first_outside(position, metadata.domain, metadata.boundary)):
-        frame, particle, leaving = outside
-        yield (
-            f"{where}, frame {frame}: particle {particle} is outside of the stated domain, at"
-            f" {position[frame, particle].round(5).tolist()}; {leaving} particles leave it."
-        )
-    change = np.linalg.norm(np.diff(displacements(position[:, moving], metadata), axis=0), axis=-1)
-    far = change > _JUMP * spacing
-    if far.any():
-        frame, index = map(int, np.argwhere(far)[0])
-        yield (
-            f"{where}: particle {int(moving[index])} jumps by {change[frame, index]:.3g} between frames {frame + 1} and"
-            f" {frame + 2}, {change[frame, index] / spacing:.0f} times the distance of neighbours"
-            f" ({int(far.any(axis=0).sum())} particles jump)."
-        )
-    _, first, number = np.unique(position[0, moving], axis=0, return_index=True, return_counts=True)
-    if (number > 1).any():
-        twin = int(moving[first[int(np.argmax(number))]])
-        twins = int((number - 1).sum())
-        yield f"{where}, frame 0: {twins} particles have the position of another, e.g. of particle {twin}."
-    mover = first_moving_particle(position, metadata.is_static(types), metadata.bounds)
-    if mover is not None:
-        yield f"{where}: particle {mover}, of the static type {types[mover]}, moves."

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import displacements
+from nmpm.data.statistics import displacements, without_those_gone
 
 _NEIGHBOURS = 8
 _QUERIES = 2000
 _CROSSING = 0.8  # of the extent of all positions
+_RESTLESS = 0.2  # likewise: particles whose typical step is longer do not cross ends, they are anywhere
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class Motion:
 
     @cached_property
     def position(self) -> np.ndarray:
-        """(T, N, D)."""
-        return self.trajectory.position[:, self.index]
+        """(T, N, D); absent is also who has left the bounds of an open axis."""
+        return without_those_gone(self.trajectory.position[:, self.index], self.metadata)
 
     @cached_property
     def step(self) -> np.ndarray:
@@ -49,7 +50,7 @@ class Motion:
     @cached_property
     def speed(self) -> np.ndarray:
         """(T - 1, N) lengths of the displacements."""
-        return np.asarray(np.linalg.norm(self.step, axis=-1))
+        return lengths(self.step)
 
     @cached_property
     def typical(self) -> np.ndarray:
@@ -60,31 +61,60 @@ class Motion:
     @cached_property
     def present(self) -> np.ndarray:
         """(T, N) whether each particle is there."""
-        return ~np.isnan(self.position[..., 0])
+        return np.asarray(~np.isnan(self.position[..., 0]))
+
+    @cached_property
+    def extent(self) -> np.ndarray:
+        """(D, 2) lowest and highest coordinates."""
+        axes = [self.position[..., axis] for axis in range(self.position.shape[-1])]
+        return np.array([[np.nanmin(values), np.nanmax(values)] for values in axes], dtype=np.float64)
+
+    @cached_property
+    def stays(self) -> np.ndarray:
+        """(D, 2) share of the frames in which a particle is within a spacing of the lowest or highest coordinates."""
+        axes = [self.position[..., axis] for axis in range(self.position.shape[-1])]
+        low, high = self.extent[:, 0] + self.spacing, self.extent[:, 1] - self.spacing
+        return np.array(
+            [[(x < a).any(axis=1).mean(), (x > b).any(axis=1).mean()] for x, a, b in zip(axes, low, high, strict=True)]
+        )
 
     @cached_property
     def crossings(self) -> np.ndarray:
-        """(T - 1, N, D) whether a step leads from one end of all positions to the other, on axes that do not wrap."""
-        extent = np.fmax.reduce(self.position, axis=(0, 1)) - np.fmin.reduce(self.position, axis=(0, 1))
-        return np.asarray((np.abs(self.step) > _CROSSING * extent) & ~np.asarray(self.metadata.periodic))
+        """(D, T - 1, N) whether a particle that else moves little comes from one end of all positions to the other.
+
+        Steps on periodic axes are none.
+        """
+        crosses = np.zeros((self.metadata.dim, *self.speed.shape), dtype=bool)
+        for axis in np.flatnonzero(~np.asarray(self.metadata.periodic)):
+            size, step = self.extent[axis, 1] - self.extent[axis, 0], np.abs(self.step[..., axis])
+            crosses[axis] = step > _CROSSING * size
+            particles = np.flatnonzero(crosses[axis].any(axis=0))
+            if len(particles):
+                restless = np.nanmedian(step[:, particles], axis=0) > _RESTLESS * size
+                crosses[axis, :, particles[restless]] = False
+        return crosses
 
     @cached_property
     def wraps(self) -> np.ndarray:
-        """(T - 1, N, D) whether a step leads across the ends of a periodic axis, in coordinates that wrap or do not."""
-        lower, upper = np.asarray(self.metadata.bounds).T
-        periods = np.floor((self.position - lower) / (upper - lower))
-        return np.asarray(
-            (np.diff(periods, axis=0) != 0) | (np.abs(np.diff(self.position, axis=0)) > (upper - lower) / 2)
-        ) & np.asarray(self.metadata.periodic)
+        """(D,) number of steps across the ends of a periodic axis, in coordinates that wrap or do not."""
+        counts = np.zeros(self.metadata.dim, dtype=int)
+        for axis in np.flatnonzero(self.metadata.periodic):
+            lower, upper = self.metadata.bounds[axis]
+            x = self.position[..., axis].astype(np.float64)
+            crosses = np.diff(np.floor((x - lower) / (upper - lower)), axis=0) != 0
+            counts[axis] = ((crosses | (np.abs(np.diff(x, axis=0)) > (upper - lower) / 2)) & self.present[1:]).sum()
+        return counts
 
     @cached_property
     def bounces(self) -> np.ndarray:
-        """(T - 2, N, D) whether a particle on its way across an end of a periodic axis stays within."""
-        lower, upper = np.asarray(self.metadata.bounds).T
-        ahead, inside = self.position[1:-1] + self.step[:-1], (self.position >= lower) & (self.position <= upper)
-        return np.asarray(
-            ((ahead < lower) | (ahead > upper)) & inside[1:-1] & inside[2:] & ~self.wraps[1:]
-        ) & np.asarray(self.metadata.periodic)
+        """(D,) number of steps after which a particle on its way across an end of a periodic axis is still within."""
+        counts = np.zeros(self.metadata.dim, dtype=int)
+        for axis in np.flatnonzero(self.metadata.periodic):
+            lower, upper = self.metadata.bounds[axis]
+            x = self.position[..., axis]
+            ahead, inside = x[1:-1] + self.step[:-1, :, axis], (x >= lower) & (x <= upper)
+            counts[axis] = (((ahead < lower) | (ahead > upper)) & inside[1:-1] & inside[2:]).sum()
+        return counts
 
     @cached_property
     def rounding(self) -> float:
@@ -107,13 +137,23 @@ class Motion:
         return neighbour_tree(self.position[frame, there], self.metadata), there
 
 
-def neighbour_tree(position: np.ndarray, metadata: Metadata) -> cKDTree:
-    """A search tree of (N, D) positions, which wraps on periodic axes; its data are relative to the bounds."""
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """(…) lengths of (…, D) vectors."""
+    return np.asarray(np.sqrt(np.einsum("...d,...d->...", vectors, vectors)))
+
+
+def relative_positions(position: np.ndarray, metadata: Metadata) -> np.ndarray:
+    """(N, D) float64 positions relative to the bounds, within the period on periodic axes."""
     lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
-    relative = position.astype(np.float64) - lower
-    wraps = np.asarray(metadata.periodic)
-    period = np.where(wraps, upper - lower, 0.0)  # cKDTree: 0 is not periodic
-    return cKDTree(np.where(wraps, np.mod(relative, np.where(wraps, period, 1.0)), relative), boxsize=period)
+    wraps, relative = np.asarray(metadata.periodic), position.astype(np.float64) - lower
+    return np.asarray(np.where(wraps, np.mod(relative, np.where(wraps, upper - lower, 1.0)), relative))
+
+
+def neighbour_tree(position: np.ndarray, metadata: Metadata) -> cKDTree:
+    """A search tree of (N, D) positions, relative to the bounds, that wraps on periodic axes."""
+    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
+    period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
+    return cKDTree(relative_positions(position, metadata), boxsize=period)
 
 
 def spacing_of(position: np.ndarray, metadata: Metadata) -> float:
@@ -125,4 +165,4 @@ def spacing_of(position: np.ndarray, metadata: Metadata) -> float:
     tree = neighbour_tree(there, metadata)
     distance = tree.query(tree.data[:: -(-len(there) // _QUERIES)], k=[number + 1])[0]
     ball = math.pi ** (dim / 2) / math.gamma(dim / 2 + 1)
-    return float(np.median(distance)) * float(ball / number) ** (1 / dim)
+    return float(np.median(distance) * (ball / number) ** (1 / dim))

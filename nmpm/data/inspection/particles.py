@@ -26,7 +26,7 @@ def find_odd_particles(motion: Motion) -> Iterator[Finding]:
 def find_particles_outside(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if particles leave the stated domain."""
     position, metadata = motion.trajectory.position, motion.metadata
-    if metadata.domain is None or not (outside := first_outside(position, metadata.domain, metadata.periodic)):
+    if metadata.domain is None or not (outside := first_outside(position, metadata.domain, metadata.boundary)):
         return
     frame, particle, leaving = outside
     yield Finding(

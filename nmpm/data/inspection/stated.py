@@ -76,8 +76,8 @@ def check_times(motion: Motion) -> Iterator[Finding]:
         yield Finding(
             "uneven time steps",
             Severity.CONTRADICTION,
-            f"{int((off > _UNEVEN).sum())} of {len(steps)} time steps differ from the usual {dt:.4g}; this frame is"
-            f" {steps[frame] / dt:.3g} of them after the one before.",
+            f"it comes {steps[frame] / dt:.3g} time steps of {dt:.4g} after the one before;"
+            f" {int((off > _UNEVEN).sum())} of {len(steps)} steps differ.",
             motion.where,
             f"frame {frame + 1}",
             float(steps[frame] / dt),
@@ -191,8 +191,8 @@ def correction(option: str) -> str:
 
 
 def _vector(values: Sequence[float] | np.ndarray) -> str:
-    return f"({', '.join(f'{value:.3g}' for value in values)})"
+    return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 
 def _comma(values: np.ndarray) -> str:
-    return ",".join(f"{value:.3g}" for value in values)
+    return ",".join(f"{value:.4g}" for value in values)

@@ -1,0 +1,222 @@
+"""Each lie about made-up data is the first finding, with its factor; data without lies have none."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
+from nmpm.data.inspection import inspect
+from nmpm.data.inspection.findings import Finding, Severity, merge_findings
+from nmpm.data.loading.sources import FolderSource
+
+DT, GRAVITY, SPACING, SIDE, FRAMES = 0.01, 9.81, 0.02, 10, 32
+WALL = Metadata(
+    bounds=((0.0, 1.0),) * 2,
+    domain=((-0.1, 1.1),) * 2,
+    dt=DT,
+    dim=2,
+    sequence_length=FRAMES,
+    particle_types={3: "boundary", 7: "goop"},
+    static_types=frozenset({3}),
+    gravity=(0.0, -GRAVITY),
+    particle_volume=SPACING**2,
+)
+
+
+@dataclass
+class Data:
+    """Positions (T, N, 2) and types (N,) of runs by split, and what is stated about them."""
+
+    metadata: Metadata
+    types: np.ndarray
+    runs: dict[str, list[np.ndarray]]
+    fields: dict[str, np.ndarray] = field(default_factory=dict)  # of all runs
+
+    def change(self, change: Callable[[np.ndarray], np.ndarray], runs: slice = slice(None)) -> None:
+        """Changes positions of runs of the train split."""
+        self.runs["train"][runs] = [change(run.copy()) for run in self.runs["train"][runs]]
+
+    def move(self, shift: float) -> None:
+        """Moves everything."""
+        self.runs = {name: [run + shift for run in runs] for name, runs in self.runs.items()}
+        self.state(
+            bounds=tuple((low + shift, high + shift) for low, high in self.metadata.bounds),
+            domain=tuple((low + shift, high + shift) for low, high in self.metadata.domain or ()),
+        )
+
+    def state(self, **changes: Any) -> None:
+        """Changes the metadata."""
+        self.metadata = replace(self.metadata, **changes)
+
+    def findings(self, folder: Path) -> tuple[Finding, ...]:
+        """What an inspection finds, one of each kind."""
+        for name, runs in self.runs.items():
+            write_split(
+                folder / f"{name}.h5", (Trajectory(np.float32(run), self.types, {}, self.fields) for run in runs)
+            )
+        write_metadata(folder, self.metadata)
+        return merge_findings(inspect(FolderSource(folder)).findings, sum(map(len, self.runs.values())))
+
+
+def reflect(flight: np.ndarray) -> np.ndarray:
+    """Coordinates of particles that walls at 0 and 1 throw back."""
+    return 1 - np.abs(1 - np.abs(flight))
+
+
+def thrown_block(
+    seed: int,
+    frames: int = FRAMES,
+    spacing: float = SPACING,
+    within: Callable[[np.ndarray], np.ndarray] = reflect,
+) -> np.ndarray:
+    """Positions (T, N, 2) of a block of particles that flies through the unit square, and of a row below its floor."""
+    rng = np.random.default_rng(seed)
+    lattice = spacing * np.stack(np.meshgrid(*[np.arange(SIDE)] * 2, indexing="ij"), -1).reshape(1, -1, 2)
+    time = DT * np.arange(frames)[:, None, None]
+    start, velocity = rng.uniform((0.1, 0.6), (0.6, 0.75)), rng.uniform((-1.5, -1.0), (1.5, 1.0))
+    flight = start + lattice + velocity * time - np.array([0.0, GRAVITY / 2]) * time**2
+    floor = np.stack([np.linspace(0, 1, 2 * SIDE), np.full(2 * SIDE, -0.05)], -1)
+    return np.concatenate([within(flight), np.broadcast_to(floor, (frames, 2 * SIDE, 2))], axis=1)
+
+
+@pytest.fixture
+def data() -> Data:
+    splits = {"train": range(6), "valid": range(6, 8), "test": range(8, 9)}
+    types = np.r_[np.full(SIDE**2, 7), np.full(2 * SIDE, 3)]
+    return Data(WALL, types, {name: [thrown_block(seed) for seed in seeds] for name, seeds in splits.items()})
+
+
+def test_nothing_is_found_in_data_without_lies(data, tmp_path):
+    assert data.findings(tmp_path) == ()
+
+
+def teleported(run: np.ndarray) -> np.ndarray:
+    run[12:, 5] += 10 * SPACING * np.array([0.6, 0.8])
+    return run
+
+
+def glitched(run: np.ndarray) -> np.ndarray:
+    run[12, 5] += 10 * SPACING * np.array([0.6, 0.8])
+    return run
+
+
+def drifted(run: np.ndarray) -> np.ndarray:
+    run = run.copy()
+    run[:, : SIDE**2] = reflect(run[:, : SIDE**2] + 0.01 * np.maximum(0, np.arange(FRAMES) - 10)[:, None, None])
+    return run
+
+
+def repeated(run: np.ndarray) -> np.ndarray:
+    return np.insert(run, 8, run[8], axis=0)
+
+
+def shuffled(run: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    for frame in range(len(run)):
+        run[frame, : SIDE**2] = run[frame, rng.permutation(SIDE**2)]
+    return run
+
+
+def shuffled_once(run: np.ndarray) -> np.ndarray:
+    order = np.random.default_rng(0).permutation(SIDE**2)
+    run[20:, : SIDE**2] = run[20:, order]
+    return run
+
+
+def doubled(run: np.ndarray) -> np.ndarray:
+    run[:, 3] = run[:, 4]
+    return run
+
+
+def wall_moves(run: np.ndarray) -> np.ndarray:
+    run[:, -1, 0] += np.linspace(0, 0.05, len(run))
+    return run
+
+
+def stuck(run: np.ndarray) -> np.ndarray:
+    run[:, :10] = run[0, :10]
+    return run
+
+
+def noisy(run: np.ndarray) -> np.ndarray:
+    run[:, : SIDE**2] += np.random.default_rng(0).normal(scale=0.01, size=run[:, : SIDE**2].shape)
+    return run
+
+
+def absent(run: np.ndarray) -> np.ndarray:
+    run[:6, 2] = run[-3:, 4] = np.nan
+    return run
+
+
+ONE = slice(2, 3)
+UNEVEN = DT * (np.arange(FRAMES) + (np.arange(FRAMES) > 9))
+LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
+    "gravity up": (lambda data: data.state(gravity=(0.0, GRAVITY)), "opposite direction", 1),
+    "gravity along x": (lambda data: data.state(gravity=(-GRAVITY, 0.0)), "gravity: .*along x in place of y", 1),
+    "gravity in mm": (lambda data: data.state(gravity=(0.0, -9810.0)), "gravity: .*1000 times too large", 1000),
+    "gravity in km": (lambda data: data.state(gravity=(0.0, -0.00981)), "gravity: .*1000 times too small", 1e-3),
+    "gravity by half": (lambda data: data.state(gravity=(0.0, -4.905)), "gravity: .*2 times too small.*-9.81", 0.5),
+    "gravity of zero": (lambda data: data.state(gravity=(0.0, 0.0)), "gravity: .*there is one", None),
+    "dt": (lambda data: data.state(dt=2.5 * DT), "dt: .*2.5 times too large.*--dt 0.01", 2.5),
+    "dt of frames": (lambda data: data.state(dt=1.0), "dt: .*100 times too large", 100),
+    "dt in ms": (lambda data: data.state(dt=DT / 1000), "dt: .*1000 times too small", 1e-3),
+    "dt against times": (lambda data: (data.state(dt=DT / 3), data.fields.update(time=DT * np.arange(FRAMES))),
+                         "dt: .*3 times too small.*recorded times.*--dt 0.01", 1 / 3),
+    "uneven times": (lambda data: data.fields.update(time=UNEVEN), "uneven time steps: .*frame 10.* 1 of 31", 2),
+    "volume": (lambda data: data.state(particle_volume=10 * SPACING**2), "particle volume: .*times too large", None),
+    "volume of a radius": (lambda data: data.state(particle_volume=0.1 * SPACING**2), "particle volume: .*small", None),
+    "bounds too small": (lambda data: data.state(bounds=((0.2, 0.8), (0.0, 1.0)), domain=None), "bounds: .*x", None),
+    "bounds too large": (lambda data: data.state(bounds=((0.0, 1.0), (0.0, 50.0)), domain=None), "far bounds: .*y", 48),
+    "domain too small": (lambda data: data.state(bounds=((0.2, 0.8), (0.0, 1.0)), domain=((0.2, 0.8), (-0.1, 1.1))),
+                         "does not contain the positions", None),
+    "walls that wrap": (lambda data: data.change(lambda run: thrown_block(0, within=lambda flight: np.mod(flight, 1))),
+                        "boundary: along x, y .*not periodic.*--boundary periodic,periodic", None),
+    "periods that are walls": (lambda data: data.state(boundary=("periodic", "wall"), domain=((0, 1), (-0.1, 1.1))),
+                               "boundary: along x .* periodic.*--boundary wall,wall", None),
+    "shared runs": (lambda data: data.runs["valid"].__setitem__(0, data.runs["train"][3]),
+                    "shared trajectories: .*1 of 2.*train 00003 and valid 00000", 0.5),
+    "same splits": (lambda data: data.runs.update(test=data.runs["train"][:1]), "test: .*test says nothing", 1),
+    "shared starts": (lambda data: data.runs["valid"].__setitem__(0, drifted(data.runs["train"][3])),
+                      "shared starts: .*train 00003 and valid 00000", 0.5),
+    "walls as material": (lambda data: data.state(static_types=frozenset(), particle_types={3: "sand", 7: "goop"}),
+                          "still particles: 180 of 180 particles of type 3, sand,.*--static 3", 1),
+    "one type for both": (lambda data: data.change(stuck), "still particles: 60 of 900", None),
+    "walls that move": (lambda data: data.change(wall_moves, ONE), "moving walls: .*train 00002, particle 119", None),
+    "named a wall": (lambda data: data.state(particle_types={3: "boundary", 7: "moving wall"}), "walls that are", None),
+    "mixed time steps": (lambda data: data.change(lambda run: thrown_block(2, 2 * FRAMES)[::2], ONE),
+                         "mixed time steps: .*train 00002 it is 2 times", 2),
+    "repeated frame": (lambda data: data.change(repeated, ONE), "repeated frames: .*train 00002, frame 9", None),
+    "missing frame": (lambda data: data.change(lambda run: np.delete(run, 8, axis=0), ONE),
+                      "missing frames: .*train 00002, frame 8: .*2.0 times", 2),
+    "order": (lambda data: data.change(shuffled, ONE), "particle order: .*train 00002", None),
+    "order once": (lambda data: data.change(shuffled_once, ONE), "particle order: .*train 00002, frame 20", None),
+    "resolution": (lambda data: data.change(lambda run: thrown_block(9, spacing=0.03), ONE),
+                   "different resolution: .*train 00002.* 1.5 times", 1.5),
+    "far from the origin": (lambda data: data.move(1000.0), "float32: .*Subtract about .1000, 1000.", None),
+    "short": (lambda data: data.change(lambda run: run[:12], slice(0, 2)), "short trajectories: 2 of 9", 2 / 9),
+    "overlap": (lambda data: data.change(doubled, ONE), "overlapping particles: .*train 00002", None),
+    "teleport": (lambda data: data.change(teleported, ONE), "jumps: .*train 00002, frame 12, particle 5", None),
+    "glitch": (lambda data: data.change(glitched, ONE), "jumps: .*train 00002, frame 12, particle 5", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_is_the_first_finding(lie, data, tmp_path):
+    tell, words, factor = LIES[lie]
+    tell(data)
+    first, *others = data.findings(tmp_path)
+    assert re.search(words, str(first)), (first, others)
+    if factor is not None:
+        assert first.factor == pytest.approx(factor, rel=0.08)
+
+
+def test_particles_that_come_and_go_are_noted(data, tmp_path):
+    data.change(absent, ONE)
+    (note,) = data.findings(tmp_path)
+    assert note.severity == Severity.NOTE
+    assert "1 of 100 particles come" in note.sentence
