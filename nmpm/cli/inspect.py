@@ -90,12 +90,12 @@ def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namesp
 def _open(path: Path, format_name: str | None, options: Options, native: Path) -> tuple[FolderSource, list[str]]:
     """The dataset, and problems of its conversion, which is in the cache; in the folder `native` if it is damaged."""
     from nmpm.data.convert import convert, native_folder
-    from nmpm.data.format import split_paths
+    from nmpm.data.format import is_native
     from nmpm.data.loading.sources import FolderSource
 
     path, problems = _dataset_of(path), list[str]()
     if format_name is None:
-        if split_paths(path):
+        if is_native(path):
             return FolderSource(path, options), []
         try:
             return FolderSource(native_folder(path, options)), []
@@ -109,20 +109,10 @@ def _open(path: Path, format_name: str | None, options: Options, native: Path) -
 
 
 def _dataset_of(path: Path) -> Path:
-    """The folder of the dataset that an HDF5 file is a split of; a DataError for other HDF5 files, such as rollouts."""
-    if path.suffix != ".h5" or not path.is_file():
-        return path
-    from nmpm.data.convert import FORMATS
-    from nmpm.data.format import Split, split_paths
+    """The folder of the dataset that an HDF5 file is a split of; other paths unchanged."""
+    from nmpm.data.format import split_paths
 
-    splits = [split.name for split in split_paths(path.parent).values()]
-    if path.name in splits or (not splits and any(kind.recognises(path.parent) for kind in FORMATS)):
-        return path.parent
-    Split(path)
-    raise DataError(
-        f"{path}: it is not a split of a dataset, which are train.h5, valid.h5 and test.h5 beside a metadata.json. To"
-        f" look at its trajectories: nmpm view {path}, or nmpm render {path}."
-    )
+    return path.parent if path in split_paths(path.parent).values() else path
 
 
 def _lines(inspection: Inspection) -> Iterator[str]:

@@ -266,6 +266,17 @@ def split_paths(folder: Path) -> Mapping[str, Path]:
     return {name: path for name, path in paths.items() if path.exists()}
 
 
+def is_native(folder: Path) -> bool:
+    """Whether a folder has split files in the native layout; those of a folder with metadata are not looked into."""
+    paths = split_paths(folder)
+    if not paths or (Path(folder) / METADATA_FILE).is_file():
+        return bool(paths)
+    try:
+        return bool(Split(next(iter(paths.values()))))
+    except DataError:
+        return False
+
+
 def find_split(folder: Path, *names: str) -> Path:
     """The file of the first of the named splits that a folder has; if none, a DataError names those there are."""
     paths = split_paths(folder)

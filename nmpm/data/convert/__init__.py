@@ -23,6 +23,7 @@ from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native, NativeFiles
+from nmpm.data.convert.nearest import describe_unknown
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.retiming import retime
 from nmpm.data.convert.rollout_pickle import RolloutPickle
@@ -77,11 +78,7 @@ def _find_format(path: Path, name: str | None) -> DatasetFormat:
     for kind in FORMATS:
         if kind.recognises(path):
             return kind
-    content = ", ".join(sorted(item.name for item in path.iterdir())[:8]) if path.is_dir() else "a file"
-    raise DataError(
-        f"{path}: no known format ({names}); found {content or 'nothing'}. State the --format, or write the arrays with"
-        " nmpm.write_trajectories."
-    )
+    raise DataError(describe_unknown(path))
 
 
 def convert(

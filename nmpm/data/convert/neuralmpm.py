@@ -15,7 +15,7 @@ from typing import ClassVar
 import h5py
 import numpy as np
 
-from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
+from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, split_files
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.data.metadata import find_family
@@ -57,6 +57,13 @@ class NeuralMpm(FileFormat):
     name: ClassVar[str] = "neuralmpm"
     summary: ClassVar[str] = "NeuralMPM's folders of sim_*.h5 files, also from the hub's iSach/NeuralMPM"
     pattern: ClassVar[str] = "sim_*.h5"
+
+    def recognises(self, path: Path) -> bool:
+        files = split_files(path, self.pattern)
+        try:
+            return bool(files) and not {"particles", "boundary"}.isdisjoint(_names(next(iter(files.values()))[0]))
+        except DataError:
+            return True  # damaged
 
     def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
         folder, published = file.resolve().parent.parent, _published(file)
@@ -104,6 +111,11 @@ class NeuralMpm(FileFormat):
 def _published(file: Path) -> _Published | None:
     """The published dataset whose name the folder around the splits has."""
     return _PUBLISHED.get(file.resolve().parent.parent.name.lower())
+
+
+def _names(path: Path) -> list[str]:
+    with open_hdf5(path) as file:
+        return list(file)
 
 
 def _content(path: Path) -> dict[str, np.ndarray]:

@@ -79,10 +79,10 @@ class Columns:
             "frame or time": parts["frame"] or parts["time"],
         }
         missing = [what for what, column in needed.items() if not column]
+        if not self.names:
+            raise DataError("it has no header with names of columns.")
         if missing:
-            raise DataError(
-                f"no column {' and no column '.join(missing)} (columns: {', '.join(self.names[:12]) or 'no header'})."
-            )
+            raise DataError(f"no column {' and no column '.join(missing)} (columns: {', '.join(self.names[:12])}).")
         for key, value in parts.items():
             object.__setattr__(self, key, value)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from nmpm.data.convert import Options, native_folder
-from nmpm.data.format import Metadata, Split, find_split, read_metadata, split_paths
+from nmpm.data.format import Metadata, Split, find_split, is_native, read_metadata
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
@@ -81,7 +81,7 @@ class FolderSource(DataSource):
 
     @cached_property
     def folder(self) -> Path:
-        if not self.path.exists() or (split_paths(self.path) and not self.options.changes_positions):
+        if not self.path.exists() or (is_native(self.path) and not self.options.changes_positions):
             return self.path
         return native_folder(self.path, self.options)
 

@@ -85,8 +85,8 @@ def test_unknown_types_and_formats_are_refused_with_a_suggestion(tmp_path):
     strange = Trajectory(made_up_trajectory(5, 3).position, np.full(3, 42))
     with pytest.raises(DataError, match=r"train split, trajectory 0: unknown particle type 42"):
         write_native(source_of(strange), tmp_path / "out")
-    (tmp_path / "a.txt").write_text("hello")
-    with pytest.raises(DataError, match=r"no known format \(native, deepmind.*found a\.txt"):
+    (tmp_path / "a.dat").write_text("hello")
+    with pytest.raises(DataError, match=r"no known format; found a\.dat.*write_trajectories.*your_data\.md"):
         convert(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match="no such file or folder"):
         convert(tmp_path / "nowhere", tmp_path / "out")

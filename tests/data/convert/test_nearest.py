@@ -1,0 +1,62 @@
+"""What is said of data of no known form."""
+
+import h5py
+import numpy as np
+import pytest
+
+from nmpm.data.convert import native_folder, open_dataset
+from nmpm.data.convert.nearest import HINTS
+from nmpm.errors import DataError
+
+RUN = np.random.default_rng(0).random((3, 30, 20, 2), dtype=np.float32)
+
+
+def refuse(path, message):
+    with pytest.raises(DataError, match=message) as raised:
+        open_dataset(path)
+    assert "\n" not in str(raised.value)
+    assert "docs/howto/your_data.md" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"pos": np.moveaxis(RUN, -1, 2)}, r"'pos' is float32 of shape \(3, 30, 2, 20\).*np\.moveaxis\(pos, 2, -1\)"),
+        ({"positions": RUN[0, 0]}, r"'positions' is .*this is one frame.*np\.stack\(frames\)"),
+        ({"a": RUN, "b": RUN}, r"which array are the positions\? Call it position \(a float32 .*, b float32"),
+        ({"state": np.zeros((30, 20, 6))}, r"'state' is float64 of shape \(30, 20, 6\); positions are"),
+    ],
+    ids=["axes", "frame", "several", "state"],
+)
+def test_arrays_of_another_shape_are_named(tmp_path, arrays, message):
+    np.savez(tmp_path / "a.npz", **arrays)
+    refuse(tmp_path / "a.npz", message)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.update({f"group/{name}": array for name, array in arrays.items()})
+    refuse(tmp_path / "a.h5", "group/")
+
+
+def test_objects_tables_and_damage_are_named(tmp_path):
+    np.savez(tmp_path / "a.npz", runs=np.array([RUN[0], RUN[0, 1:]], dtype=object))
+    refuse(tmp_path / "a.npz", r"'runs' holds Python objects, which are not unpickled")
+    (tmp_path / "a.npz").write_bytes(b"PK no")
+    refuse(tmp_path / "a.npz", r"a\.npz: cannot be read as \.npz")
+    (tmp_path / "a.txt").write_text("frame x y\n1 0 0\n")
+    refuse(tmp_path / "a.txt", r"a\.txt: it is no table of tracks: no column id \(columns: frame, x, y\)")
+
+
+@pytest.mark.parametrize("suffix", HINTS)
+def test_other_programs_files_come_with_a_way_out(tmp_path, suffix):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / f"run0{suffix}").write_bytes(b"?")
+    if suffix != ".pkl":  # which has a format of its own
+        refuse(tmp_path, rf"run0{suffix}: {suffix} files are not read: .*{HINTS[suffix].split()[0]}")
+
+
+@pytest.mark.usefixtures("home")
+def test_files_that_are_called_like_splits_need_not_be_native(tmp_path):
+    for split in ("train", "valid"):
+        with h5py.File(tmp_path / f"{split}.h5", "w") as file:
+            file["positions"] = RUN
+    folder = native_folder(tmp_path)
+    assert sorted(path.name for path in folder.glob("*.h5")) == ["train.h5", "valid.h5"]
