@@ -11,6 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,11 +20,12 @@ from torch import Tensor
 from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.array_checks import check_end
 from nmpm.data.fields import read_fields, require_fields
-from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.format import Metadata, Split, Trajectory, split_paths
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence
 from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
 from nmpm.data.times import check_times
+from nmpm.data.volumes import SIZES, mean_volume, volumes
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
@@ -49,8 +51,13 @@ class RecordingReader:
     metadata: Metadata
     scene: Scene
 
-    def recording(self, trajectory: Trajectory, where: str) -> Recording:
-        """Converts a trajectory, with its fields as `read_fields` gives them; `where` names it in errors.
+    def recording(self, trajectory: Trajectory, where: str, volume: np.ndarray | None = None) -> Recording:
+        """Converts a trajectory.
+
+        Args:
+            trajectory: The trajectory, with its fields as `read_fields` gives them.
+            where: Names it in errors.
+            volume: (N,) volumes of its particles, as multiples of the scene's `particle_volume`; None for 1.
 
         Raises:
             DataError: if a particle leaves the scene's domain, its material is not in the scene, a static particle
@@ -76,6 +83,7 @@ class RecordingReader:
             fields=dict(self._fields(trajectory.fields, moving, presence, where)),
             present=None if presence is None else torch.from_numpy(presence.present),
             obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
+            volume=None if volume is None else _positive(volume, moving, where),
         )
 
     def _obstacles(self, position: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
@@ -160,6 +168,17 @@ class RecordingReader:
         return index
 
 
+def _positive(volume: np.ndarray, moving: np.ndarray, where: str) -> Tensor:
+    """The (N',) volumes of the moving particles, of (N,) ones; a DataError if one is not positive."""
+    wrong = moving & ~((volume > 0) & np.isfinite(volume))
+    if wrong.any():
+        raise DataError(
+            f"{where}: the size of particle {int(np.argmax(wrong))} ({' or '.join(SIZES)}) is not a positive"
+            " number. Correct the field, or rename it if it is no size."
+        )
+    return torch.from_numpy(volume[moving].astype(np.float32))
+
+
 class SplitRecordings(Sequence[Recording]):
     """Trajectories of a split as recordings, read and validated on access.
 
@@ -187,7 +206,21 @@ class SplitRecordings(Sequence[Recording]):
         index = self.indices[number]
         names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
         fields = read_fields(self.split, index, names) if names else {}
-        return self.reader.recording(replace(self.split.read(index), fields=fields), self.split.where(index))
+        trajectory = replace(self.split.read(index), fields=fields)
+        return self.reader.recording(trajectory, self.split.where(index), self._relative_volumes(index))
+
+    @cached_property
+    def _mean_volume(self) -> float | None:
+        """The mean volume of the dataset's particles: of its first split, if there are splits beside this file."""
+        beside = next(iter(split_paths(self.split.path.parent).values()), self.split.path)
+        return mean_volume(Split(beside), self.reader.metadata)
+
+    def _relative_volumes(self, index: int) -> np.ndarray | None:
+        """(N,) volumes of a trajectory's particles over the mean one; None where all are alike."""
+        if self._mean_volume is None:
+            return None
+        values = volumes(self.split, index, self.reader.metadata)
+        return None if values is None else values / self._mean_volume
 
     @property
     def frames(self) -> tuple[int, ...]:

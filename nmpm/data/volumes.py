@@ -1,0 +1,57 @@
+"""Volumes of particles of different size, from a field that says how large they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import h5py
+import numpy as np
+
+from nmpm.data.format import Metadata, Split
+from nmpm.data.hdf5 import check_stored_size, open_hdf5
+
+SIZES = ("volume", "radius", "diameter", "size")
+"""Names of fields that say how large particles are; the first that a trajectory has counts."""
+_VARIES = 1.01  # largest over smallest volume; below that, all particles are alike
+_CONSTANT = 1e-5  # of a value; it may change by that in time
+_SAMPLE = 8  # trajectories
+
+
+def mean_volume(split: Split, metadata: Metadata) -> float | None:
+    """Mean volume of the moving particles of a dataset, in units that cancel in ratios; None where all are alike.
+
+    The volume is the field `volume`, or the power `dim` of `radius`, `diameter` or `size`, where it is constant in
+    time. Up to 8 trajectories are read.
+    """
+    every = [
+        values[metadata.is_moving(split.particle_type(index))]
+        for index in range(0, len(split), -(-len(split) // _SAMPLE))
+        if (values := volumes(split, index, metadata)) is not None
+    ]
+    sample = np.concatenate([np.empty(0), *every])
+    sample = sample[sample > 0]
+    return float(sample.mean()) if len(sample) and sample.max() > _VARIES * sample.min() else None
+
+
+def volumes(split: Split, index: int, metadata: Metadata) -> np.ndarray | None:
+    """(N,) volumes of a trajectory's particles, as in `mean_volume`; None where no field gives them."""
+    frames, particles = split.frames(index), split.particles(index)
+    with open_hdf5(split.path) as file:
+        group = file[split.names[index]]
+        for name in SIZES:
+            stored = group.get(name)
+            if isinstance(stored, h5py.Dataset) and stored.shape in ((particles,), (frames, particles)):
+                check_stored_size(stored, f"{split.where(index)}: {name}")
+                values = _constant(stored)
+                return values if values is None or name == "volume" else values**metadata.dim
+    return None
+
+
+def _constant(stored: Any) -> np.ndarray | None:
+    """(N,) values in time, NaN where a particle has none; None if they are no numbers or change in time."""
+    if stored.dtype.kind not in "iuf":
+        return None
+    values = np.atleast_2d(np.asarray(stored[()], dtype=np.float64))
+    low, high = np.fmin.reduce(values, axis=0), np.fmax.reduce(values, axis=0)
+    changes = high - low > _CONSTANT * np.abs(high)
+    return None if changes.any() else low
