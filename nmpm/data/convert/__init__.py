@@ -18,6 +18,7 @@ from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
 from nmpm.data.convert.conversion import renumber_types, write_native
+from nmpm.data.convert.csv_frames import CsvFrames
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
@@ -29,6 +30,7 @@ from nmpm.data.convert.retiming import retime
 from nmpm.data.convert.rollout_pickle import RolloutPickle
 from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
+from nmpm.data.convert.vtkhdf import VtkHdf
 from nmpm.data.convert.xyz import Xyz
 from nmpm.data.format import METADATA_FILE
 from nmpm.data.gravity import check_gravity
@@ -45,8 +47,10 @@ FORMATS: tuple[DatasetFormat, ...] = (
     RolloutPickle(),
     NativeFiles(),
     ArrayFiles(),
+    CsvFrames(),
     Tracks(),
     Vtk(),
+    VtkHdf(),
     Lammps(),
     Xyz(),
 )

@@ -16,6 +16,11 @@ AXES = "xyz"
 
 _COMPONENTS = ("vx vy vz", "velocityx velocityy velocityz", "velx vely velz", "velocity0 velocity1 velocity2", "u v w")
 
+ARRAY_NAMES = frozenset(
+    {*" ".join(_COMPONENTS).split(), *(n for key in ("id", "types", "active", "velocity") for n in USUAL_NAMES[key])}
+)
+"""Names of arrays with a meaning, in lower case without separators."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -122,7 +127,7 @@ def _scalars(name: str, values: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
     """Names and (N,) values of an array's components; nothing for strings."""
     if values.dtype.kind not in "biuf":
         return []
-    name = name.replace("/", "_")
+    name = "particle_time" if name == "time" else name.replace("/", "_")
     if values.ndim == 1 or values.shape[1] == 1:
         return [(name, values.reshape(-1))]
     ends = AXES if values.shape[1] <= len(AXES) else range(values.shape[1])

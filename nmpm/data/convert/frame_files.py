@@ -37,7 +37,7 @@ from nmpm.data.convert.base import (
 )
 from nmpm.data.convert.frame import AXES, Frame, ParticleArrays
 from nmpm.data.convert.frame_stack import FrameStack
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, divide
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError
 
@@ -123,14 +123,15 @@ class FrameFormat(DatasetFormat):
         splits, divided = divide(runs)
         first = self._first_frames(next(iter(splits.values()))[0])
         layout = Layout.of(first, self._type_ids(first, runs))
-        metadata = _metadata(layout)
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
+        unknown = EVERYTHING_UNKNOWN - {name for name, value in stated.items() if value is not None}
+        metadata, unknown = apply_family(_metadata(layout), unknown, options)
         return ForeignDataset(
             options.apply_to(metadata),
             {split: partial(self._read_all, each, layout) for split, each in splits.items()},
             (*layout.notes(), *gaps, *divided, *self.notes(first, options)),
             {split: len(each) for split, each in splits.items()},
-            unknown=EVERYTHING_UNKNOWN - {name for name, value in stated.items() if value is not None},
+            unknown=unknown,
         )
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
@@ -163,10 +164,10 @@ class FrameFormat(DatasetFormat):
         gaps: list[str] = []
         for folder, files in folders:
             if many:
-                runs += [FrameRun(file, 0, 0, _split_of(file, path), None, (file,)) for file in files]
+                runs += [FrameRun(file, 0, split=_split_of(file, path), files=(file,)) for file in files]
             else:
                 series = _series(folder, files, gaps)
-                runs.append(FrameRun(folder, 0, len(series), _split_of(folder, path), None, series))
+                runs.append(FrameRun(folder, 0, len(series), _split_of(folder, path), files=series))
         if many and len(runs) < 3:
             runs = [replace(run, frames=self.count(run.file)) for run in runs]
         rest = f" The same in {counted(len(gaps) - 1, 'more run')}." if gaps[1:] else ""

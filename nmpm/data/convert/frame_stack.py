@@ -9,6 +9,7 @@ import numpy as np
 
 from nmpm._support.messages import one_line
 from nmpm.data.convert.frame import AXES, Frame, ParticleArrays
+from nmpm.data.convert.named_arrays import plain_name
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
 
@@ -16,6 +17,7 @@ _log = logging.getLogger(__name__)
 
 _ABSENT_TYPE = -1
 _FRAMES = 64
+_PROPERTIES = ("radius", "diameter", "mass", "volume")
 
 
 class FrameStack:
@@ -217,7 +219,7 @@ class FrameStack:
             for array in values.values():
                 for row in array:  # in place: no second copy of the run
                     row[: len(order)] = row[order]
-        values = {name: array[:, : len(order)] for name, array in values.items()}
+        values = {name: _constant(name, array[:, : len(order)]) for name, array in values.items()}
         position = values.pop("position")
         return Trajectory(position, types[order], {}, values | self._time())
 
@@ -228,3 +230,11 @@ class FrameStack:
         if len(stated) < max(2, len(times) // 2) or np.ptp(times[stated]) == 0:
             return {}
         return {"time": np.interp(np.arange(len(times)), stated, times[stated])}
+
+
+def _constant(name: str, values: np.ndarray) -> np.ndarray:
+    """(N,) sizes and masses of particles where (T, N) ones do not change in time."""
+    if plain_name(name) not in _PROPERTIES:
+        return values
+    last = np.fmax.reduce(values)
+    return last if ((values == last) | np.isnan(values)).all() else values

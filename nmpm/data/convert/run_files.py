@@ -89,12 +89,7 @@ class RunFiles(DatasetFormat):
             undivided = [replace(run, frames=self.frames(run)) for run in undivided]
         splits, divided = divide(undivided) if undivided else (runs, ())
         stated, unknown, notes = self.facts(next(iter(files.values()))[0])
-        if options.family is not None:
-            family = find_family(options.family)
-            static, prescribed = family.static, family.prescribed
-            names = dict(family.types)
-            stated = replace(stated, particle_types=names, static_types=static, prescribed_types=prescribed)
-            unknown -= {"particle_types", "static_types"}
+        stated, unknown = apply_family(stated, unknown, options)
         metadata = options.apply_to(stated)
         return ForeignDataset(
             metadata,
@@ -110,6 +105,16 @@ class RunFiles(DatasetFormat):
             trajectories = self.read(file, [run.index for run in inside], metadata)
             for run, trajectory in zip(inside, trajectories, strict=True):
                 yield trajectory if run.part is None else cut(trajectory, run.part)
+
+
+def apply_family(metadata: Metadata, unknown: frozenset[str], options: Options) -> tuple[Metadata, frozenset[str]]:
+    """The metadata with the types of the family that the user names, and the names of fields that are still unknown."""
+    if options.family is None:
+        return metadata, unknown
+    family = find_family(options.family)
+    names, static, prescribed = dict(family.types), family.static, family.prescribed
+    stated = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
+    return stated, unknown - {"particle_types", "static_types"}
 
 
 def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple[str, ...]]:

@@ -26,7 +26,7 @@ from nmpm.errors import DataError, NmpmError
 
 _log = logging.getLogger(__name__)
 
-_USUAL: Mapping[str, tuple[str, ...]] = {
+USUAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "frame": (
         "frame", "frames", "framenumber", "frameindex", "frameid", "framenr", "step", "timestep", "iteration", "image",
     ),
@@ -67,7 +67,7 @@ class Columns:
 
     def __post_init__(self) -> None:
         plain = {plain_column(name): name for name in reversed(self.names)}
-        parts: dict[str, Any] = {key: _first(plain, usual) for key, usual in _USUAL.items()}
+        parts: dict[str, Any] = {key: _first(plain, usual) for key, usual in USUAL_COLUMNS.items()}
         parts["position"] = _components(plain, _POSITION)
         velocity = _components(plain, (*_VELOCITY, "{letter}"))
         parts["velocity"] = velocity if len(velocity) == len(parts["position"]) else ()
@@ -96,6 +96,11 @@ class Columns:
         """Columns with a meaning."""
         single = (self.frame, self.time, self.track, self.run, self.types)
         return (*(name for name in single if name is not None), *self.position, *self.velocity)
+
+
+def coordinate_columns(names: Sequence[str]) -> tuple[str, ...]:
+    """The columns of the coordinates x, y and z, as far as there are."""
+    return _components({plain_column(name): name for name in reversed(names)}, _POSITION)
 
 
 def _first(plain: Mapping[str, str], usual: Iterable[str]) -> str | None:

@@ -98,7 +98,7 @@ def test_times_elements_and_further_columns(tmp_path):
     convert(tmp_path / "run.lammpstrj", tmp_path / "out")
     trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
     assert trajectory.fields["time"].tolist() == [0, 0.5, 1]
-    assert trajectory.fields["radius"].tolist() == [[7.5, 8.5]] * 3
+    assert trajectory.fields["radius"].tolist() == [7.5, 8.5]
     assert trajectory.fields["c_stress[1]"].tolist() == [[3, 4]] * 3
     assert trajectory.particle_type.tolist() == [2, 1]
     assert read_metadata(tmp_path / "out").particle_types == {1: "wall", 2: "Fe"}

@@ -1,0 +1,61 @@
+"""Tables with a file per frame: CSV and its relatives, and Parquet, with coordinates in columns x, y, z."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from nmpm.data.convert.frame import ARRAY_NAMES, Frame
+from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.tables import Chunk, plain_column, read_chunks, read_columns
+from nmpm.data.convert.tracks import USUAL_COLUMNS, coordinate_columns
+from nmpm.errors import DataError, NmpmError
+
+_SAME_IN_FRAME = {*USUAL_COLUMNS["frame"], *USUAL_COLUMNS["time"]}
+
+
+class CsvFrames(FrameFormat):
+    """A table per frame; a time or frame in it is the same in all rows."""
+
+    name: ClassVar[str] = "csv-frames"
+    summary: ClassVar[str] = "tables with a file per frame (.csv, .tsv, also .gz; .parquet): x, y, z"
+    patterns: ClassVar[tuple[str, ...]] = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.parquet")
+
+    def recognises(self, path: Path) -> bool:
+        files = next(self._folders(path), (path, []))[1]
+        try:
+            return len(files) > 1 and all(map(_is_frame, files[:2]))
+        except (NmpmError, OSError):
+            return False
+
+    def frames(self, file: Path) -> Iterator[Frame]:
+        names = read_columns(file)
+        coordinates = coordinate_columns(names)
+        if not coordinates:
+            raise DataError(f"{file}: no columns x, y of coordinates (found: {', '.join(names[:12]) or 'no header'}).")
+        chunks = list(read_chunks(file, names))
+        table = {name: np.concatenate([chunk[name] for chunk in chunks]) if chunks else np.zeros(0) for name in names}
+        texts = [name for name in coordinates if table[name].dtype.kind != "f"]
+        if texts:
+            raise DataError(f"{file}: the column {texts[0]} must contain numbers.")
+        position = np.stack([table.pop(name) for name in coordinates], axis=1)
+        time = next((table[name] for name in table if plain_column(name) in USUAL_COLUMNS["time"]), np.zeros(0))
+        arrays = {_name(name): table[name] for name in table if plain_column(name) not in _SAME_IN_FRAME}
+        yield Frame(position, arrays, float(time[0]) if len(time) and time.dtype.kind == "f" else None)
+
+
+def _is_frame(file: Path) -> bool:
+    """Whether a table is one frame: it has coordinates, and one time or frame if any."""
+    names = read_columns(file)
+    keys = [name for name in names if plain_column(name) in _SAME_IN_FRAME]
+    chunk: Chunk = next(read_chunks(file, keys), {}) if keys else {}
+    return bool(coordinate_columns(names)) and all((values == values[0]).all() for values in chunk.values())
+
+
+def _name(column: str) -> str:
+    """A column's name, without its unit if it is a usual one."""
+    plain = plain_column(column)
+    return plain if plain in ARRAY_NAMES else column

@@ -1,0 +1,107 @@
+"""VTKHDF files, `.vtkhdf`: poly data or an unstructured grid, with time steps or a file per frame; read by h5py.
+
+The points of all time steps are in one array; `Steps` says where those of each step begin (https://docs.vtk.org,
+"VTKHDF file format").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+
+from nmpm._support.messages import one_line
+from nmpm.data.convert.frame import Frame
+from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.format import VTKHDF
+from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
+from nmpm.errors import DataError
+
+_BLOCK_BYTES = 2**24
+_TYPES = ("PolyData", "UnstructuredGrid")
+
+
+class VtkHdf(FrameFormat):
+    """VTKHDF files of points."""
+
+    name: ClassVar[str] = "vtkhdf"
+    summary: ClassVar[str] = "VTKHDF files of points (.vtkhdf), with time steps or a file per frame"
+    patterns: ClassVar[tuple[str, ...]] = ("*.vtkhdf",)
+
+    def frames(self, file: Path) -> Iterator[Frame]:
+        with open_hdf5(file) as content:
+            root = _root(content, file)
+            rows = {name: _Rows(values) for name, values in root.get("PointData", {}).items()}
+            points = _Rows(root["Points"])
+            for count, first, starts, time in _steps(root):
+                position = points.take(first, count).astype(np.float64)
+                yield Frame(position, {name: rows[name].take(starts.get(name, first), count) for name in rows}, time)
+
+    def count(self, file: Path) -> int:
+        with open_hdf5(file) as content:
+            root = _root(content, file)
+            return int(root["Steps"].attrs["NSteps"]) if "Steps" in root else 1
+
+
+def _root(content: Any, file: Path) -> Any:
+    """The group of the points.
+
+    Raises:
+        DataError: if there is none, or it takes content from other files.
+    """
+    check_self_contained(content, file)
+    root = content.get(VTKHDF)
+    if not isinstance(root, h5py.Group):
+        raise DataError(f"{file}: there is no group {VTKHDF} in it.")
+    kind = root.attrs.get("Type", b"nothing")
+    kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+    if kind not in _TYPES:
+        raise DataError(f"{file}: it has a {one_line(kind, 40)}; particles are points, as {' or '.join(_TYPES)}.")
+    for name, values in (("Points", root["Points"]), *root.get("PointData", {}).items()):
+        check_stored_size(values, f"{file}: {name}")
+    return root
+
+
+def _steps(root: Any) -> Iterator[tuple[int, int, dict[str, int], float | None]]:
+    """Yields the number of points of each step, the index of the first, that of each array, and the time."""
+    points = root["NumberOfPoints"][()]
+    if "Steps" not in root:
+        yield int(points.sum()), 0, {}, _time(root)
+        return
+    steps, number = root["Steps"], int(root["Steps"].attrs["NSteps"])
+    starts = {name: values[()] for name, values in steps.get("PointDataOffsets", {}).items()}
+    firsts, times, parts = (steps[name][:number] for name in ("PointOffsets", "Values", "PartOffsets"))
+    counts = steps["NumberOfParts"][:number] if "NumberOfParts" in steps else np.ones(number, int)
+    for step in range(number):
+        count = int(points[parts[step] : parts[step] + counts[step]].sum())
+        yield count, int(firsts[step]), {name: int(each[step]) for name, each in starts.items()}, float(times[step])
+
+
+class _Rows:
+    """Rows of a dataset, read in blocks: a step alone would unpack a whole chunk."""
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset, self._first, self._rows = dataset, 0, dataset[:0]
+
+    def take(self, first: int, count: int) -> np.ndarray:
+        """Some rows; raises a DataError if there are fewer."""
+        if first < self._first or first + count > self._first + len(self._rows):
+            block = _BLOCK_BYTES // max(1, self._dataset.dtype.itemsize * math.prod(self._dataset.shape[1:]))
+            self._first, self._rows = first, self._dataset[first : first + max(count, block)]
+        rows = np.asarray(self._rows[first - self._first :][:count])
+        if len(rows) != count or first < 0:
+            name = self._dataset.name.removeprefix(f"/{VTKHDF}/")
+            raise DataError(f"{self._dataset.file.filename}: {count} rows of {name} from {first} on are not there.")
+        return rows
+
+
+def _time(root: Any) -> float | None:
+    """The time that the field data state."""
+    for name, values in root.get("FieldData", {}).items():
+        if name.lower() in ("timevalue", "time") and values.shape == (1,):
+            return float(values[0])
+    return None
