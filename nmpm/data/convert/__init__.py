@@ -26,6 +26,7 @@ from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native, NativeFiles
 from nmpm.data.convert.nearest import describe_unknown
 from nmpm.data.convert.neuralmpm import NeuralMpm
+from nmpm.data.convert.ply import Ply
 from nmpm.data.convert.retiming import retime
 from nmpm.data.convert.rollout_pickle import RolloutPickle
 from nmpm.data.convert.tracks import Tracks
@@ -51,6 +52,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     Tracks(),
     Vtk(),
     VtkHdf(),
+    Ply(),
     Lammps(),
     Xyz(),
 )

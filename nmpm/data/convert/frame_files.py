@@ -261,16 +261,16 @@ def _series(folder: Path, files: Sequence[Path], gaps: list[str]) -> tuple[Path 
             f"{folder}: files of {len(set(names))} kinds: {kinds}. Their names should differ in their last number only,"
             " that of the frame: give each run a folder of its own, and remove other files."
         )
-    found = [_NUMBER.search(_stem(file)) for file in files]
-    numbers = np.array([int(match.group()) if match else 0 for match in found])
+    matches = [_NUMBER.search(_stem(file)) for file in files]
+    numbers = np.array([int(match.group()) if match else 0 for match in matches])
     steps = np.diff(numbers)
     if len(files) < 3 or (steps == steps[0]).all():
         return tuple(files)
     values, counts = np.unique(steps, return_counts=True)
     step = int(values[counts.argmax()])
     after = files[int(np.argmax(steps != step))].name
-    places = (numbers - numbers[0]) // max(step, 1)
-    missing = int(places[-1]) + 1 - len(files)
+    indices = (numbers - numbers[0]) // max(step, 1)
+    missing = int(indices[-1]) + 1 - len(files)
     if steps.min() < 1 or (steps % step).any() or missing > _MISSING * len(files):
         gaps.append(f"{folder}: the numbers of files are uneven (first after {after}); their order counts.")
         return tuple(files)
@@ -278,8 +278,8 @@ def _series(folder: Path, files: Sequence[Path], gaps: list[str]) -> tuple[Path 
         f"{folder}: {missing} of {len(files) + missing} frames are missing (first after {after}); no particle is there"
         " in these."
     )
-    present = dict(zip(places.tolist(), files, strict=True))
-    return tuple(present.get(place) for place in range(len(files) + missing))
+    present = dict(zip(indices.tolist(), files, strict=True))
+    return tuple(present.get(index) for index in range(len(files) + missing))
 
 
 def _stem(file: Path) -> str:

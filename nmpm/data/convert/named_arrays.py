@@ -21,14 +21,14 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     ),
     "types": (
         "particletype", "particletypes", "types", "type", "materials", "material", "materialids", "materialid",
-        "matid", "phases", "phase", "species", "atomtypes", "labels", "label", "element", "elements",
-        "kind", "mk",
+        "matid", "phases", "phase", "species", "atomtypes", "labels", "label", "element", "elements", "kind",
+        "mk",
     ),
     "velocity": ("velocity", "velocities", "particlevelocities", "vel", "vels", "v"),
     "active": ("active", "isactive", "alive", "present", "exists", "mask", "valid"),
     "id": (
-        "id", "ids", "particle", "particleid", "particleids", "pid", "idp", "uid", "tag", "track", "trackid", "globalid",
-        "globalids",
+        "id", "ids", "particle", "particleid", "particleids", "pid", "idp", "uid", "tag", "track", "trackid",
+        "globalid", "globalids",
     ),
     "time": ("time", "times", "timestamps", "t"),
     "dt": ("dt", "deltat", "framedt", "timestep", "frameinterval"),

@@ -1,0 +1,58 @@
+"""PLY files of points, a file per frame; read by plyfile."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from nmpm._support.bounded_files import check_regular
+from nmpm._support.messages import one_line
+from nmpm.data.convert.frame import AXES, Frame
+from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.errors import ConfigError, DataError
+
+_TIME = re.compile(r"time\W+([-+.\deE]+)\s*$", re.IGNORECASE)
+
+
+class Ply(FrameFormat):
+    """The element `vertex` of PLY files; a comment such as `time 0.5` states the time."""
+
+    name: ClassVar[str] = "ply"
+    summary: ClassVar[str] = "PLY files of points, a file per frame (needs: pip install nmpm[vtk])"
+    patterns: ClassVar[tuple[str, ...]] = ("*.ply",)
+
+    def frames(self, file: Path) -> Iterator[Frame]:
+        check_regular(file)
+        try:
+            import plyfile
+        except ImportError as error:
+            raise ConfigError(f'{file}: reading PLY needs plyfile: pip install "nmpm[vtk]".') from error
+        try:
+            content = plyfile.PlyData.read(str(file))
+        except (plyfile.PlyParseError, OSError, ValueError, MemoryError, UnicodeDecodeError) as error:
+            raise DataError(f"{file}: cannot be read as PLY ({one_line(error)}). Is it complete?") from error
+        yield _frame(content, file)
+
+
+def _frame(content: Any, file: Path) -> Frame:
+    elements = {element.name: element for element in content.elements}
+    vertices: Any = elements["vertex"].data if "vertex" in elements else np.zeros(0)
+    names = vertices.dtype.names or ()
+    axes = [axis for axis in AXES if axis in names]
+    if len(axes) < 2:
+        raise DataError(f"{file}: it has no element vertex with x, y (found: {', '.join([*elements, *names])}).")
+    position = np.stack([vertices[axis].astype(np.float64) for axis in axes], axis=1)
+    arrays = {name: np.array(vertices[name]) for name in names if name not in axes and vertices[name].dtype != object}
+    times = (_TIME.search(comment) for comment in (*content.comments, *content.obj_info))
+    return Frame(position, arrays, next((_number(match[1]) for match in times if match), None))
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
