@@ -51,6 +51,7 @@ class Axis:
         if self.period:
             return self.period.interval
         low, high = self.low - self._margin(self.lower, spacing), self.high + self._margin(self.upper, spacing)
+        # Obstacles beyond the particles are beyond the bounds.
         if self.low > self.solid[0]:
             low = max(low, self.solid[0])
         if self.high < self.solid[1]:
@@ -59,8 +60,9 @@ class Axis:
         return _round(math.floor(low / unit), unit), _round(math.ceil(high / unit), unit)
 
     def _margin(self, wall: Wall | None, spacing: float) -> float:
-        """What is added to the extreme position; but obstacles beyond it are beyond the bounds."""
-        if self.opens or (wall and wall.certain):
+        """What is added to the extreme position, where it is no end."""
+        flat = self.high - self.low < spacing
+        if (self.opens or (wall and wall.certain)) and not flat:
             return 0.0
         return spacing if wall else max(_MARGIN * (self.high - self.low), spacing)
 

@@ -160,11 +160,13 @@ def _differing(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[
 
 def _from_momentum(tracks: Sequence[Track], dt: float) -> Fact[tuple[float, ...] | None] | None:
     """Gravity from the mean acceleration of all particles; None where it is not steady."""
-    second = [np.diff(track.position, 2, axis=0) for track in tracks if len(track.position) > 2]
-    if not second:
+    second = [np.diff(track.position, 2, axis=0) for track in tracks]
+    complete = [each[np.isfinite(each).all(axis=2)] for each in second]
+    complete = [each for each in complete if len(each)]
+    if not complete:
         return None
-    single = math.sqrt(float(np.nanmean([np.nanmean(each**2) for each in second])))
-    means = [np.nanmean(each, axis=(0, 1)) for each in second]
+    single = math.sqrt(float(np.mean([np.mean(each**2) for each in complete])))
+    means = [each.mean(axis=0) for each in complete]
     if all(np.linalg.norm(mean) < _BALANCED * single for mean in means):
         how = "all axes are periodic, and the mean acceleration is below 0.1% of single particles'."
         return Fact((0.0,) * len(means[0]), how, "measured")
@@ -174,12 +176,11 @@ def _from_momentum(tracks: Sequence[Track], dt: float) -> Fact[tuple[float, ...]
 
 
 def _why_not(tracks: Sequence[Track], flights: Sequence[Flight], spacing: float) -> str:
-    moved = [
-        float(np.nanmedian(np.linalg.norm(track.position[:8] - track.position[0], axis=2).max(axis=0)))
-        for track in tracks
-        if np.isfinite(track.position[0]).any()
-    ]
-    if moved and np.median(moved) < spacing / 50:
+    starts = [track.position[: _FRAMES[0]] for track in tracks]
+    reach = [(np.fmax.reduce(start, axis=0) - np.fmin.reduce(start, axis=0)).max(axis=1) for start in starts]
+    moved = np.concatenate([np.empty(0), *reach])
+    moved = moved[np.isfinite(moved)]
+    if len(moved) and np.median(moved) < spacing / 50:
         return "most particles are at rest in first frames"
     if not flights:
         return "paths in first frames are no parabolas: they are noisy, or particles push each other"
