@@ -18,6 +18,7 @@ _EXAMPLES = """\
 examples:
   nmpm simulate --list                               the shipped scenes
   nmpm simulate waterramps --preview ramps.png       draw one trajectory, write no data
+  nmpm simulate waterramps --preview ramps.vtkhdf    write it for ParaView; .usda for Blender, …
   nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
   nmpm simulate waterramps --shard 2/8 --out ramps   one of 8 jobs; the last completes the folder
   nmpm simulate my-scene.yaml --out mine             your own scene, from a copy of a shipped one
@@ -34,6 +35,8 @@ def run(words: list[str]) -> None:
     Raises:
         SystemExit: with status 130 after Ctrl-C.
     """
+    from nmpm.data.write import SUFFIXES
+
     parser = argparse.ArgumentParser(
         prog="nmpm simulate",
         description="Simulate a dataset of a shipped scene or your own, ready for training.",
@@ -43,7 +46,9 @@ def run(words: list[str]) -> None:
     parser.add_argument("name", nargs="?", help="a shipped scene, or a YAML file")
     parser.add_argument("--list", action="store_true", help="list the shipped scenes")
     parser.add_argument("--show", action="store_true", help="print the scene's YAML")
-    parser.add_argument("--preview", type=Path, metavar="FILE", help="simulate one trajectory and draw it (PNG)")
+    parser.add_argument(
+        "--preview", type=Path, metavar="FILE", help=f"simulate one trajectory: a .png draws it, {SUFFIXES} hold it"
+    )
     for split in ("train", "valid", "test"):
         parser.add_argument(f"--{split}", type=int, metavar="N", help=f"{split} trajectories (default: the paper's)")
     parser.add_argument("--frames", type=int, help="frames after the initial one (default: the scene's)")
@@ -76,7 +81,7 @@ def _simulate(options: argparse.Namespace) -> None:
     for name, least in (("workers", 1), ("frames", 1), ("seed", 0), ("train", 0), ("valid", 0), ("test", 0)):
         check_at_least(f"--{name}", getattr(options, name), least)
     if options.preview is not None:
-        check_picture("--preview", options.preview)
+        _check_preview(options.preview)
     elif options.out is not None:
         check_folder("--out", options.out)
     from nmpm.data import catalog
@@ -103,6 +108,16 @@ def _simulate(options: argparse.Namespace) -> None:
     sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
 
 
+def _check_preview(path: Path) -> None:
+    """Raise ConfigError, before the work, if a preview cannot be written."""
+    from nmpm.data.write import find_writer, is_written_by_suffix
+
+    if is_written_by_suffix(path):
+        find_writer("--preview", path)
+    else:
+        check_picture("--preview", path)
+
+
 def _list() -> None:
     from nmpm.data import catalog
     from nmpm.sim import load_preset
@@ -124,12 +139,16 @@ def _preview(preset: Preset, seed: int, path: Path) -> None:
     from nmpm._support.progress import progress_bar
     from nmpm.data.format import Trajectory
     from nmpm.data.generate import preset_metadata
+    from nmpm.data.write import is_written_by_suffix, write_trajectory
     from nmpm.viz import write_snapshots
     from nmpm.viz.files import label_trajectory
 
     with progress_bar(f"Simulating {preset.name}", preset.frames) as step:
         run = preset.simulate(seed, lambda _: step())
-    trajectory = Trajectory(run.position, run.particle_type, run.attributes)
-    title = f"{preset.name}, simulated by nmpm ({preset.generator})"
-    write_snapshots(label_trajectory(trajectory, "simulated", preset_metadata(preset), preset.scene, title), path)
+    trajectory, metadata = Trajectory(run.position, run.particle_type, run.attributes), preset_metadata(preset)
+    if is_written_by_suffix(path):
+        path = write_trajectory(path, trajectory, metadata)
+    else:
+        title = f"{preset.name}, simulated by nmpm ({preset.generator})"
+        write_snapshots(label_trajectory(trajectory, "simulated", metadata, preset.scene, title), path)
     sys.stdout.write(f"wrote {path}\n")

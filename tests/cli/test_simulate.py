@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from nmpm.cli import main
-from nmpm.data.format import read_metadata
+from nmpm.data.format import Split, read_metadata
 from nmpm.data.loading.sources import FolderSource
 from nmpm.sim import preset_names
 from nmpm.sim.loading import preset_text
@@ -71,6 +71,13 @@ def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["look.png"]
     with Image.open("look.png") as picture:
         assert min(picture.size) > 200
+
+
+def test_a_preview_may_be_a_file_for_other_programs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "sandramps", "--frames", "6", "--preview", "look.vtkhdf"]) == 0
+    split = Split(Path("look.vtkhdf"))
+    assert (len(split), split.frames(0)) == (1, 7)
 
 
 def test_an_interruption_says_how_to_go_on(tmp_path):
