@@ -118,6 +118,7 @@ def test_there_is_something_to_test():
         "trade",
         "compare",
         "inspect",
+        "init",
         "convert",
         "export",
     }
@@ -142,6 +143,8 @@ def test_configurations_of_trainings_are_valid(words, make_dataset, workplace, c
     (run / "config.yaml").write_text(find_config("goop.yaml").read_text("utf-8"), "utf-8")
     for name in ("best.ckpt", "last.ckpt"):
         (run / "checkpoints" / name).touch()
+    for word in {"FOLDER.yaml", "honey.yaml"} & set(words):  # that nmpm init wrote
+        Path(word).write_text(find_config("waterdrop.yaml").read_text("utf-8").replace("???", "honey"), "utf-8")
     given = [str(workplace / "honey") if word in RECORDED else word for word in words[1:]]
     with contextlib.suppress(SystemExit):
         main([*given, *([] if "--print_config" in given else ["--print_config"])])

@@ -38,7 +38,7 @@ from nmpm.training.callbacks.threads import Threads
 from nmpm.training.checkpoints import AtomicCheckpointIO, check_same_recipe, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.preflight import OVERALL, check_disk, fitting_precision
+from nmpm.training.preflight import OVERALL, check_disk, check_memory, fitting_precision
 from nmpm.zoo.registry import load_model
 
 T = TypeVar("T")
@@ -193,6 +193,7 @@ class EmulatorCLI(LightningCLI):
         for logger in self.trainer.loggers:
             check_folder("The logger's save_dir", Path(logger.save_dir or "."))
         check_disk(self.trainer, self.model)
+        check_memory(self.trainer, self.model, self.datamodule.batch_size)
         resumed = self._load_checkpoint()
         if resumed is not None:
             self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated

@@ -1,4 +1,4 @@
-"""Checks before the first step: options of the Trainer, precision, metrics, monitored errors and disk space.
+"""Checks before the first step: options of the Trainer, precision, metrics, monitored errors, memory and disk space.
 
 Lightning itself rejects further options when the Trainer is made. `docs/lightning.md` lists what works.
 """
@@ -29,12 +29,15 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torchmetrics import Metric
 
 from nmpm._support.devices import computes_bfloat16
+from nmpm._support.memory import free_memory
 from nmpm._support.messages import one_line, suggestion
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.grid_rule import MULTIPLE, TrainingSize, grid_shape
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import Comparison, still
+from nmpm.processors import UNet
 
 if TYPE_CHECKING:
     from nmpm.training.module import EmulatorModule
@@ -49,6 +52,8 @@ CHECKPOINT_SIZE = 5
 """Bytes of a checkpoint for each of the weights', at most: averaged ones and the state of SOAP or Adam with them."""
 REPORT_BYTES = 32 * 2**20
 """Of the report with its pictures, and of logs."""
+MEMORY_MARGIN = 1.25
+"""Times the free memory that a training's estimate may reach: estimates are within a quarter."""
 
 _COUNT_EPOCHS = "needs epochs that end, and batches are endless: give limit_train_batches=N and max_epochs"
 
@@ -213,7 +218,30 @@ def _try_metrics(errors: Comparison, recordings: SplitRecordings, frames: int | 
         raise ConfigError(f"model.metrics cannot be computed on {split.where(index)} ({reason}).") from error
 
 
-# Disk space
+# Memory and disk space
+
+
+def check_memory(trainer: Trainer, module: EmulatorModule, batch_size: int) -> None:
+    """Raise ConfigError, with a grid that fits, if the activations of a U-Net on the CPU would not fit into memory."""
+    recipe, scene = module.emulator.recipe, module.emulator.scene
+    if trainer.strategy.root_device.type != "cpu" or not isinstance(recipe.processor, UNet):
+        return
+    size = TrainingSize(batch_size, 1 if module.recompute else module.unroll, recipe.processor.width)
+    free = free_memory()
+
+    def fits(shape: Sequence[int]) -> bool:
+        return size.memory(shape) <= MEMORY_MARGIN * free
+
+    if fits(module.emulator.grid.shape):
+        return
+    numbers = range(MULTIPLE, max(module.emulator.grid.shape), MULTIPLE)
+    smaller = [cells for cells in numbers if fits(grid_shape(scene.domain, scene.periodic, cells))]
+    shape = " x ".join(map(str, module.emulator.grid.shape))
+    raise ConfigError(
+        f"A training on {shape} cells takes about {size.memory(module.emulator.grid.shape) / 1e9:.0f} GB of memory, of"
+        f" which {free / 1e9:.1f} are free: give --model.cells {max(smaller, default=MULTIPLE)}, a smaller"
+        f" --data.batch_size than {batch_size}, or --model.recompute true."
+    )
 
 
 def check_disk(trainer: Trainer, module: LightningModule) -> None:

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from nmpm.data.format import write_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.metrics import MSE, RolloutMetric
+from nmpm.processors import UNet
 from nmpm.training import preflight
 from tests.made_up import made_up_trajectory
 from tests.trainings import QUIET, data_of, module_of, trainer_of
@@ -114,6 +115,16 @@ def test_a_full_disk_is_refused_and_a_nearly_full_one_is_warned_of(make_dataset,
     leave(50)
     with pytest.warns(UserWarning, match="50 MB"):
         preflight.check_disk(trainer, module)
+
+
+def test_a_grid_that_does_not_fit_into_memory_is_refused_with_one_that_does(make_dataset, tmp_path, monkeypatch):
+    data = data_of(make_dataset(dim=3))
+    module = module_of(data, cells=64, unroll=2, processor=UNet(width=24, depth=3))
+    trainer = lightning.Trainer(accelerator="cpu", default_root_dir=tmp_path / "run", logger=False, max_steps=1)
+    monkeypatch.setattr(preflight, "free_memory", lambda: 2e9)
+    with pytest.raises(ConfigError, match=r"64 x 64 x 64 cells takes about 6 GB .* 2.0 are free: give --model.cells 40"):
+        preflight.check_memory(trainer, module, batch_size=4)
+    preflight.check_memory(trainer, module_of(data, cells=40, processor=UNet(width=24, depth=3)), batch_size=4)
 
 
 @pytest.mark.parametrize("emulated", [True, False])
