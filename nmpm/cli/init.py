@@ -90,13 +90,13 @@ def _write(path: Path, options: Options, out: Path, root: str, minutes: float) -
     """Write a configuration for a dataset, and return its lines."""
     from nmpm._support.atomic import atomic_write
     from nmpm.data.loading.sources import FolderSource
-    from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration, survey
+    from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration
     from nmpm.evaluation.pace import measure_machine
 
     if not path.exists():
         raise ConfigError(f"{path}: there is no such file or folder.")
-    source = CompletedSource.of(FolderSource(path, options))
-    scene, facts = source.data.scene, survey(source.data)
+    source, facts = CompletedSource.of(FolderSource(path, options)).look()
+    scene = source.data.scene
     choice = Choice.of(scene, facts, measure_machine(scene.dim, minutes))
     text = render_configuration(str(path), source, choice, root)
     with atomic_write(out) as part:

@@ -134,17 +134,19 @@ def recommended_cells(grids: Sequence[GridFacts], particles: int, machine: Machi
         enough = grid.cells >= LEAST_CELLS[dim] and grid.high_speed <= MOST_SPEED
         return enough and cost.fits and cost.steps >= LEAST_STEPS
 
-    fitting = [grid for grid in grids if suits(grid)] or [min(grids, key=lambda grid: grid.cells)]
+    coarsest = [grid for grid in grids if grid.cells >= LEAST_CELLS[dim]] or list(grids)
+    fitting = [grid for grid in grids if suits(grid)] or [min(coarsest, key=lambda grid: grid.cells)]
     return min(fitting, key=lambda grid: abs(math.log(max(grid.per_cell, 1.0) / target))).cells
 
 
 def candidates(domain: Sequence[Interval], spacing: float) -> tuple[int, ...]:
     """Cells along the longest side worth a look, ascending: from 8 to 1.25 spacings of particles to a cell."""
-    longest, dim = max(high - low for low, high in domain), len(domain)
-    low = min(max(longest / (_COARSEST * spacing), LEAST_CELLS[dim] / 2), MOST_CELLS / 2)
+    sides, dim = [high - low for low, high in domain], len(domain)
+    longest, least = max(sides), MULTIPLE * max(sides) / min(sides)  # else cells of the shortest axis are narrower
+    low = min(max(longest / (_COARSEST * spacing), LEAST_CELLS[dim] / 2, least), MOST_CELLS / 2)
     high = min(max(longest / (_FINEST * spacing), 2 * low, 2 * LEAST_CELLS[dim]), MOST_CELLS)
     steps = [low * (high / low) ** (index / (_CANDIDATES - 1)) for index in range(_CANDIDATES)]
-    return tuple(dict.fromkeys(max(MULTIPLE, round(cells / MULTIPLE) * MULTIPLE) for cells in steps))
+    return tuple(dict.fromkeys(math.ceil(cells / MULTIPLE - 0.5) * MULTIPLE for cells in steps))
 
 
 def grid_shape(domain: Sequence[Interval], periodic: Sequence[bool], cells: int) -> tuple[int, ...]:

@@ -30,7 +30,7 @@ def test_slow_machines_and_fast_particles_get_coarser_grids():
     assert recommended_cells(facts(GOOP), 2000, Machine()) == 40
     assert recommended_cells(facts(GOOP), 2000, Machine(slowness=1.1)) == 32  # 2000 steps
     assert recommended_cells(facts(GOOP, speed=0.07), 2000, Machine()) == 32  # 2.5 cells a frame
-    assert recommended_cells(facts(GOOP), 2000, Machine(memory=1e6)) == 24  # none fits: the coarsest
+    assert recommended_cells(facts(GOOP), 2000, Machine(memory=1e6)) == 32  # none fits: the coarsest
 
 
 def test_memory_bounds_grids_in_three_dimensions():

@@ -5,7 +5,7 @@ import yaml
 from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.data.grid_rule import Machine
 from nmpm.data.loading.sources import FolderSource
-from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration, survey
+from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration
 from nmpm.errors import DataError
 from tests.made_up import made_up_metadata
 
@@ -25,6 +25,7 @@ def falling(frames=60, lift=0.0, noise=0.0, shift=0.0, dim=2):
 
 
 def written(folder, *runs, splits=("train", "valid", "test"), **changes):
+    folder.mkdir(exist_ok=True)
     for name in splits:
         write_split(folder / f"{name}.h5", runs)
     known = {"particle_volume": 0.01 ** runs[0].position.shape[2], "sequence_length": len(runs[0].position) - 1}
@@ -33,8 +34,8 @@ def written(folder, *runs, splits=("train", "valid", "test"), **changes):
 
 
 def configured(folder, minutes=15):
-    source = CompletedSource.of(FolderSource(folder))
-    choice = Choice.of(source.data.scene, survey(source.data), Machine(minutes=minutes))
+    source, facts = CompletedSource.of(FolderSource(folder)).look()
+    choice = Choice.of(source.data.scene, facts, Machine(minutes=minutes))
     text = render_configuration(str(folder), source, choice, "runs/here")
     return yaml.safe_load(text), text
 
@@ -65,9 +66,11 @@ def test_energy_is_not_limited_where_it_comes_in(tmp_path, run, changes, reason)
     assert f"# energy: not limited, as {reason}" in text
 
 
-def test_noise_is_measured_and_advised_on(tmp_path):
-    _, text = written(tmp_path, falling(noise=0.002))
-    assert "Positions are noisy: 0.002, 20% of the particles' distance" in text
+def test_noisy_positions_are_smoothed(tmp_path, monkeypatch):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    config, text = written(tmp_path / "data", falling(noise=0.002))
+    assert config["data"]["smooth"] == 7
+    assert "positions have a noise of 0.002," in text
 
 
 def test_short_trajectories_are_unrolled_over_fewer_bundles(tmp_path):

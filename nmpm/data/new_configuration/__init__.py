@@ -3,5 +3,4 @@
 from nmpm.data.new_configuration.choice import OPTIONS as OPTIONS
 from nmpm.data.new_configuration.choice import Choice as Choice
 from nmpm.data.new_configuration.choice import CompletedSource as CompletedSource
-from nmpm.data.new_configuration.survey import survey as survey
 from nmpm.data.new_configuration.text import render_configuration as render_configuration

@@ -10,12 +10,14 @@ from nmpm.data.grid_rule import GridCost, GridFacts, Machine, TrainingSize, grid
 from nmpm.data.inspection.reading import open_dataset
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import FAMILIES
-from nmpm.data.new_configuration.survey import Survey
+from nmpm.data.new_configuration.survey import Survey, survey
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
-OPTIONS = ("family", "gravity", "boundary", "bounds", "fields")
+OPTIONS = ("family", "gravity", "boundary", "bounds", "fields", "resample", "smooth")
 """Facts that a configuration can state in its section data."""
+SMOOTH = 7
+"""Frames of the local fits that replace noisy positions."""
 FRAMES = 8
 MOST_GAIN = 0.05
 """Energy, of the initial one, that may be gained by rounding and elasticity where nothing feeds the scene."""
@@ -51,6 +53,18 @@ class CompletedSource:
                 opened = FolderSource(opened.path, replace(opened.options, gravity=gravity.value))
                 hows["gravity"] = str(gravity)
         return cls(opened, hows)
+
+    def look(self) -> tuple[CompletedSource, Survey]:
+        """The dataset, smoothed along time where its positions are noisy, and facts about its trajectories."""
+        facts = survey(self.data)
+        if not facts.noise or self.data.options.smooth is not None:
+            return self, facts
+        how = (
+            f"positions have a noise of {facts.noise:.2g}, {facts.noise_share:.0%} of a step: local fits replace them"
+            " (for errors, too)"
+        )
+        smoothed = FolderSource(self.data.path, replace(self.data.options, smooth=SMOOTH))
+        return CompletedSource(smoothed, self.hows | {"smooth": how}), survey(smoothed)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from nmpm.scene import Scene
 
 TRAJECTORIES = 8
 _WHITE = -0.6  # correlation of successive accelerations of noise: -2/3
-_NOISE = 0.005  # of the spacing: less is rounding
+_ROUNDING = 1e-3  # of the spacing: less noise is that of float32
+_NOISY = 0.1  # of a typical step
 _STATIONARY = 1.5  # ratio of mean speeds early and late
 _LATE = 0.9  # of a trajectory
 _FULL = 0.995  # of the occupied cells that are not fuller than the density cap
@@ -40,6 +41,7 @@ class Survey:
     late_speed: float = 0.0  # median over the last tenth
     mean_late_speed: float = 0.0
     noise: float = 0.0  # standard deviation of positions, where they are noisy
+    noise_share: float = 0.0  # of a typical step
     grids: tuple[GridFacts, ...] = ()
     late: list[np.ndarray] = field(default_factory=list)  # positions (N, D) in last frames
 
@@ -102,7 +104,9 @@ def _add(facts: Survey, trajectory: Trajectory, metadata: Metadata, scene: Scene
         ("late_speed", np.nanmedian(speed[-tenth:])),
     ):
         setattr(facts, name, (1 - share) * getattr(facts, name) + share * float(value))
-    facts.noise = max(facts.noise, _noise(step, scene.particle_spacing))
+    noise = _noise(step)
+    if noise > max(_NOISY * float(np.nanmedian(speed)), _ROUNDING * scene.particle_spacing):
+        facts.noise, facts.noise_share = noise, noise / float(np.nanmedian(speed))
     gain = None if facts.comings else energy_gain(position, step, scene)
     facts.gain = gain if facts.looked_at == 1 or facts.gain is None or gain is None else max(facts.gain, gain)
 
@@ -123,7 +127,7 @@ def energy_gain(position: np.ndarray, step: np.ndarray, scene: Scene) -> float |
     return float((energy.max() - energy[0]) / initial) if initial > 0 else math.inf
 
 
-def _noise(step: np.ndarray, spacing: float) -> float:
+def _noise(step: np.ndarray) -> float:
     """Standard deviation of white noise on positions, from steps (T, N, D); 0 where accelerations are not noise.
 
     Second differences of white noise of variance s² have the variance 6 s², successive ones a correlation of -2/3.
@@ -138,7 +142,7 @@ def _noise(step: np.ndarray, spacing: float) -> float:
         return 0.0
     correlation = np.nanmean(product[:, seen], axis=0)[power > 0] / power[power > 0]
     deviation = math.sqrt(float(np.median(power)) / (6 * step.shape[2]))
-    return deviation if np.median(correlation) < _WHITE and deviation > _NOISE * spacing else 0.0
+    return deviation if np.median(correlation) < _WHITE else 0.0
 
 
 def _linear_counts(cells: np.ndarray, shape: Sequence[int]) -> np.ndarray:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -25,6 +24,8 @@ _CROWDED = 1.8  # volume fraction of late cells from which a density cap is wort
 _OFF_CENTRE = 0.25  # cells by which walls may lie off their mirror image
 _BUFFER_BYTES = 1e9
 _WIDTH = 118
+
+_TRIVIAL = {"particle_types", "sequence_length"}  # of which the title and the data say as much
 
 Entry = tuple[str, str]
 """A value as YAML, and a comment."""
@@ -49,7 +50,6 @@ def render_configuration(path: str, source: CompletedSource, choice: Choice, roo
     )
     return environment.get_template("configuration.yaml").render(
         title=_title(path, choice),
-        minutes=f"{machine.minutes:.3g}",
         root=_scalar(root),
         steps=steps,
         pace=f"{choice.cost.seconds:.2g} s a step on this machine; more than fit, so that a faster one uses its time",
@@ -73,11 +73,15 @@ def render_configuration(path: str, source: CompletedSource, choice: Choice, roo
     )
 
 
-def _title(path: str, choice: Choice) -> str:
+def _title(path: str, choice: Choice) -> list[str]:
     scene, survey = choice.scene, choice.survey
     counts = ", ".join(f"{number} {name}" for name, number in survey.counts.items())
-    particles = f"up to {survey.particles} particles of {', '.join(scene.materials)}"
-    return f"{path}: {counts} trajectories in {scene.dim}-D, {particles}."
+    materials = "" if scene.materials == ("particles",) else f" of {', '.join(scene.materials)}"
+    return _wrapped(
+        f"{path}: trajectories in {scene.dim}-D, {counts}, of up to {survey.particles} particles{materials}. Written by"
+        f" nmpm init for a training of {choice.machine.minutes:.3g} minutes. Each key is explained in tutorial.yaml"
+        " (nmpm --help)."
+    )
 
 
 def _cells(choice: Choice) -> str:
@@ -130,7 +134,7 @@ def _facts(source: CompletedSource) -> dict[str, Entry]:
     """Options of the datamodule, by which the user, or what was found, completes the metadata."""
     given = {name: getattr(source.data.options, name) for name in OPTIONS}
     return {
-        name: (json.dumps(value), "; ".join(_wrapped(source.hows.get(name, "as given")))[:_WIDTH])
+        name: (json.dumps(value), source.hows.get(name, "as given"))
         for name, value in given.items()
         if value is not None
     }
@@ -140,21 +144,12 @@ def _remarks(source: CompletedSource, choice: Choice) -> Iterator[str]:
     """Facts and how they were found, then advice."""
     scene, metadata = choice.scene, source.data.metadata
     yield f"dt {metadata.dt:g}; gravity {_gravity(scene)}; bounds {_box(scene.bounds)}, {', '.join(scene.boundary)}"
-    for name, how in _found(metadata.extra).items():
-        yield f"{name}: {how}"
+    stated = metadata.extra.get(FOUND)
+    for name, how in stated.items() if isinstance(stated, dict) else ():
+        if name not in _TRIVIAL and (not name.endswith("_types") or getattr(metadata, name, None)):
+            yield f"{name}: {how}"
     if not scene.gravity_known:
-        yield "Without a known gravity none is added to what the network predicts; give it by gravity: [0.0, -9.81]."
-    if choice.survey.noise:
-        share = choice.survey.noise / scene.particle_spacing
-        yield (
-            f"Positions are noisy: {choice.survey.noise:.2g}, {share:.0%} of the particles' distance. Smooth them along"
-            " time: velocities are differences of frames."
-        )
-
-
-def _found(extra: Mapping[str, Any]) -> dict[str, str]:
-    stated = extra.get(FOUND)
-    return {str(name): str(how) for name, how in stated.items()} if isinstance(stated, dict) else {}
+        yield "Without a known gravity none is added to what the network predicts; a key gravity here states it."
 
 
 def _gravity(scene: Scene) -> str:
