@@ -22,7 +22,7 @@ from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, ex
 from nmpm._support.messages import one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, split_files
 from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, plain_name
-from nmpm.data.convert.run_arrays import RunArrays, group_runs, is_flat
+from nmpm.data.convert.run_arrays import RunArrays, group_runs
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
@@ -79,20 +79,19 @@ class ArrayFiles(RunFiles):
 
 def array_facts(first: RunArrays) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
     """Metadata from the arrays of a run, names of those that are unknown, and notes on how arrays are read."""
-    run, dt = first.positions(0), first.fact("dt")
+    run = first.positions(0)
     dim = 2 if is_flat(run) else run.shape[2]
-    bounds, stated = first.bounds(), dict[str, Any]()
-    if bounds is not None:
-        stated["bounds"] = bounds[:dim]
-    if names := first.type_names():
-        stated["particle_types"] = names
-    if dt is not None and (dt > 0).all():
-        stated["dt"] = float(dt.reshape(-1)[0])
+    stated = first.stated_facts(dim)
     facts: dict[str, Any] = {"bounds": ((0.0, 1.0),) * dim, "dt": 1.0, "particle_types": {}} | stated
     known = {*stated, *({"gravity"} if "gravity" in first.roles else ())}
     flat = ("z is 0 everywhere: the data are 2-D.",) if dim < run.shape[2] else ()
     metadata = Metadata(dim=dim, sequence_length=UNKNOWN_LENGTH, **facts)
     return metadata, EVERYTHING_UNKNOWN - known, (*first.notes(), *flat)
+
+
+def is_flat(position: np.ndarray) -> bool:
+    """Whether the z of (T, N, 3) positions is 0 wherever a particle is."""
+    return position.shape[-1] == 3 and not np.nan_to_num(position[..., 2]).any()
 
 
 def is_array_folder(path: Path) -> bool:

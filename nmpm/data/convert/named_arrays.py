@@ -34,7 +34,10 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "dt": ("dt", "deltat", "framedt", "timestep", "frameinterval"),
     "gravity": ("gravity", "grav", "g"),
     "bounds": ("bounds", "box", "boundingbox", "bbox", "domain", "limits"),
+    "particle_volume": ("particlevolume",),
     "type_names": ("typenames", "particletypenames", "materialnames", "names"),
+    "static_types": ("statictypes",),
+    "boundary": ("boundary", "boundaries", "boundaryconditions"),
 }  # fmt: skip
 """Names of arrays by what they mean, in lower case without separators; the first that fits is taken."""
 
@@ -139,6 +142,7 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
         "dt": [(), (1,)],
         "gravity": [(dim,), (3,)],
         "bounds": [(dim, 2), (2, dim)],
+        "particle_volume": [(), (1,)],
     }
     by_plain_name = {plain: name for plain, name in _by_plain_name(arrays).items() if name != position}
     roles = {}
@@ -148,10 +152,16 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
         match = next((name for name in names if tuple(arrays[name].shape) in fitting), None)
         if match is not None:
             roles[meaning] = match
-    names = [by_plain_name[usual] for usual in USUAL_NAMES["type_names"] if usual in by_plain_name]
-    texts = [name for name in names if arrays[name].dtype.kind in "SUO" and len(arrays[name].shape) == 1]
-    return roles | ({"type_names": texts[0]} if texts else {})
+    for meaning, kinds in _LISTS.items():
+        names = [by_plain_name[usual] for usual in USUAL_NAMES[meaning] if usual in by_plain_name]
+        lists = [name for name in names if arrays[name].dtype.kind in kinds and len(arrays[name].shape) == 1]
+        if lists:
+            roles[meaning] = lists[0]
+    return roles
 
+
+_LISTS = {"type_names": "SUO", "static_types": "iu", "boundary": "SUO"}
+"""Kinds of the numbers or texts of facts that are lists of any length."""
 
 _AXIS_NAMES: Mapping[str, tuple[str, ...]] = {
     "position": (r"{axis}", r"pos{axis}", r"position{axis}", r"p{axis}"),

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from nmpm.data.convert.named_arrays import (
 from nmpm.data.convert.run_files import cut
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
-from nmpm.scene import Interval
+from nmpm.scene import Boundary, Interval
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,20 @@ class RunArrays:
         """The array of a meaning in a run; None where there is none."""
         name = self.roles.get(meaning)
         return None if name is None else self._take(name, run)
+
+    def stated_facts(self, dim: int) -> dict[str, Any]:
+        """Fields of `Metadata` that arrays state, for data of so many axes."""
+        facts: dict[str, Any] = {"particle_types": self.type_names(), "bounds": (self.bounds() or ())[:dim]}
+        for name in ("dt", "particle_volume"):
+            value = self.fact(name)
+            if value is not None and np.isfinite(value).all() and (value > 0).all():
+                facts[name] = float(value.reshape(-1)[0])
+        boundary, static = self.fact("boundary"), self.fact("static_types")
+        if boundary is not None and set(as_text(boundary)) <= set(get_args(Boundary)):
+            facts["boundary"] = tuple(as_text(boundary).tolist()[:dim])
+        if static is not None and facts["particle_types"]:
+            facts["static_types"] = frozenset(static.tolist())
+        return {name: value for name, value in facts.items() if value or name == "static_types"}
 
     def type_names(self) -> dict[int, str]:
         """Names of type ids, where types are stored as names or names beside them; else empty."""
@@ -243,11 +257,6 @@ def _drop_axes(position: np.ndarray, dim: int, where: str) -> np.ndarray:
     if position[..., dim:].any():
         raise DataError(f"{where}: z is 0 in the first run, but not here. Give all runs the same number of axes.")
     return position[..., :dim]
-
-
-def is_flat(position: np.ndarray) -> bool:
-    """Whether the z of (T, N, 3) positions is 0 wherever a particle is."""
-    return position.shape[-1] == 3 and not np.nan_to_num(position[..., 2]).any()
 
 
 _RUN_WORDS = frozenset(

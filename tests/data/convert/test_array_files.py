@@ -165,6 +165,23 @@ def test_components_and_names_of_types_are_joined(tmp_path):
     assert [types[i] for i in run.particle_type.tolist()] == names.tolist()
 
 
+def test_facts_beside_the_arrays_are_taken(tmp_path):
+    facts = {
+        "bounds": ((0.0, 1.0), (0.0, 2.0)),
+        "boundary": ("periodic", "wall"),
+        "particle_volume": 1e-3,
+        "dt": 0.1,
+        "static_types": frozenset({1}),
+    }
+    stored = {name: np.array(sorted(value) if name == "static_types" else value) for name, value in facts.items()}
+    types, names = np.arange(PARTICLES) % 2, np.array(["water", "lid"])
+    np.savez(tmp_path / "a.npz", position=made(), particle_type=types, type_names=names, **stored)
+    dataset = open_dataset(tmp_path / "a.npz")
+    assert {name: getattr(dataset.metadata, name) for name in facts} == facts
+    assert dataset.metadata.particle_types == {0: "water", 1: "lid"}
+    assert dataset.unknown == {"gravity", "sequence_length"}
+
+
 def test_swapped_axes_are_refused_with_the_mend(tmp_path):
     position, types = made(frames=30, particles=20).swapaxes(0, 1), np.zeros(20, int)
     np.savez(tmp_path / "swapped.npz", position=position, types=types)
