@@ -37,8 +37,8 @@ class Sample:
     time: np.ndarray | None  # (F,) in the file's unit
     velocity: np.ndarray | None  # (F, P, D) in length per unit of time, where the file has velocities
     whole: bool  # whether the frames reach to the trajectory's end
-    first: Snapshot
-    last: Snapshot
+    first: Snapshot  # of the first frame, or the first of those with most particles
+    last: Snapshot  # of the last frame with at least half as many
 
     def of(self, types: frozenset[int]) -> np.ndarray:
         """Positions (F, P', D) float64 of the particles of some types."""
@@ -62,6 +62,8 @@ def take_sample(trajectory: Trajectory) -> Sample:
     count = min(particles, max(_PARTICLES, _BYTES // (row * frames)))
     index = _spread(types, count)
     length = min(frames, max(2, _BYTES // (row * len(index))))
+    present = np.isfinite(position[..., 0]).sum(axis=1)
+    fullest, last = int(present.argmax()), int(np.flatnonzero(2 * present >= present.max())[-1])
     fields = trajectory.fields
     time, velocity = fields.get("time"), fields.get("velocity")
     return Sample(
@@ -70,8 +72,8 @@ def take_sample(trajectory: Trajectory) -> Sample:
         time=None if time is None or np.shape(time) != (frames,) else np.asarray(time, np.float64)[:length],
         velocity=None if velocity is None or velocity.shape != position.shape else velocity[:length, index],
         whole=length == frames,
-        first=_snapshot(position, types, range(frames)),
-        last=_snapshot(position, types, range(frames - 1, -1, -1)),
+        first=_snapshot(position[fullest], types),
+        last=_snapshot(position[last], types),
     )
 
 
@@ -86,13 +88,10 @@ def _spread(types: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate(kept))
 
 
-def _snapshot(position: np.ndarray, types: np.ndarray, frames: range) -> Snapshot:
-    """The first of some frames in which at least one particle is; of a type with many particles those in a slab."""
-    for frame in frames:
-        present = np.isfinite(position[frame]).all(axis=1)
-        if present.any():
-            break
-    points, kinds = position[frame, present].astype(np.float64), types[present]
+def _snapshot(frame: np.ndarray, types: np.ndarray) -> Snapshot:
+    """The particles of a frame (N, D) that are there; of a type with many, those in a slab."""
+    present = np.isfinite(frame).all(axis=1)
+    points, kinds = frame[present].astype(np.float64), types[present]
     kept = np.concatenate([_slab(points, np.flatnonzero(kinds == kind)) for kind in np.unique(kinds)])
     return Snapshot(points[kept], kinds[kept])
 
