@@ -52,6 +52,12 @@ def test_a_fall_that_ends_on_the_floor_keeps_its_energy_and_comes_to_rest(tmp_pa
     assert max(map(len, text.splitlines()[2:])) <= 120
 
 
+def test_gravity_that_nobody_states_is_measured_in_the_units_of_the_metadata(tmp_path):
+    config, text = written(tmp_path, falling(frames=40), gravity=None)
+    assert config["data"]["gravity"] == pytest.approx([0.0, -9.81], rel=1e-2)
+    assert "free flight" in text
+
+
 @pytest.mark.parametrize(
     ("run", "changes", "reason"),
     [

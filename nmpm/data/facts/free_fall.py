@@ -65,12 +65,12 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
         return _differing(clear, number, dt)
     means = [flight.mean for flight in flights]
     if len(means) >= 3 and len(_agreeing(means, _MEAN_AGREE)) == len(means):
-        how = f"the mean acceleration of all particles in first frames, in {len(means)} of {number} trajectories"
+        how = f"mean acceleration of all particles in first frames of {len(means)} of {number} trajectories"
         return _gravity(means, dt, how, "likely")
     later = [flight for flight in (_later_flight(track, spacing) for track in tracks) if flight is not None]
     alike = _agreeing([flight.acceleration for flight in later], AGREE)
     if len(alike) >= 2:
-        how = f"particles in flight at any time, in {len(alike)} of {number} trajectories"
+        how = f"particles in flight at any time in {len(alike)} of {number} trajectories"
         return _gravity([later[index].acceleration for index in alike], dt, how, "likely")
     if closed and (momentum := _from_momentum(tracks, dt)):
         return momentum
@@ -121,10 +121,8 @@ def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[tup
     vectors = [flight.acceleration for flight in flights]
     share = float(np.median([flight.share for flight in flights]))
     means = sum(_same(flight.mean, flight.acceleration, AGREE) for flight in flights)
-    how = (
-        f"free flight of {share:.0%} of the particles in first frames, in {len(flights)} of {number} trajectories; the"
-        f" mean acceleration of all particles agrees in {means}"
-    )
+    how = f"free flight of {share:.0%} of the particles in first frames of {len(flights)} of {number} trajectories"
+    how = f"{how}, the mean acceleration of all in {means}"
     return _gravity(vectors, dt, how, "measured" if len(flights) > 1 or means else "likely")
 
 
@@ -137,7 +135,7 @@ def _gravity(vectors: Sequence[np.ndarray], dt: float, how: str, sure: Sure) -> 
     value = tuple(
         round(float(part) / dt**2, digits) + 0.0 if abs(part) > max(_EXACT, spread) * size else 0.0 for part in centre
     )
-    return Fact(value, f"{how}; trajectories agree to {max(spread, 1e-3):.1%}.", sure)
+    return Fact(value, f"{how}; they agree to {max(spread, 1e-3):.1%}.", sure)
 
 
 def _no_gravity(flights: Sequence[Flight], number: int, spacing: float, dt: float) -> Fact[tuple[float, ...] | None]:
@@ -171,7 +169,7 @@ def _from_momentum(tracks: Sequence[Track], dt: float) -> Fact[tuple[float, ...]
         how = "all axes are periodic, and the mean acceleration is below 0.1% of single particles'."
         return Fact((0.0,) * len(means[0]), how, "measured")
     if len(means) > 1 and len(_agreeing(means, _MEAN_AGREE)) == len(means):
-        return _gravity(means, dt, "all axes are periodic; the mean acceleration of all particles", "likely")
+        return _gravity(means, dt, "all axes are periodic; mean acceleration of all particles", "likely")
     return None
 
 

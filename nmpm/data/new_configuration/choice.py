@@ -48,7 +48,7 @@ class CompletedSource:
             hows["family"] = f"guessed from the particles' type ids; or one of {', '.join(FAMILIES)}"
         scene = opened.scene
         if not scene.gravity_known and FOUND not in opened.metadata.extra:
-            gravity = find_facts(Split(find_split(folder, "train"))).gravity
+            gravity = find_facts(Split(find_split(folder, "train")), opened.metadata).gravity
             if gravity.value is not None:
                 opened = FolderSource(opened.path, replace(opened.options, gravity=gravity.value))
                 hows["gravity"] = str(gravity)
