@@ -43,6 +43,45 @@ class Frame:
     boundary: tuple[Boundary, ...] | None = None
 
 
+def flat_axes(frames: Sequence[Frame]) -> dict[int, float]:
+    """The axis of three along which all particles have the same coordinate, and that; empty if not just one has."""
+    positions = [frame.position for frame in frames if frame.position.shape[1] == len(AXES)]
+    position = np.concatenate(positions) if positions else np.zeros((0, len(AXES)))
+    position = position[~np.isnan(position).any(axis=1)]
+    flat = np.flatnonzero(np.ptp(position, axis=0) == 0).tolist() if len(position) > 1 else []
+    return {axis: float(position[0, axis]) for axis in flat} if len(flat) == 1 else {}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the first frames tell about all.
+
+    Args:
+        axes: The axes of the files that are kept.
+        constant: Values of the axes that are left out, which are the same for all particles.
+        type_ids: Type ids by the names in the files, where types have names.
+    """
+
+    axes: tuple[int, ...]
+    constant: Mapping[int, float]
+    type_ids: Mapping[str, int]
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], type_ids: Mapping[str, int]) -> Layout:
+        """The layout of frames; an axis in which nothing has an extent is left out."""
+        constant = flat_axes(frames)
+        return cls(
+            tuple(axis for axis in range(frames[0].position.shape[1]) if axis not in constant), constant, type_ids
+        )
+
+    def notes(self) -> tuple[str, ...]:
+        """For the user."""
+        return tuple(
+            f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {' and '.join(AXES[i] for i in self.axes)}."
+            for axis, value in self.constant.items()
+        )
+
+
 def wrap(position: np.ndarray, box: Sequence[Interval] | None, boundary: Sequence[Boundary] | None) -> np.ndarray:
     """(N, D) positions within the box along periodic axes."""
     for axis, kind in enumerate((boundary or ())[: position.shape[1]]):

@@ -35,7 +35,7 @@ from nmpm.data.convert.base import (
     find_split_name,
     number_order,
 )
-from nmpm.data.convert.frame import AXES, Frame, ParticleArrays
+from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes
 from nmpm.data.convert.frame_stack import FrameStack
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide
 from nmpm.data.format import Metadata, Trajectory
@@ -62,34 +62,6 @@ class FrameRun(Run):
     def frame_files(self) -> tuple[Path | None, ...]:
         """The files of the frames to take."""
         return self.files if self.part is None else self.files[self.part.start : self.part.stop]
-
-
-@dataclass(frozen=True)
-class Layout:
-    """What the first frames tell about all: the axes that are kept, and the type ids of names of types."""
-
-    axes: tuple[int, ...]
-    constant: dict[int, float]
-    type_ids: dict[str, int]
-    first: tuple[Frame, ...]
-
-    @classmethod
-    def of(cls, frames: Sequence[Frame], type_ids: dict[str, int]) -> Layout:
-        """The layout of frames; an axis in which nothing has an extent is left out."""
-        dim = frames[0].position.shape[1]
-        position = np.concatenate([frame.position for frame in frames if frame.position.shape[1] == dim])
-        position = position[~np.isnan(position).any(axis=1)]
-        flat = [axis for axis in range(dim) if dim == 3 and len(position) > 1 and np.ptp(position[:, axis]) == 0]
-        constant = {axis: float(position[0, axis]) for axis in flat} if len(flat) == 1 else {}
-        axes = tuple(axis for axis in range(dim) if axis not in constant)
-        return cls(axes, constant, type_ids, tuple(frames))
-
-    def notes(self) -> tuple[str, ...]:
-        """For the user."""
-        return tuple(
-            f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {' and '.join(AXES[i] for i in self.axes)}."
-            for axis, value in self.constant.items()
-        )
 
 
 class FrameFormat(DatasetFormat):
@@ -125,7 +97,7 @@ class FrameFormat(DatasetFormat):
         layout = Layout.of(first, self._type_ids(first, runs))
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
         unknown = EVERYTHING_UNKNOWN - {name for name, value in stated.items() if value is not None}
-        metadata, unknown = apply_family(_metadata(layout), unknown, options)
+        metadata, unknown = apply_family(_metadata(layout, first[0]), unknown, options)
         return ForeignDataset(
             options.apply_to(metadata),
             {split: partial(self._read_all, each, layout) for split, each in splits.items()},
@@ -176,10 +148,14 @@ class FrameFormat(DatasetFormat):
     def _first_frames(self, run: FrameRun) -> list[Frame]:
         """A few frames of a run with particles: the first of a file with many, else those of a few files."""
         files = run.present
-        if len(files) == 1:
-            frames = list(islice(self.frames(files[0]), _FIRST_FRAMES))
-        else:
+        if len(files) > 1:
             frames = [self._only_frame(file, run) for file in (*files[:2], files[-1])]
+        else:
+            frames = []
+            for frame in islice(self.frames(files[0]), _FIRST_FRAMES):
+                frames.append(frame)
+                if len(frames) > 1 and not flat_axes(frames):
+                    break
         inhabited = [frame for frame in frames if len(frame.position)]
         if not inhabited:
             raise DataError(f"{run.file}: there are no particles in its first frames.")
@@ -214,7 +190,7 @@ class FrameFormat(DatasetFormat):
     def _read(self, run: FrameRun, layout: Layout) -> Trajectory:
         many = len(run.files) == 1
         total = (run.frames if run.part is None else len(run.part)) or None
-        stack = FrameStack(layout.axes, layout.constant, layout.type_ids, total)
+        stack = FrameStack(layout, total)
         with progress_bar(f"Reading {run.file.name}", total) as advance:
             for frame, where in self._frames_of_many(run) if many else self._frames_of_files(run):
                 if frame is None:
@@ -295,13 +271,12 @@ def _split_of(file: Path, path: Path) -> str | None:
     return find_split_name(*words[:1])
 
 
-def _metadata(layout: Layout) -> Metadata:
-    """What the first frames state; the rest is unknown."""
-    frame, dim = layout.first[0], len(layout.axes)
+def _metadata(layout: Layout, frame: Frame) -> Metadata:
+    """What the first frame states; the rest is unknown."""
     return Metadata(
         bounds=tuple((0.0, 1.0) if frame.box is None else frame.box[axis] for axis in layout.axes),
         dt=1.0,
-        dim=dim,
+        dim=len(layout.axes),
         sequence_length=UNKNOWN_LENGTH,
         particle_types={index: name for name, index in layout.type_ids.items()},
         boundary=() if frame.boundary is None else tuple(frame.boundary[axis] for axis in layout.axes),

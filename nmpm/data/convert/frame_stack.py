@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.convert.frame import AXES, Frame, ParticleArrays
+from nmpm.data.convert.frame import AXES, Frame, Layout, ParticleArrays
 from nmpm.data.convert.named_arrays import plain_name
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
@@ -26,16 +25,12 @@ class FrameStack:
     Particles are matched by their ids, where the frames have ids: those that a frame lacks are absent in it (NaN).
 
     Args:
-        axes: The axes of the files that are kept.
-        constant: Values of the axes that are left out, which are the same for all particles.
-        type_ids: Type ids by the names in the files, where types are names.
+        layout: Of the frames.
         frames: Number of frames, None where it is unknown.
     """
 
-    def __init__(
-        self, axes: Sequence[int], constant: Mapping[int, float], type_ids: Mapping[str, int], frames: int | None = None
-    ) -> None:
-        self._axes, self._constant, self._type_ids = list(axes), constant, type_ids
+    def __init__(self, layout: Layout, frames: int | None = None) -> None:
+        self._axes, self._constant, self._type_ids = list(layout.axes), layout.constant, layout.type_ids
         self._frames, self._count = frames or _FRAMES, 0
         self._values: dict[str, np.ndarray] = {}  # (frames, particles, …), with room for more
         self._particles = self._room = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -79,7 +80,8 @@ def open_lines(path: Path, kind: str) -> Iterator[Lines]:
     try:
         packed = path.suffix.lower() == ".gz"
         size = path.stat().st_size
-        with gzip.open(path) if packed else path.open("rb") as file:
+        # The buffer reads lines several times faster than GzipFile.
+        with io.BufferedReader(gzip.GzipFile(path), _LINE_BYTES) if packed else path.open("rb") as file:
             yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
     except NmpmError:
         raise
