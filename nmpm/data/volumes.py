@@ -48,10 +48,10 @@ def volumes(split: Split, index: int, metadata: Metadata) -> np.ndarray | None:
 
 
 def _constant(stored: Any) -> np.ndarray | None:
-    """(N,) values in time, NaN where a particle has none; None if they are no numbers or change in time."""
+    """(N,) values, NaN where a particle has none or none that is positive; None if they are no numbers or change in time."""
     if stored.dtype.kind not in "iuf":
         return None
     values = np.atleast_2d(np.asarray(stored[()], dtype=np.float64))
     low, high = np.fmin.reduce(values, axis=0), np.fmax.reduce(values, axis=0)
     changes = high - low > _CONSTANT * np.abs(high)
-    return None if changes.any() else low
+    return None if changes.any() else np.where(low > 0, low, np.nan)
