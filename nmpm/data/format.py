@@ -44,6 +44,9 @@ TRUTH = "truth"
 """Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
 VTKHDF = "VTKHDF"
 """Group by which ParaView reads a file, see `nmpm.data.write.vtkhdf`; it is not a trajectory."""
+TRACK = "track"
+"""Dataset of numbers (T, N) that tell particles apart that share a column, one after the other with gaps between; -1
+where there is none."""
 _CHUNK_BYTES = 2**20
 _LAYOUT = "expected a group per trajectory with `position` (T, N, D) and `particle_type` (N,)"
 
@@ -179,13 +182,21 @@ class Split:
 
     def time(self, index: int) -> np.ndarray | None:
         """The (T,) float64 times of a trajectory's frames, its field `time`; None where it has none."""
-        entry = self._entries[index]
+        time = self._numbers(index, "time", (self.frames(index),), "iuf")
+        return None if time is None else time.astype(np.float64)
+
+    def tracks(self, index: int) -> np.ndarray | None:
+        """The (T, N) numbers of the particles in each column, its field `track`; None where each holds one alone."""
+        return self._numbers(index, TRACK, (self.frames(index), self.particles(index)), "iu")
+
+    def _numbers(self, index: int, name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray | None:
+        """A field of a trajectory, or None if it has none of that name, shape and kinds of numbers."""
         with open_hdf5(self.path) as file:
-            time = file[entry.name].get("time")
-            if not isinstance(time, h5py.Dataset) or time.shape != (entry.frames,) or time.dtype.kind not in "iuf":
+            stored = file[self._entries[index].name].get(name)
+            if not isinstance(stored, h5py.Dataset) or stored.shape != shape or stored.dtype.kind not in kinds:
                 return None
-            check_stored_size(time, f"{self.where(index)}: time")
-            return np.asarray(time[()], dtype=np.float64)
+            check_stored_size(stored, f"{self.where(index)}: {name}")
+            return np.asarray(stored[()])
 
     def attributes(self, index: int) -> dict[str, Any]:
         """The attributes of a trajectory."""

@@ -48,7 +48,7 @@ def volumes(split: Split, index: int, metadata: Metadata) -> np.ndarray | None:
 
 
 def _constant(stored: Any) -> np.ndarray | None:
-    """(N,) values, NaN where a particle has none or none that is positive; None if they are no numbers or change in time."""
+    """(N,) values, NaN where one is not positive; None if they are no numbers or change in time."""
     if stored.dtype.kind not in "iuf":
         return None
     values = np.atleast_2d(np.asarray(stored[()], dtype=np.float64))

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from nmpm.data.convert.tables import one_cell
-from nmpm.data.format import Trajectory
+from nmpm.data.format import TRACK, Trajectory
 from nmpm.errors import DataError
 
 _JITTER = 0.1  # of the time between frames
 _GAPS = 4  # frames of a regular grid per frame that is there
 _SPARSE = 4  # entries of (T, ids) arrays per row, beyond which tracks share slots
-TRACK = "track"
-"""Field with the number of the track in each slot and frame, in the order of the ids; -1 where there is none."""
 
 
 @dataclass(frozen=True)

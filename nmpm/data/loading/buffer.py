@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nmpm._support.threads import Task
-from nmpm.data.loading.padded_batch import PaddedRecordings, displacements
+from nmpm.data.loading.padded_batch import PaddedRecordings, displacements, overlap
 from nmpm.data.loading.presence import first_frames
 from nmpm.data.loading.recording import Recording
 from nmpm.data.loading.window_plan import Drawn, WindowPlan
@@ -99,10 +99,9 @@ class _BufferContents:
     def size(self, drawn: Drawn) -> int:
         """Number of particles of a window."""
         trajectory, first = drawn
-        if self.padded.spans is None:
+        if self.padded.tracks is None:
             return self.recordings[trajectory].frames.shape[1]
-        begin, end = self.padded.spans[self.rows[trajectory]].T
-        return int(np.count_nonzero((begin < first + self.length) & (end >= first)))
+        return int(np.count_nonzero(overlap(self.padded.tracks[self.rows[trajectory]], first, self.length)))
 
     def gather(self, drawn: Sequence[Drawn], particles: int) -> Window:
         """The windows, padded to a number of particles."""

@@ -10,11 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.data.loading.presence import spans
+from nmpm.data.loading.presence import find_tracks
 from nmpm.data.loading.recording import Recording
 from nmpm.errors import DataError
 from nmpm.particles import Window
 from nmpm.scene import Scene
+
+_NO_TRACK = (-1, 0, 0)
+"""Padding among tracks: no column, and a frame that exists."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class PaddedRecordings:
         material, mask, obstacle, obstacle_mask, gravity, fields, present, obstacle_frames, volume: as in `Window`, with
             S in place of B.
         scene: The recordings' scene.
-        spans: (S, N, 2) first and last frame in which each particle is there; None where all always are.
+        tracks: (S, K, 3) the recordings' tracks, padded with such that are never there; None where all particles
+            always are.
     """
 
     frames: Tensor
@@ -40,7 +44,7 @@ class PaddedRecordings:
     present: Tensor | None = None
     obstacle_frames: Tensor | None = None
     volume: Tensor | None = None
-    spans: np.ndarray | None = None
+    tracks: np.ndarray | None = None
 
     @classmethod
     def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
@@ -77,6 +81,7 @@ class PaddedRecordings:
                 for name, values in original.fields.items()
             },
             present=None if original.present is None or self.present is None else self.present[row, :frames, :count],
+            tracks=original.tracks,
             obstacle_frames=original.obstacle_frames,
             volume=original.volume,
         )
@@ -96,11 +101,11 @@ class PaddedRecordings:
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)
         frame = first[:, None] + torch.arange(length, device=self.frames.device)
-        if particles is not None and self.spans is not None:
-            there = _present_particles(self.spans[rows], starts, length, particles)
-            window = self._gather_some(row, frame, _index_tensor(there, self.frames.device))
+        if self.tracks is None:
+            window = self._gather_columns(row, frame, slice(particles))
         else:
-            window = self._gather_all(row, frame, slice(particles))
+            tracks = _tracks_in_windows(self.tracks[rows], starts, length, particles)
+            window = self._gather_tracks(row, frame, _index_tensor(tracks, self.frames.device))
         unwrap(window.frames, self.scene)
         if self.obstacle_frames is None:
             return window
@@ -108,7 +113,7 @@ class PaddedRecordings:
         unwrap(moved, self.scene)
         return replace(window, obstacle_frames=moved, obstacle=moved[:, 1])
 
-    def _gather_all(self, row: Tensor, frame: Tensor, kept: slice) -> Window:
+    def _gather_columns(self, row: Tensor, frame: Tensor, kept: slice) -> Window:
         """The windows of (B,) rows and (B, T) frames with some particles, the same ones for all rows."""
         return Window(
             frames=self.frames[:, :, kept][row[:, None], frame],
@@ -121,27 +126,30 @@ class PaddedRecordings:
                 name: values[:, :, kept][row] if values.shape[1] == 1 else values[:, :, kept][row[:, None], frame]
                 for name, values in self.fields.items()
             },
-            present=None if self.present is None else self.present[:, :, kept][row[:, None], frame],
             volume=None if self.volume is None else self.volume[:, kept][row],
         )
 
-    def _gather_some(self, row: Tensor, frame: Tensor, particles: Tensor) -> Window:
-        """The windows of (B,) rows and (B, T) frames with (B, N') of their particles; −1 is padding."""
-        real, chosen = particles >= 0, particles.clamp(min=0)
-        scene, moment, each = row[:, None, None], frame[:, :, None], chosen[:, None, :]
+    def _gather_tracks(self, row: Tensor, frame: Tensor, tracks: Tensor) -> Window:
+        """The windows of (B,) rows and (B, T) frames with (B, N', 3) of their tracks; a column of −1 is padding."""
+        column, first, last = tracks.unbind(dim=-1)
+        real, column = column >= 0, column.clamp(min=0)
+        # Before and after its track a particle is where that begins and ends.
+        nearest = torch.minimum(torch.maximum(frame[:, :, None], first[:, None]), last[:, None])
+        scene, each = row[:, None, None], column[:, None]
+        there = real[:, None] & (nearest == frame[:, :, None])
         return Window(
-            frames=self.frames[scene, moment, each],
-            material=self.material[row[:, None], chosen],
+            frames=self.frames[scene, nearest, each],
+            material=self.material[row[:, None], column],
             mask=real,
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
             fields={
-                name: values[scene, moment if values.shape[1] > 1 else 0, each if values.shape[2] > 1 else 0]
+                name: values[scene, nearest if values.shape[1] > 1 else 0, each if values.shape[2] > 1 else 0]
                 for name, values in self.fields.items()
             },
-            present=None if self.present is None else self.present[scene, moment, each] & real[:, None],
-            volume=None if self.volume is None else self.volume[row[:, None], chosen],
+            present=there if self.present is None else there & self.present[scene, nearest, each],
+            volume=None if self.volume is None else self.volume[row[:, None], column],
         )
 
 
@@ -202,29 +210,37 @@ def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
 
 
 def _stack_presence(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """`present` and `spans` of `PaddedRecordings`; nothing where all particles always are there."""
+    """`present` and `tracks` of `PaddedRecordings`; nothing where all particles always are there."""
     if all(recording.present is None for recording in recordings):
         return {}
     parts = [
         torch.ones(recording.frames.shape[:2], dtype=torch.bool) if recording.present is None else recording.present
         for recording in recordings
     ]
-    present = _pad_and_stack([part.unsqueeze(-1) for part in parts], [False])[0].squeeze(-1)
-    padded = np.full((*present.shape[::2], 2), [present.shape[1], -1])
-    for row, part in enumerate(parts):
-        padded[row, : part.shape[1]] = spans(part.numpy())
-    return {"present": present, "spans": padded}
+    tracks = [
+        find_tracks(part.numpy()) if recording.tracks is None else recording.tracks
+        for part, recording in zip(parts, recordings, strict=True)
+    ]
+    padded = np.full((len(tracks), max(map(len, tracks)), 3), _NO_TRACK)
+    for row, own in enumerate(tracks):
+        padded[row, : len(own)] = own
+    return {"present": _pad_and_stack([part.unsqueeze(-1) for part in parts], [False])[0].squeeze(-1), "tracks": padded}
 
 
-def _present_particles(spans: np.ndarray, starts: Sequence[int], length: int, count: int) -> np.ndarray:
-    """(B, count) particles, by their (B, N, 2) spans, that are there at some time in windows, padded with −1."""
-    first = np.asarray(starts)[:, None]
-    there = (spans[..., 0] < first + length) & (spans[..., 1] >= first)
-    particles = np.full((len(there), count), -1)
-    for row, mask in enumerate(there):
-        index = np.flatnonzero(mask)
-        particles[row, : len(index)] = index
-    return particles
+def _tracks_in_windows(tracks: np.ndarray, starts: Sequence[int], length: int, count: int | None) -> np.ndarray:
+    """(B, count, 3) tracks, of (B, K, 3) ones, that overlap windows, padded; all K when the count is None."""
+    if count is None:
+        return tracks
+    result = np.full((len(tracks), count, 3), _NO_TRACK)
+    for row, (own, start) in enumerate(zip(tracks, starts, strict=True)):
+        within = own[overlap(own, start, length)]
+        result[row, : len(within)] = within
+    return result
+
+
+def overlap(tracks: np.ndarray, start: int, length: int) -> np.ndarray:
+    """(K,) whether (K, 3) tracks overlap the window of `length` frames from `start` on."""
+    return np.asarray((tracks[:, 0] >= 0) & (tracks[:, 1] < start + length) & (tracks[:, 2] >= start))
 
 
 def _stack_obstacle_frames(recordings: Sequence[Recording], centre: Sequence[float]) -> Tensor | None:

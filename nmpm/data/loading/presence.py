@@ -43,9 +43,20 @@ class Presence:
         return np.asarray(values[source, np.arange(values.shape[1])])
 
 
-def spans(present: np.ndarray) -> np.ndarray:
-    """(N, 2) first and last frame in which each particle is there, of (T, N) presence."""
-    return np.stack([present.argmax(axis=0), len(present) - 1 - present[::-1].argmax(axis=0)], axis=1)
+def find_tracks(present: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
+    """(K, 3) tracks: the column that holds the particle, and the first and the last frame in which it is there.
+
+    Args:
+        present: (T, N) whether the particle of each column is there in each frame.
+        ids: (T, N) which particle that is, where columns hold several, one after the other; else each holds one.
+    """
+    column, frame = np.nonzero(present.T)
+    other = np.diff(column, prepend=-1) != 0
+    if ids is not None:
+        other |= np.diff(ids[frame, column], prepend=0) != 0
+    begins = np.flatnonzero(other)
+    ends = np.append(begins[1:], len(frame)) - 1
+    return np.stack([column[begins], frame[begins], frame[ends]], axis=1)
 
 
 def first_frames(present: np.ndarray, length: int) -> np.ndarray:

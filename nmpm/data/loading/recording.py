@@ -22,7 +22,7 @@ from nmpm.data.array_checks import check_end
 from nmpm.data.fields import read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory, split_paths
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.loading.presence import Presence
+from nmpm.data.loading.presence import Presence, find_tracks
 from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
 from nmpm.data.times import check_times
 from nmpm.data.volumes import SIZES, mean_volume, volumes
@@ -40,6 +40,7 @@ class Recording:
     gravity: Tensor  # (D,) float32 in length per frame squared, zero where unknown
     fields: Mapping[str, Tensor] = field(default_factory=dict)  # float32 (T, N), (1, N) if constant in time, or (1, 1)
     present: Tensor | None = None  # (T, N) bool; None where all particles always are
+    tracks: np.ndarray | None = None  # (K, 3) where some are absent, see `find_tracks`: a column may hold several
     obstacle_frames: Tensor | None = None  # (T, M, D) float32; None where no obstacle of the scene moves
     volume: Tensor | None = None  # (N,) float32 volumes as multiples of the scene's `particle_volume`; None for 1
 
@@ -51,13 +52,16 @@ class RecordingReader:
     metadata: Metadata
     scene: Scene
 
-    def recording(self, trajectory: Trajectory, where: str, volume: np.ndarray | None = None) -> Recording:
+    def recording(
+        self, trajectory: Trajectory, where: str, volume: np.ndarray | None = None, ids: np.ndarray | None = None
+    ) -> Recording:
         """Converts a trajectory.
 
         Args:
             trajectory: The trajectory, with its fields as `read_fields` gives them.
             where: Names it in errors.
             volume: (N,) volumes of its particles, as multiples of the scene's `particle_volume`; None for 1.
+            ids: (T, N) numbers that tell particles apart that share a column; None where none do.
 
         Raises:
             DataError: if a particle leaves the scene's domain, its material is not in the scene, a static particle
@@ -82,6 +86,7 @@ class RecordingReader:
             gravity=(torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float(),
             fields=dict(self._fields(trajectory.fields, moving, presence, where)),
             present=None if presence is None else torch.from_numpy(presence.present),
+            tracks=None if presence is None else find_tracks(presence.present, None if ids is None else ids[:, moving]),
             obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
             volume=None if volume is None else _positive(volume, moving, where),
         )
@@ -207,7 +212,8 @@ class SplitRecordings(Sequence[Recording]):
         names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
         fields = read_fields(self.split, index, names) if names else {}
         trajectory = replace(self.split.read(index), fields=fields)
-        return self.reader.recording(trajectory, self.split.where(index), self._relative_volumes(index))
+        ids = self.split.tracks(index) if np.isnan(trajectory.position[..., 0]).any() else None
+        return self.reader.recording(trajectory, self.split.where(index), self._relative_volumes(index), ids)
 
     @cached_property
     def _mean_volume(self) -> float | None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.loading.buffer import TrajectoryBuffer
 from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.presence import Presence, first_frames, spans
+from nmpm.data.loading.presence import Presence, find_tracks, first_frames
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
@@ -71,7 +71,7 @@ def test_absent_particles_are_where_they_were_last_or_will_be_first(seed, frames
             before = known[known <= frame]
             source = before[-1] if len(before) else known[0]
             np.testing.assert_array_equal(filled[frame, column], position[source, particle])
-        assert spans(presence.present)[column].tolist() == [known[0], known[-1]]
+        assert find_tracks(presence.present)[column].tolist() == [column, known[0], known[-1]]
 
 
 @given(seed=st.integers(0, 10**6), frames=st.integers(3, 20), length=st.integers(3, 8))
@@ -156,6 +156,32 @@ def test_recordings_without_a_velocity_or_an_end_are_named(folder):
     )
     with pytest.raises(DataError, match="trajectory 00001: no particle is there in two successive frames"):
         recordings[1]
+
+
+def test_particles_that_share_a_column_are_apart_in_windows(tmp_path):
+    whole = made_up_trajectory(20, 6, fields=("heat",))
+    apart, shared = whole.position.copy(), np.full((20, 4, 2), np.nan, np.float32)
+    heat, number = np.zeros((20, 4)), np.full((20, 4), -1)
+    for column, lives in enumerate([[(0, 9, 0), (10, 20, 1)], [(0, 5, 2), (7, 12, 3), (14, 20, 4)], [], [(0, 20, 5)]]):
+        for first, end, particle in lives:
+            shared[first:end, column] = whole.position[first:end, particle]
+            heat[first:end, column] = whole.fields["heat"][first:end, particle]
+            number[first:end, column] = particle
+            apart[:first, particle] = apart[end:, particle] = np.nan
+    shared[3, 3] = apart[3, 5] = np.nan  # a gap in a track
+    write_metadata(tmp_path, made_up_metadata(fields=("heat",)))
+    windows = []
+    for position, fields in ((apart, whole.fields), (shared, {"heat": heat, "track": number})):
+        stored = Trajectory(position, np.full(position.shape[1], 7), {}, fields)
+        write_split(tmp_path / "train.h5", [stored])
+        recordings = recordings_of(tmp_path)
+        plan = WindowPlan(frames=(20,), length=5, batch_size=8, buffer_size=1, passes=4.0, seed=0)
+        windows += [next(TrajectoryBuffer(recordings, plan).batches()), collate([recordings[0]], recordings.scene)]
+    for one, other in ((windows[0], windows[2]), (windows[1], windows[3])):
+        assert torch.equal(one.frames, other.frames)
+        assert torch.equal(one.present, other.present)
+        assert torch.equal(one.mask, other.mask)
+        assert torch.equal(one.fields["heat"] * one.present, other.fields["heat"] * other.present)
 
 
 def test_fields_of_absent_particles_may_be_unknown(folder):
