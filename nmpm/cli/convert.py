@@ -109,9 +109,9 @@ def _export(arguments: argparse.Namespace, options: Options, ids: dict[int, int]
     from nmpm.data.write import find_writer
 
     writer = find_writer("DESTINATION", arguments.destination)
-    dataset = open_complete(arguments.source, arguments.format, options)
-    dataset = renumber_types(dataset, ids) if ids else dataset
-    exported = export(dataset, arguments.destination, arguments.split, arguments.trajectory)
+    with open_complete(arguments.source, arguments.format, options) as opened:
+        dataset = renumber_types(opened, ids) if ids else opened
+        exported = export(dataset, arguments.destination, arguments.split, arguments.trajectory)
     for note in (*dataset.notes, *exported.notes):
         sys.stdout.write(f"- {note}\n")
     if exported.files == 1:

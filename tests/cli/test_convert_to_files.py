@@ -73,3 +73,14 @@ def test_there_and_back_again(dataset, tmp_path, suffix):
     if suffix in (".h5", ".vtkhdf", ".npz"):
         types = read_metadata(dataset).particle_types
         assert [named[i] for i in split.read(0).particle_type] == [types[i] for i in before.particle_type]
+
+
+def test_a_run_that_a_training_would_cut_stays_whole(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    position = np.random.default_rng(0).random((500, 6, 2), dtype=np.float32)
+    np.save("run.npy", position)
+    assert main(["convert", "run.npy", "run.npz"]) == 0
+    assert "Cut along time" not in capsys.readouterr().out
+    with np.load("run.npz") as arrays:
+        np.testing.assert_array_equal(arrays["position"], position)

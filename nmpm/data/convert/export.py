@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert import native_folder, open_dataset
 from nmpm.data.convert.base import ForeignDataset, Options
+from nmpm.data.convert.conversion import NOTES, write_native
 from nmpm.data.format import Trajectory
 from nmpm.data.write import TrajectoryWriter, find_writer, write_trajectory
 from nmpm.data.write.frames import fields_left_out
@@ -26,12 +29,19 @@ class Exported:
     notes: tuple[str, ...]
 
 
-def open_complete(path: Path, format_name: str | None, options: Options) -> ForeignDataset:
-    """As `open_dataset`; facts that are to be found in the trajectories are found by a conversion in the cache."""
+@contextmanager
+def open_complete(path: Path, format_name: str | None, options: Options) -> Iterator[ForeignDataset]:
+    """As `open_dataset`, with runs whole; facts that are to be found in them are found by converting them first."""
     dataset = open_dataset(path, format_name, options)
-    if dataset.unknown or None in dataset.counts.values():
-        return open_dataset(native_folder(path, options, format_name))
-    return dataset
+    if dataset.whole is not None:
+        with TemporaryDirectory() as temporary:
+            notes = write_native(dataset.whole, Path(temporary) / "whole")
+            yield replace(open_dataset(Path(temporary) / "whole"), notes=notes)
+    elif dataset.unknown or None in dataset.counts.values():
+        native = open_dataset(native_folder(path, options, format_name))
+        yield replace(native, notes=tuple(native.metadata.extra.get(NOTES, ())))
+    else:
+        yield dataset
 
 
 def export(dataset: ForeignDataset, destination: Path, split: str | None, index: int | None) -> Exported:

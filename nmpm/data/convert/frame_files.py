@@ -37,7 +37,7 @@ from nmpm.data.convert.base import (
 )
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes
 from nmpm.data.convert.frame_stack import FrameStack
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide, keep_whole
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError
 
@@ -98,13 +98,14 @@ class FrameFormat(DatasetFormat):
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
         unknown = EVERYTHING_UNKNOWN - {name for name, value in stated.items() if value is not None}
         metadata, unknown = apply_family(_metadata(layout, first[0]), unknown, options)
-        return ForeignDataset(
+        dataset = ForeignDataset(
             options.apply_to(metadata),
             {split: partial(self._read_all, each, layout) for split, each in splits.items()},
             (*layout.notes(), *gaps, *divided, *self.notes(first, options)),
             {split: len(each) for split, each in splits.items()},
             unknown=unknown,
         )
+        return keep_whole(dataset, runs, partial(self._read_all, layout=layout))
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
         """Yields folders with files of this format and these files; of a file its own."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,6 +43,8 @@ class Run:
     split: str | None = None
     part: range | None = None
 
+
+_CUT = "Cut along time: the first 80% of the frames train, then 10% valid, 10% test."
 
 SomeRun = TypeVar("SomeRun", bound=Run)
 
@@ -91,13 +93,14 @@ class RunFiles(DatasetFormat):
         stated, unknown, notes = self.facts(next(iter(files.values()))[0])
         stated, unknown = apply_family(stated, unknown, options)
         metadata = options.apply_to(stated)
-        return ForeignDataset(
+        dataset = ForeignDataset(
             metadata,
             {split: partial(self._read_all, parts, metadata) for split, parts in splits.items()},
             (*notes, *divided),
             {split: len(parts) for split, parts in splits.items()},
             unknown=unknown,
         )
+        return keep_whole(dataset, undivided, partial(self._read_all, metadata=metadata)) if undivided else dataset
 
     def _read_all(self, runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
         for file in dict.fromkeys(run.file for run in runs):
@@ -130,9 +133,19 @@ def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple
         note = f"Nothing divides the {len(runs)} runs: in their order {sizes}. Folders train, valid, test would."
         return {split: [runs[index] for index in part] for split, part in parts.items()}, (note,)
     if all(run.frames >= 10 * LEAST_FRAMES for run in runs):
-        note = "Cut along time: the first 80% of the frames train, then 10% valid, 10% test."
-        return {split: [replace(run, part=time_parts(run.frames)[split]) for run in runs] for split in SPLITS}, (note,)
+        return {split: [replace(run, part=time_parts(run.frames)[split]) for run in runs] for split in SPLITS}, (_CUT,)
     return {"train": runs}, (f"{counted(len(runs), 'run')}, too few to divide: all for training.",)
+
+
+def keep_whole(
+    dataset: ForeignDataset, runs: Sequence[SomeRun], read: Callable[[Sequence[SomeRun]], Iterator[Trajectory]]
+) -> ForeignDataset:
+    """The dataset, with its runs `whole` beside it if `divide` has cut them along time; `read` reads runs."""
+    if _CUT not in dataset.notes:
+        return dataset
+    notes = tuple(note for note in dataset.notes if note != _CUT)
+    whole = replace(dataset, splits={"train": partial(read, runs)}, counts={"train": len(runs)}, notes=notes)
+    return replace(dataset, whole=whole)
 
 
 def time_parts(frames: int) -> dict[str, range]:
