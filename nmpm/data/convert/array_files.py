@@ -20,10 +20,10 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import UNKNOWN_LENGTH, split_files
+from nmpm.data.convert.base import split_files
 from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, plain_name
 from nmpm.data.convert.run_arrays import RunArrays, group_runs
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles, placeholder_metadata
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.errors import DataError, NmpmError
@@ -82,11 +82,9 @@ def array_facts(first: RunArrays) -> tuple[Metadata, frozenset[str], tuple[str, 
     run = first.positions(0)
     dim = 2 if is_flat(run) else run.shape[2]
     stated = first.stated_facts(dim)
-    facts: dict[str, Any] = {"bounds": ((0.0, 1.0),) * dim, "dt": 1.0, "particle_types": {}} | stated
     known = {*stated, *({"gravity"} if "gravity" in first.roles else ())}
     flat = ("z is 0 everywhere: the data are 2-D.",) if dim < run.shape[2] else ()
-    metadata = Metadata(dim=dim, sequence_length=UNKNOWN_LENGTH, **facts)
-    return metadata, EVERYTHING_UNKNOWN - known, (*first.notes(), *flat)
+    return placeholder_metadata(dim, **stated), EVERYTHING_UNKNOWN - known, (*first.notes(), *flat)
 
 
 def is_flat(position: np.ndarray) -> bool:

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from nmpm._support.messages import counted
-from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files, split_runs
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, split_files, split_runs
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.data.metadata import find_family
 from nmpm.errors import DataError
@@ -23,6 +23,12 @@ LEAST_FRAMES = 50
 EVERYTHING_UNKNOWN = frozenset(
     {"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "sequence_length", "particle_types"}
 )
+
+
+def placeholder_metadata(dim: int, **facts: Any) -> Metadata:
+    """Metadata with these facts, and placeholders for all others."""
+    values: dict[str, Any] = {"bounds": ((0.0, 1.0),) * dim, "dt": 1.0, "particle_types": {}}
+    return Metadata(dim=dim, sequence_length=UNKNOWN_LENGTH, **(values | facts))
 
 
 @dataclass(frozen=True)
@@ -61,9 +67,12 @@ class RunFiles(DatasetFormat):
 
     patterns: ClassVar[tuple[str, ...]]
 
-    @abc.abstractmethod
+    def recognises(self, path: Path) -> bool:
+        return bool(self.files(path))
+
     def runs(self, file: Path) -> Sequence[Run]:
-        """The runs in a file, in order; cheap where the format allows it."""
+        """The runs in a file, in order; one where a subclass does not say it."""
+        return [Run(file, 0)]
 
     @abc.abstractmethod
     def frames(self, run: Run) -> int:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from nmpm.data.convert.array_files import array_facts
-from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
+from nmpm.data.convert.base import ForeignDataset, Options
 from nmpm.data.convert.run_arrays import RunArrays, group_runs
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, cut, divide
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, cut, divide, placeholder_metadata
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import DataError
 
@@ -74,8 +74,7 @@ def _facts(first: RunArrays | Trajectory) -> tuple[Metadata, frozenset[str], tup
         return array_facts(first)
     if first.metadata is not None:
         return first.metadata, frozenset(), ()
-    dim = first.position.shape[2]
-    return Metadata(((0.0, 1.0),) * dim, 1.0, dim, UNKNOWN_LENGTH, {}), EVERYTHING_UNKNOWN, ()
+    return placeholder_metadata(first.position.shape[2]), EVERYTHING_UNKNOWN, ()
 
 
 def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:

@@ -17,8 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.messages import counted
-from nmpm.data.convert.base import UNKNOWN_LENGTH
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles, placeholder_metadata
 from nmpm.data.convert.tables import SUFFIXES, Chunk, one_cell, plain_column, read_chunks, read_columns
 from nmpm.data.convert.track_rows import TrackRows, frame_numbers
 from nmpm.data.format import Metadata, Trajectory
@@ -158,13 +157,7 @@ class Tracks(RunFiles):
         dim, z = len(columns.position), columns.position[2:]
         flat = dim == 3 and all((chunk[z[0]] == 0).all() for chunk in read_chunks(file, z))
         names = _type_names(file, columns.types)
-        metadata = Metadata(
-            bounds=((0.0, 1.0),) * (dim - flat),
-            dt=1.0,
-            dim=dim - flat,
-            sequence_length=UNKNOWN_LENGTH,
-            particle_types=dict(enumerate(names)),
-        )
+        metadata = placeholder_metadata(dim - flat, particle_types=dict(enumerate(names)))
         shown = f"{columns.key}, {columns.track}, {', '.join(columns.position)}"
         others = [name for name in columns.names if name not in columns.used]
         fields = f"; as fields, where they are numbers: {', '.join(others)}" if others else ""
