@@ -2,8 +2,8 @@
 
 Between two bundles, particles enter that are recorded in this frame and the one before, at the recorded position and
 with the recorded velocity; those that the recording no longer has leave; obstacles take their place, and the velocity
-that brings them to their place at the next bundle's end. After the recording's last frame nobody enters, and obstacles
-stand still. Frames are counted from the start of the rollout.
+that brings them to their place at the next bundle's end. A particle that was absent is another one afterwards. After
+the recording's last frame nobody enters, and obstacles stand still. Frames are counted from the start of the rollout.
 """
 
 from __future__ import annotations
@@ -71,16 +71,21 @@ class Prescribed(Batched):
         return cls(obstacle=torch.cat([frames[:, :1], frames], dim=1))
 
     def apply(self, state: Particles, frame: int, ahead: int) -> Particles:
-        """The state after so many frames, as the next bundle of `ahead` frames starts from it."""
-        return self._move_obstacles(self._exchange(state, frame), frame, ahead)
+        """The state after so many frames, a whole number of bundles of `ahead` frames, as the next starts from it."""
+        return self._move_obstacles(self._exchange(state, frame, ahead), frame, ahead)
 
-    def _exchange(self, state: Particles, frame: int) -> Particles:
+    def stays(self, state: Particles, frame: int, ahead: int) -> Tensor:
+        """(B, N) bool: the particles of a state after so many frames that were there throughout the last bundle."""
+        if self.present is None or self.is_over(frame):
+            return state.mask
+        return state.mask & self.present[:, max(0, frame + 2 - ahead) : frame + 2].all(1)
+
+    def _exchange(self, state: Particles, frame: int, ahead: int) -> Particles:
         if self.position is None or self.present is None or self.is_over(frame):
             return state
-        there, before = self.present[:, frame + 1], self.present[:, frame]
         position, last = self.position[:, frame + 1], self.position[:, frame]
-        stays = state.mask & there
-        enters = there & before & ~stays
+        stays = self.stays(state, frame, ahead)
+        enters = self.present[:, frame + 1] & self.present[:, frame] & ~stays
         velocity = torch.where(enters.unsqueeze(-1), position - last, 0.0)
         fields = {
             name: torch.where(stays, values, self.fields[name][:, frame + 1])
@@ -150,6 +155,12 @@ class Exchange:
         self.prescribed.check(particles)
         return self.prescribed.apply(particles, 0, self._emulator.frames)
 
+    def stays(self, particles: Particles, frame: int) -> Tensor:
+        """(B, N) bool: the particles of the state after so many frames that go on from where they are."""
+        if self.prescribed is None:
+            return particles.mask
+        return self.prescribed.stays(particles, frame, self._emulator.frames)
+
     def after(self, particles: Particles, frame: int) -> Particles:
         """The state after so many frames, for the next bundle."""
         if self.prescribed is not None:
@@ -190,13 +201,12 @@ def without_escaped(scene: Scene, state: Particles) -> Particles:
 def predicted_particles(present: Tensor, ahead: int) -> Tensor:
     """(B, T - 2, N) bool: which recorded particles (B, T, N) a rollout in bundles of `ahead` frames predicts, and when.
 
-    Those in its state at the bundle's start, see `Prescribed`, that are recorded in the frame.
+    Those in its state at the bundle's start, see `Prescribed`, that are recorded in all frames since.
     """
-    state, parts = present[:, 0] & present[:, 1], []
+    parts = []
     for first in range(2, present.shape[1], ahead):
-        if first > 2:
-            state = present[:, first - 1] & (state | present[:, first - 2])
-        parts.append(state.unsqueeze(1) & present[:, first : first + ahead])
+        start = (present[:, first - 2] & present[:, first - 1]).unsqueeze(1)
+        parts.append((start & present[:, first : first + ahead]).int().cummin(1).values.bool())
     return torch.cat(parts, dim=1) if parts else present[:, 2:]
 
 
@@ -215,8 +225,8 @@ def predict_from_entries(predictor: Predictor, window: Window, ahead: int) -> Te
     if window.present is None or prescribed is None:
         return path
     for first in range(ahead, frames, ahead):
-        before, state = state.mask, prescribed.apply(state, first, ahead)
-        enters = state.mask & ~before
+        stays, state = prescribed.stays(state, first, ahead), prescribed.apply(state, first, ahead)
+        enters = state.mask & ~stays
         if bool(enters.any()):
             later = torch.where(enters[:, None, :, None], predictor(state, frames - first), path[:, first:])
             path = torch.cat([path[:, :first], later], dim=1)

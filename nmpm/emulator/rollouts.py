@@ -55,10 +55,10 @@ def unroll(
             if index == bundles - 1:
                 monitor.read()
         yield travelled.without_absent(particles.mask) if exchange.varies else travelled
-        after = exchange.after(bundle.state_after(particles), (index + 1) * emulator.frames)
+        after, frame = bundle.state_after(particles), (index + 1) * emulator.frames
         if exchange.varies:
-            periods.forget(~(particles.mask & after.mask))
-        after = periods.wrap(after)
+            periods.forget(~exchange.stays(after, frame))
+        after = periods.wrap(exchange.after(after, frame))
         calls.prepare(particles, after)
         particles = after
 

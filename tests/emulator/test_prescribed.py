@@ -67,6 +67,20 @@ def test_particles_enter_at_the_start_of_a_bundle_with_their_recorded_velocity_a
     torch.testing.assert_close(made[0][counted], window.target[0][counted], atol=1e-6, rtol=0)
 
 
+def test_a_particle_that_was_absent_for_a_frame_is_another_one_afterwards():
+    scene = box(gravity=(0.0, 0.0))
+    state = cloud(scene, 2, speed=0.001)
+    window = recording(scene, state, 12)
+    window.present = torch.ones(1, 14, 2, dtype=torch.bool)
+    window.present[0, 3, 1] = False
+    window.frames[0, 4:, 1] = torch.tensor([0.2, 0.2])  # somebody else, far away
+    made = rollout(drifting(scene), window.initial, 12, prescribed=Prescribed.of(window))
+    torch.testing.assert_close(made[0, 4:, 1], window.target[0, 4:, 1], atol=1e-6, rtol=0)
+    assert predicted_particles(window.present, FRAMES)[0, :, 1].tolist() == [True] + [False] * 3 + [True] * 8
+    trivial = predict_from_entries(still, window, FRAMES)
+    torch.testing.assert_close(trivial[0, 4:, 1], window.target[0, 4:, 1])
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 5))
 def test_a_rollout_predicts_those_that_scores_count_whatever_the_presence(seed, frames):
