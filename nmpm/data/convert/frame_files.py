@@ -41,7 +41,7 @@ from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, d
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError
 
-_DEPTH = 4  # of folders
+_DEPTH = 3  # of folders
 _FIRST_FRAMES = 10  # of a file with many, from which the layout is taken
 _MISSING = 0.1  # part of a run's frames that may be missing
 _NUMBER = re.compile(r"\d{1,18}(?!.*\d)")
@@ -265,11 +265,16 @@ def _stem(file: Path) -> str:
 
 
 def _split_of(file: Path, path: Path) -> str | None:
-    """The split that the name of the outermost folder, or of a file in it, begins with."""
-    if file == path:
-        return None
-    words = re.findall(r"[a-z]+", file.relative_to(path).parts[0].lower())
-    return find_split_name(*words[:1])
+    """The split that the name of the outermost folder, or of a file in it, begins with.
+
+    Raises:
+        DataError: if an inner folder is a split.
+    """
+    names = file.relative_to(path).parts
+    splits = [find_split_name(*re.findall(r"[a-z]+", name.lower())[:1]) for name in names]
+    if splits[1:-1].count(None) < len(splits[1:-1]) and splits[0] is None:
+        raise DataError(f"{path}: there are datasets in its folders. Give one of them: {path / names[0]}.")
+    return splits[0] if splits else None
 
 
 def _metadata(layout: Layout, frame: Frame) -> Metadata:

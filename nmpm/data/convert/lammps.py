@@ -74,7 +74,8 @@ class Lammps(FrameFormat):
         steps = [frame.step for frame in frames if frame.step is not None]
         if len(steps) < 2 or options.dt is not None or frames[0].time is not None:
             return ()
-        return (f"Frames are {steps[1] - steps[0]} steps of LAMMPS apart; state the time between them: --dt.",)
+        apart = steps[1] - steps[0]
+        return (f"Frames are {apart} steps of LAMMPS apart; if dt is not the time between them, state it: --dt.",)
 
 
 def _header(lines: Lines) -> _Header | None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nmpm.data.convert import Options, convert, open_dataset
-from nmpm.data.format import Split
+from nmpm.data.convert import convert, open_dataset
+from nmpm.data.format import Split, Trajectory
 from nmpm.errors import DataError
 
 T, N = 12, 6
@@ -37,9 +37,9 @@ def write_frames(path: Path, *frames: str) -> Path:
     return path
 
 
-def read(source: Path, out: Path, split: str = "train", index: int = 0, **options: object):
+def read(source: Path, out: Path, split: str = "train", index: int = 0) -> Trajectory:
     if not out.exists():
-        convert(source, out, options=Options(**options))
+        convert(source, out)
     return Split(out / f"{split}.h5").read_with_fields(index)
 
 
@@ -241,6 +241,12 @@ def test_wrong_files_are_named(tmp_path, damage, message):
     damage(tmp_path / "run")
     with pytest.raises(DataError, match=message):
         convert(tmp_path / "run", tmp_path / "out")
+
+
+def test_a_folder_of_datasets_is_refused(tmp_path):
+    write_run(tmp_path / "all" / "one" / "train" / "run0")
+    with pytest.raises(DataError, match=r"all: there are datasets in its folders. Give one of them: .*one\."):
+        convert(tmp_path / "all", tmp_path / "out")
 
 
 def test_one_frame_is_no_run(tmp_path):
