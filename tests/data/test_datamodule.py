@@ -240,4 +240,4 @@ def test_files_that_do_not_suffice_are_named(make_dataset):
     (folder / "valid.h5").rename(folder / "validation.h5")
     with pytest.raises(DataError, match=r"no valid.h5 there.*Rename validation.h5 to valid.h5"):
         module_of(folder).val_dataloader()
-    assert any("Rename validation.h5" in finding for finding in inspect(FolderSource(folder)).findings)
+    assert any("Rename validation.h5" in finding.sentence for finding in inspect(FolderSource(folder)).findings)

@@ -178,7 +178,7 @@ class _Counts:
         for name, split in splits.items():
             for index in range(len(split)):
                 types = split.particle_type(index)
-                moving, static = int(metadata.is_moving(types).sum()), int(metadata.is_static(types).sum())
+                moving, static = int(metadata.is_moving(types).sum()), int(metadata.is_obstacle(types).sum())
                 self.sizes[name].append((split.frames(index), moving, static))
                 for number, count in zip(*np.unique(types, return_counts=True), strict=True):
                     self.materials.setdefault(metadata.particle_types[int(number)], []).append(int(count))
