@@ -51,7 +51,7 @@ def write_viewable(path: Path, trajectories: Iterable[Trajectory], dt: float) ->
 def add_vtkhdf(file: Any, dt: float) -> None:
     """Adds what VTK needs to show the trajectories of an open HDF5 file, the first `MOST_TRAJECTORIES` of them.
 
-    One trajectory alone becomes VTK's poly data; several, or one with its truth, become a collection with a block for
+    One trajectory alone becomes VTK's poly data; several, or one with its truth, become a data set with a block for
     each. A block that is shorter than others stays at its last frame.
 
     Args:
@@ -67,7 +67,7 @@ def add_vtkhdf(file: Any, dt: float) -> None:
         _set_type(root, "PolyData", _POLY_DATA_VERSION)
         _write_block(root, blocks[0], times)
         return
-    _set_type(root, "PartitionedDataSetCollection", _COLLECTION_VERSION)
+    _set_type(root, "MultiBlockDataSet", _COLLECTION_VERSION)
     assembly = _ordered_group(root, "Assembly")
     for index, block in enumerate(blocks):
         group = root.create_group(block.name)

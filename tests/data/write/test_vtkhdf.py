@@ -61,7 +61,7 @@ def test_several_trajectories_and_truths_are_blocks(tmp_path):
     names = [steps[0].GetMetaData(i).Get(steps[0].NAME()) for i in range(3)]
     assert names == ["trajectory_00000", "truth_00000", "trajectory_00001"]
     for frame, step in enumerate(read(tmp_path / "out.h5")):
-        points = [arrays(step[1].GetPartition(block, 0))[0][:, :2] for block in range(3)]
+        points = [arrays(step[1].GetBlock(block))[0][:, :2] for block in range(3)]
         np.testing.assert_array_equal(points[0], one.position[frame])
         np.testing.assert_array_equal(points[1], one.fields["truth"][min(frame, 2)])
         np.testing.assert_array_equal(points[2], other.position[min(frame, 3)])
