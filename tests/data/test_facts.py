@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from nmpm.data.convert import ForeignDataset
+from nmpm.data.convert import ForeignDataset, Options, convert
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.facts import FactFinder, Facts, find_facts
+from nmpm.data.facts.domain import domain_fact
 from nmpm.data.facts.periodic import roundest
 from nmpm.data.format import Metadata, Split, Trajectory, read_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
@@ -141,6 +142,26 @@ class TestBounds:
         assert facts_of(path).boundary.value == ("open",) * 3
 
 
+class TestDomain:
+    @pytest.mark.parametrize("bounds", [((0, 10), (0, 10)), ((0, 20), (-0.5, 1)), ((0, 1), (0, 2), (0, 3))])
+    def test_has_a_cell_of_wall_and_whole_cells(self, bounds):
+        fact = domain_fact(bounds, ("wall",) * len(bounds), None, spacing=0.1)
+        sides = np.diff(fact.value).ravel()
+        cells = next(count for count in range(8, 513, 8) if f"about {count} cells" in fact.how)
+        cell = sides.max() / cells
+        assert sides / cell == pytest.approx(np.round(sides / cell), abs=0.01)
+        for (low, high), (outer_low, outer_high) in zip(bounds, fact.value, strict=True):
+            assert 0.99 * cell < low - outer_low < 1.52 * cell
+            assert 0.99 * cell < outer_high - high < 1.52 * cell
+
+    def test_contains_obstacles_and_ends_with_other_boundaries(self):
+        bounds = ((0.0, 4.0), (0.0, 2.0), (0.0, 2.0))
+        obstacles = ((0.0, 4.0), (0.0, 2.0), (-1.0, 2.0))
+        domain = domain_fact(bounds, ("periodic", "open", "wall"), obstacles, spacing=0.1).value
+        assert domain[:2] == bounds[:2]
+        assert domain[2][0] <= -1
+
+
 class TestTypes:
     def test_static_and_rigid_types_and_particles_that_never_move(self, rng):
         fluid = thrown(rng, (0.0, -2.0), frames=40)
@@ -236,6 +257,15 @@ class TestConversion:
         metadata = read_metadata(tmp_path / "a")
         assert metadata.static_types == {1}
         assert metadata.extra["vel_mean"] == pytest.approx(np.diff(fluid, axis=0).mean((0, 1)).tolist(), rel=1e-3)
+
+    def test_stated_facts_win(self, rng, tmp_path):
+        np.savez(tmp_path / "a.npz", positions=np.stack([thrown(rng, (0.0, -2.0)) for _ in range(3)]))
+        options = Options(gravity=(0.0, -7.0), boundary=("periodic", "wall"), dt=0.5, types={0: "jelly"})
+        convert(tmp_path / "a.npz", tmp_path / "b", options=options)
+        metadata, scene = read_metadata(tmp_path / "b"), infer_scene(tmp_path / "b")
+        assert (metadata.dt, metadata.gravity, scene.materials) == (0.5, (0.0, -7.0), ("jelly",))
+        assert scene.domain[0] == scene.bounds[0]
+        assert {"gravity", "dt", "boundary"}.isdisjoint(metadata.extra["found"])
 
     def test_gravities_of_trajectories_are_kept(self, rng, tmp_path):
         run = Trajectory(thrown(rng, (0.0, -2.0)), np.zeros(144, int), {"gravity": [0.0, -5.0]})

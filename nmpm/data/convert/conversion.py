@@ -96,7 +96,8 @@ class _Log:
         self.frames: set[int] = set()
         self.extent = Extent(self.metadata.dim)
         dt = None if "dt" in self.unknown else self.metadata.dt
-        self._finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types)
+        boundary = None if "boundary" in self.unknown else self.metadata.boundary
+        self._finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types, boundary)
         self._facts: list[str] = []
 
     def watch(

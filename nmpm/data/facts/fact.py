@@ -42,6 +42,7 @@ class Facts:
     """Facts about a dataset, named as the fields of `Metadata`; lengths and times in the file's units."""
 
     bounds: Fact[tuple[Interval, ...]]
+    domain: Fact[tuple[Interval, ...]]  # what a grid should cover
     boundary: Fact[tuple[Boundary, ...]]
     dt: Fact[float]
     gravity: Fact[tuple[float, ...] | None]  # None where it is not known
@@ -56,9 +57,12 @@ class Facts:
     def complete(self, metadata: Metadata, unknown: Collection[str]) -> Metadata:
         """The metadata with the `unknown` fields replaced by these facts, and notes on them under the key `found`.
 
-        Types that the metadata name or declare static remain so. With the static types, the prescribed ones are found.
+        Types that the metadata name or declare static remain so. With the static types, the prescribed ones are found;
+        with the bounds, the domain.
         """
         names = {*unknown, *({"prescribed_types"} if "static_types" in unknown else ())}
+        if "bounds" in unknown and metadata.domain is None:
+            names.add("domain")
         facts: Mapping[str, Fact[Any]] = {name: fact for name, fact in vars(self).items() if name in names}
         values = {name: fact.value for name, fact in facts.items()}
         if "particle_types" in values:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, find_axes
+from nmpm.data.facts.domain import domain_fact
 from nmpm.data.facts.fact import Fact, Facts
 from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.facts.obstacles import TypeMotion, name_types, prescribed_fact
@@ -18,6 +20,7 @@ from nmpm.data.facts.volume import find_particle_volume
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.statistics import Extent
 from nmpm.errors import DataError
+from nmpm.scene import Boundary
 
 _SAMPLE_BYTES = 2**27
 
@@ -29,10 +32,17 @@ class FactFinder:
         dim: Number of space dimensions.
         dt: Time between frames, where it is known; else it is found.
         obstacles: Types that are known to be obstacles, beside those that are found.
+        boundary: The kind of boundary of each axis, where it is known; the domain depends on it.
     """
 
-    def __init__(self, dim: int, dt: float | None = None, obstacles: frozenset[int] = frozenset()) -> None:
-        self.dim, self._dt, self._obstacles = dim, dt, obstacles
+    def __init__(
+        self,
+        dim: int,
+        dt: float | None = None,
+        obstacles: frozenset[int] = frozenset(),
+        boundary: Sequence[Boundary] | None = None,
+    ) -> None:
+        self.dim, self._dt, self._obstacles, self._boundary = dim, dt, obstacles, boundary
         self._extents: dict[int, Extent] = {}  # by type
         self._motion, self._samples, self._times = TypeMotion(), Samples(), TimeSteps()
         self._frames: set[int] = set()
@@ -68,9 +78,12 @@ class FactFinder:
             volume = find_particle_volume(self._samples, materials)
         spacing, dt = self._spacing(volume), self._times.fact(tuple(self._samples))
         axes, openings = self._axes(materials, spacing)
+        bounds, boundary = bounds_fact(axes, spacing), boundary_fact(axes, openings)
+        solid = [axis.solid for axis in axes] if materials < types else None
         return Facts(
-            bounds=bounds_fact(axes, spacing),
-            boundary=boundary_fact(axes, openings),
+            bounds=bounds,
+            domain=domain_fact(bounds.value, self._boundary or boundary.value, solid, spacing),
+            boundary=boundary,
             dt=dt,
             gravity=self._gravity(axes, materials, spacing, self._dt or dt.value),
             particle_types=self._names(static.value, prescribed.value),
