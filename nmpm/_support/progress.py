@@ -5,15 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from datetime import timedelta
 from importlib.util import find_spec
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 LINE_SECONDS = 30.0
 """Least time between two lines, where standard error is a file or a pipe."""
+_ACTIVE: ContextVar[Progress | None] = ContextVar("_ACTIVE", default=None)
+"""The bar that is shown now; a bar within it is another line of it."""
 
 
 class Step(Protocol):
@@ -29,6 +40,14 @@ def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
     `what` describes the work of `total` steps, None where that is unknown, of which some are `done` already. Yields a
     function to call after each step.
     """
+    outer = _ACTIVE.get()
+    if outer is not None:
+        inner = outer.add_task(what, total=total, completed=done)
+        try:
+            yield lambda what="", by=1: _advance(outer, inner, what, by)
+        finally:
+            outer.remove_task(inner)
+        return
     console = Console(stderr=True)
     # Without ipywidgets rich would warn at every bar of a notebook.
     if not (console.is_terminal or (console.is_jupyter and find_spec("ipywidgets"))):
@@ -40,8 +59,15 @@ def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
     columns = (BarColumn(bar_width=20), MofNCompleteColumn(), *times, TextColumn("{task.description}"))
     # Drawn once a second, as times are measured beside it.
     with Progress(*columns, console=console, transient=True, refresh_per_second=1) as progress:
-        task = progress.add_task(what, total=total, completed=done)
-        yield lambda what="", by=1: progress.update(task, advance=by, **({"description": what} if what else {}))
+        task, token = progress.add_task(what, total=total, completed=done), _ACTIVE.set(progress)
+        try:
+            yield lambda what="", by=1: _advance(progress, task, what, by)
+        finally:
+            _ACTIVE.reset(token)
+
+
+def _advance(progress: Progress, task: TaskID, what: str, by: int) -> None:
+    progress.update(task, advance=by, description=what or None)
 
 
 class _Lines:

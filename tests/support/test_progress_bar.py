@@ -28,6 +28,15 @@ def test_a_terminal_shows_a_bar(output):
     assert "ETA" in file.getvalue()
 
 
+def test_a_bar_within_a_bar_is_another_line_of_it(output):
+    file = output(force_terminal=True)
+    with progress_bar("all", 2) as step, progress_bar("part", 7) as inner:
+        inner()
+        step()
+    assert "0/7" in file.getvalue()
+    assert file.getvalue().count("\x1b[?25l") == 1  # hides the cursor: one display
+
+
 @pytest.mark.parametrize("kind", [{"force_terminal": False}, {"force_jupyter": True}], ids=["a file", "no widgets"])
 def test_elsewhere_long_work_prints_a_line_now_and_then(output, monkeypatch, recwarn, kind):
     monkeypatch.setattr(progress, "find_spec", lambda name: None)
