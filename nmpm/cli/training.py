@@ -7,6 +7,7 @@ Trainer, and takes the seconds that importing Lightning takes.
 from __future__ import annotations
 
 import ast
+import os
 import re
 import sys
 import textwrap
@@ -18,6 +19,7 @@ import yaml
 
 from nmpm.cli import COMMANDS
 from nmpm.cli.early_checks import (
+    NOT_FILES,
     SIGNATURES,
     Option,
     UsageError,
@@ -53,11 +55,17 @@ def run(words: list[str]) -> int:
 
 
 def add_configuration(options: Sequence[Option]) -> list[Option]:
-    """The options with a configuration that is written for --data.path, where they name none."""
+    """The options with a configuration that is written for --data.path, where they name none.
+
+    Raises:
+        ConfigError: in one of several processes, which would write different ones.
+    """
     given = {option.name: option.value for option in options}
     path = given.get("--data.path")
-    if path is None or "--config" in given or "--print_config" in given:
+    if path is None or path in NOT_FILES or "--config" in given or "--print_config" in given:
         return list(options)
+    if any(int(os.environ.get(name) or 1) > 1 for name in ("WORLD_SIZE", "SLURM_NTASKS")):
+        raise ConfigError(f"Several processes need one --config: write it first, by nmpm init {path}.")
     from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
     from nmpm.data.convert import Options
     from nmpm.data.new_configuration import OPTIONS
@@ -188,7 +196,9 @@ EXAMPLES = {
   nmpm fit --config goop.yaml                           simulate data, train, test, draw
   nmpm fit --resume runs/goop                           go on after an interruption
   nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
-  nmpm fit --config waterdrop.yaml --data.path FOLDER   train on recorded data""",
+  nmpm fit --data.path FOLDER                           on recorded data, by a configuration that nmpm
+                                                        init chooses for them; it is kept in the run
+  nmpm fit --config waterdrop.yaml --data.path FOLDER   on recorded data, by another""",
     "validate": """\
   nmpm validate runs/goop                               its best weights""",
     "test": """\

@@ -34,7 +34,7 @@ MEMORY_SHARE = 0.7
 """Of the free memory that a training may take."""
 _FINEST, _COARSEST, _CANDIDATES = 1.25, 8.0, 12  # spacings of particles to a cell
 _CELL_SECONDS = {1: 1.6e-9, 2: 4.7e-9, 3: 12.5e-9}  # of a core, by dimension; times width²
-_PARTICLE_SECONDS = 1.7e-6
+_PARTICLE_SECONDS, _STEP_SECONDS = 2e-6, 0.02  # the latter of the optimizer
 _BYTES, _BASE_BYTES = {1: 75, 2: 75, 3: 115}, 0.4e9  # of a cell, times width
 
 
@@ -69,8 +69,13 @@ class TrainingSize:
 
     def seconds(self, shape: Sequence[int], particles: int) -> float:
         """Seconds of a step on one core of an AMD EPYC in float32, to 30%; other machines differ by a factor."""
-        network = _CELL_SECONDS[len(shape)] * padded_cells(shape) * self.width**2
-        return self.batch_size * self.unroll * (network + _PARTICLE_SECONDS * particles)
+        particle_seconds = _PARTICLE_SECONDS * particles * self.batch_size * self.unroll
+        return _STEP_SECONDS + self.network_seconds(shape) + particle_seconds
+
+    def network_seconds(self, shape: Sequence[int]) -> float:
+        """Those of the network alone."""
+        cells = self.batch_size * self.unroll * padded_cells(shape)
+        return _CELL_SECONDS[len(shape)] * cells * self.width**2
 
     def memory(self, shape: Sequence[int]) -> float:
         """Bytes that a training takes on the CPU, to 20%."""

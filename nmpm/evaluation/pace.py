@@ -46,7 +46,7 @@ def measure_machine(dim: int, minutes: float = MINUTES) -> Machine:
     threads = min(stated_threads(None) or usable_cores(), size.batch_size) if device.type == "cpu" else 1
     pace = size.unroll * fastest / (1 + _THREADS_GAIN * (threads - 1))
     memory = float(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else free_memory()
-    return Machine(pace / size.seconds(shape, particles=0), memory, minutes)
+    return Machine(pace / size.network_seconds(shape), memory, minutes)
 
 
 @contextmanager
