@@ -71,9 +71,8 @@ class Bundle:
     velocity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def without_absent(self, mask: Tensor) -> Bundle:
-        """The same with NaN for the positions and fields of particles that are not there, False in `mask` (B, N)."""
-        there = mask.unsqueeze(1)
+    def without_absent(self, there: Tensor) -> Bundle:
+        """The same with NaN for positions and fields of particles that are not `there`, (B, m, N) or (B, 1, N) bool."""
         position = torch.where(there.unsqueeze(-1), self.position, torch.nan)
         fields = {name: torch.where(there, values, torch.nan) for name, values in self.fields.items()}
         return Bundle(position, self.velocity, fields)

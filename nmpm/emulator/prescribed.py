@@ -80,6 +80,15 @@ class Prescribed(Batched):
             return state.mask
         return state.mask & self.present[:, max(0, frame + 2 - ahead) : frame + 2].all(1)
 
+    def remaining(self, state: Particles, frame: int, ahead: int) -> Tensor:
+        """(B, ahead, N) bool: the particles of a state after so many frames that are there until each of the next."""
+        there = state.mask.unsqueeze(1).expand(-1, ahead, -1)
+        if self.present is None:
+            return there
+        recorded = self.present[:, frame + 2 : frame + 2 + ahead]
+        rest = there[:, recorded.shape[1] :]
+        return (there & torch.cat([recorded, rest], dim=1)).int().cummin(1).values.bool()
+
     def _exchange(self, state: Particles, frame: int, ahead: int) -> Particles:
         if self.position is None or self.present is None or self.is_over(frame):
             return state
@@ -160,6 +169,12 @@ class Exchange:
         if self.prescribed is None:
             return particles.mask
         return self.prescribed.stays(particles, frame, self._emulator.frames)
+
+    def there(self, particles: Particles, frame: int) -> Tensor:
+        """(B, m, N) or (B, 1, N) bool: who is there in the bundle from a state after so many frames."""
+        if self.prescribed is None:
+            return particles.mask.unsqueeze(1)
+        return self.prescribed.remaining(particles, frame, self._emulator.frames)
 
     def after(self, particles: Particles, frame: int) -> Particles:
         """The state after so many frames, for the next bundle."""

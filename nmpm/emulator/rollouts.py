@@ -54,8 +54,9 @@ def unroll(
             monitor.see(emulator, periods.unwrapped_state(particles), travelled)
             if index == bundles - 1:
                 monitor.read()
-        yield travelled.without_absent(particles.mask) if exchange.varies else travelled
-        after, frame = bundle.state_after(particles), (index + 1) * emulator.frames
+        frame = index * emulator.frames
+        yield travelled.without_absent(exchange.there(particles, frame)) if exchange.varies else travelled
+        after, frame = bundle.state_after(particles), frame + emulator.frames
         if exchange.varies:
             periods.forget(~exchange.stays(after, frame))
         after = periods.wrap(exchange.after(after, frame))
