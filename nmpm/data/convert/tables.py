@@ -23,7 +23,7 @@ ROWS = 100_000
 """Rows of a chunk."""
 _UNITS = "[nuµμmck]?m|px|pixels?|[nuµμm]?s|sec|kg|g"
 _LINE = 2**16  # characters of a line
-_LABELS = 4  # rows of units or labels below the header, as TrackMate writes them
+_BLOCK = 2**22  # characters that are parsed at a time
 
 Chunk = Mapping[str, np.ndarray]
 """Columns by name, floats or texts."""
@@ -53,24 +53,49 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
     limit = expansion_limit(path.stat().st_size)
     with _open_text(path) as file:
         names, delimiter, number = _header(file)
-        wanted = [names.index(name) for name in columns]
-        rows = _rows(file, delimiter)
-        first = next(rows, None)
-        for _ in range(_LABELS):  # labels and units below the header have no numbers
-            if first is None or any(map(_is_number, first)):
-                break
-            first, number = next(rows, None), number + 1
-        while first is not None:
-            chunk = [first, *islice(rows, ROWS - 1)]
-            wrong = next((index for index, row in enumerate(chunk) if len(row) != len(names)), None)
-            if wrong is not None:
-                raise DataError(
-                    f"{path}, line {number + 1 + wrong}: it has {len(chunk[wrong])} cells, the header has {len(names)}."
-                )
+        for lines in _blocks(file):
             if path.suffix == ".gz" and file.buffer.tell() > limit:
                 raise DataError(f"{path}: unpacks to more than {limit:,} bytes.")
-            yield {names[index]: _column([row[index] for row in chunk]) for index in wanted}
-            first, number = next(rows, None), number + len(chunk)
+            rows = [line for line in lines if line.strip() and line[0] not in "#%"]
+            table = _parse(rows, names, delimiter)
+            if table is None:
+                raise _cells_error(path, lines, number, len(names), delimiter)
+            if table:
+                yield {name: table[name] for name in columns}
+            number += len(lines)
+
+
+def _blocks(file: TextIO) -> Iterator[list[str]]:
+    """Yields the lines of a file, many at a time."""
+    while text := file.read(_BLOCK):
+        if not text.endswith("\n"):
+            text += file.readline(_LINE)
+        yield text.replace("\r", "").removesuffix("\n").split("\n")
+
+
+def _parse(rows: list[str], names: Sequence[str], delimiter: str | None) -> Chunk | None:
+    """The columns of some rows; empty where there are none, None if rows have other numbers of cells."""
+    try:
+        numbers = np.loadtxt(rows, delimiter=delimiter, comments=None, quotechar='"', ndmin=2) if rows else np.empty(0)
+        if numbers.ndim == 2 and numbers.shape[1] == len(names):
+            return dict(zip(names, numbers.T, strict=True))
+    except ValueError:  # texts, empty cells
+        pass
+    cells = [row.split() for row in rows] if delimiter is None else list(csv.reader(rows, delimiter=delimiter))
+    while cells and not any(map(_is_number, cells[0])):  # labels and units below the header have no numbers
+        cells.pop(0)
+    if any(len(row) != len(names) for row in cells):
+        return None
+    return {name: _column([row[index] for row in cells]) for index, name in enumerate(names) if cells}
+
+
+def _cells_error(path: Path, lines: list[str], first: int, count: int, delimiter: str | None) -> DataError:
+    """The error on the first row with another number of cells than the header."""
+    for number, line in enumerate(lines, start=first + 1):
+        cells = len(_split(line, delimiter)) if line.strip() and line[0] not in "#%" else count
+        if cells != count:
+            return DataError(f"{path}, line {number}: it has {cells} cells, the header has {count}.")
+    return DataError(f"{path}: rows have another number of cells than the header, {count}.")
 
 
 def _header(file: TextIO) -> tuple[tuple[str, ...], str | None, int]:
@@ -80,19 +105,10 @@ def _header(file: TextIO) -> tuple[tuple[str, ...], str | None, int]:
         if not text:
             continue
         delimiter = next((sign for sign in "\t;," if sign in text), None)
-        names = _split(text, delimiter)
-        named = len(set(names)) == len(names) and not any(map(_is_number, names)) and all(names)
+        names = [name or f"column {index}" for index, name in enumerate(_split(text, delimiter))]  # pandas' index
+        named = len(set(names)) == len(names) and not any(map(_is_number, names))
         return (tuple(names) if named and len(names) > 1 else (), delimiter, number)
     return (), None, 0
-
-
-def _rows(file: TextIO, delimiter: str | None) -> Iterator[list[str]]:
-    lines = (
-        line for line in iter(lambda: file.readline(_LINE), "") if line.strip() and not line.startswith(("#", "%"))
-    )
-    if delimiter is None:
-        return map(str.split, lines)
-    return csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
 
 
 def _split(text: str, delimiter: str | None) -> list[str]:

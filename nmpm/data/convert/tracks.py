@@ -173,6 +173,8 @@ class Tracks(RunFiles):
             where = f"{file}, run {index}" if columns.run else str(file)
             if index in set(indices):
                 yield track_rows(_join(chunks), columns, metadata.dim, ids, where, row).trajectory(where)
+            if index == max(indices):
+                return
             row += sum(len(chunk[columns.key]) for chunk in chunks)
 
 

@@ -163,3 +163,13 @@ def test_a_sample_of_tracks_is_read(recorded):
     assert run.position.shape[0] == 160
     assert np.isnan(run.position[..., 0]).all(axis=1).sum() == 2
     assert np.isfinite(run.position[..., 0]).sum() == 65_577
+
+
+def test_tables_of_pandas_and_of_track_mate_are_read(tmp_path):
+    header, *rows = lines(made())
+    indexed = [f",{header}", *(f"{index},{row}" for index, row in enumerate(rows))]
+    np.testing.assert_allclose(read(write(tmp_path / "pandas.csv", indexed)).position, made(), atol=1e-6)
+    labelled = [header, "Frame,Spot ID,X,Y", ",,(mm),(mm)", *rows]
+    np.testing.assert_allclose(read(write(tmp_path / "mate.csv", labelled)).position, made(), atol=1e-6)
+    quoted = [header, *(",".join(f'"{cell}"' for cell in row.split(",")) for row in rows)]
+    np.testing.assert_allclose(read(write(tmp_path / "quoted.csv", quoted)).position, made(), atol=1e-6)
