@@ -6,7 +6,7 @@ import csv
 import gzip
 import re
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -16,12 +16,14 @@ import numpy as np
 
 from nmpm._support.bounded_files import check_regular, expansion_limit
 from nmpm._support.messages import one_line
+from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 SUFFIXES = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.txt", "*.txt.gz", "*.parquet")
 ROWS = 100_000
 """Rows of a chunk."""
 _UNITS = "[nuµμmck]?m|px|pixels?|[nuµμm]?s|sec|kg|g"
+_LARGE = 32  # MiB of a file beyond which its progress is shown
 _LINE = 2**16  # characters of a line
 _BLOCK = 2**22  # characters that are parsed at a time
 
@@ -51,9 +53,10 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
                 yield {name: _arrow_column(batch.column(name)) for name in columns}
         return
     limit = expansion_limit(path.stat().st_size)
-    with _open_text(path) as file:
+    with _open_text(path) as file, _progress(path) as advance_to:
         names, delimiter, number = _header(file)
         for lines in _blocks(file):
+            advance_to(file)
             if path.suffix == ".gz" and file.buffer.tell() > limit:
                 raise DataError(f"{path}: unpacks to more than {limit:,} bytes.")
             rows = [line for line in lines if line.strip() and line[0] not in "#%"]
@@ -63,6 +66,24 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
             if table:
                 yield {name: table[name] for name in columns}
             number += len(lines)
+
+
+@contextmanager
+def _progress(path: Path) -> Iterator[Callable[[Any], object]]:
+    """A function that shows how much of a large text file is read, of which the open file is its argument."""
+    total, done = path.stat().st_size // 2**20, 0
+    if total < _LARGE:
+        yield lambda _: None
+        return
+
+    def advance_to(file: Any) -> None:
+        nonlocal done
+        now = getattr(file.buffer, "fileobj", file.buffer).tell() // 2**20  # of what is stored
+        step(by=now - done)
+        done = now
+
+    with progress_bar(f"Reading {path.name}, MiB", total) as step:
+        yield advance_to
 
 
 def _blocks(file: TextIO) -> Iterator[list[str]]:
