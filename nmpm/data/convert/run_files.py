@@ -17,7 +17,7 @@ from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.data.metadata import find_family
 from nmpm.errors import DataError
 
-LEAST_FRAMES = 50
+LEAST_FRAMES = 16
 """Frames of the parts for validation and tests when one or two runs are cut along time."""
 
 EVERYTHING_UNKNOWN = frozenset(

@@ -114,7 +114,7 @@ def test_one_long_run_is_cut_along_time(tmp_path):
     run = read(tmp_path / "long.npz", "valid")
     np.testing.assert_array_equal(run.position, position[480:540])
     np.testing.assert_allclose(run.fields["time"], np.arange(480, 540) * 0.1)
-    np.savez(tmp_path / "short.npz", position=position[:400])
+    np.savez(tmp_path / "short.npz", position=position[:150])
     assert splits(tmp_path / "short.npz") == {"train": 1}
 
 
