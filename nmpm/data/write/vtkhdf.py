@@ -25,6 +25,7 @@ MOST_TRAJECTORIES = 32
 _POLY_DATA_VERSION, _COLLECTION_VERSION = (2, 0), (2, 1)
 _CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 _COMPRESSED = {"compression": "gzip", "shuffle": True}
+_LEAST_BYTES = 2**11  # of what is compressed, as the index of chunks takes as much
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def _write_cells(group: Any, frames: int, particles: int) -> None:
 def _write(group: Any, name: str, values: np.ndarray) -> None:
     """Numbers of VTK's bookkeeping: integers, but for times."""
     values = values if name == "Values" else values.astype(np.int64)
-    group.create_dataset(name, data=values, **(_COMPRESSED if values.size > 1 else {}))
+    group.create_dataset(name, data=values, **(_COMPRESSED if values.nbytes > _LEAST_BYTES else {}))
 
 
 def _map(group: Any, name: str, values: Any, leading: int, dim: int) -> None:
