@@ -26,9 +26,8 @@ class Frame:
 
 def frame_times(trajectory: Trajectory, metadata: Metadata) -> np.ndarray:
     """(T,) float64: the recorded times, or else those of frames `dt` apart, from 0 on."""
-    stated = trajectory.fields.get("time")
-    frames = len(trajectory.position)
-    return np.arange(frames) * metadata.dt if stated is None else np.asarray(stated, dtype=np.float64).reshape(frames)
+    frames, stated = len(trajectory.position), np.asarray(trajectory.fields.get("time"))
+    return stated.astype(np.float64) if stated.shape == (frames,) else np.arange(frames) * metadata.dt
 
 
 def particle_fields(trajectory: Trajectory) -> dict[str, np.ndarray]:

@@ -62,7 +62,8 @@ def add_vtkhdf(file: Any, dt: float) -> None:
     blocks = list(_blocks([file[name] for name in list(file)[:MOST_TRAJECTORIES]]))
     longest = max(blocks, key=lambda block: block.frames)
     stated = longest.trajectory.get("time")
-    times = np.arange(longest.frames) * dt if stated is None else np.asarray(stated[()], dtype=np.float64)
+    is_stated = isinstance(stated, h5py.Dataset) and stated.shape == (longest.frames,)
+    times = np.asarray(stated[()], dtype=np.float64) if is_stated else np.arange(longest.frames) * dt
     root = _ordered_group(file, VTKHDF)
     if len(blocks) == 1:
         _set_type(root, "PolyData", _POLY_DATA_VERSION)
@@ -70,10 +71,9 @@ def add_vtkhdf(file: Any, dt: float) -> None:
         return
     _set_type(root, "MultiBlockDataSet", _COLLECTION_VERSION)
     assembly = _ordered_group(root, "Assembly")
-    for index, block in enumerate(blocks):
+    for block in blocks:
         group = root.create_group(block.name)
         _set_type(group, "PolyData", _COLLECTION_VERSION)
-        group.attrs["Index"] = index
         assembly[block.name] = h5py.SoftLink(group.name)
         _write_block(group, block, times)
 
@@ -121,7 +121,8 @@ def _write_block(group: Any, block: _Block, times: np.ndarray) -> None:
     _map(group, "Points", position, 2, dim)
     data, offsets = group.create_group("PointData"), steps.create_group("PointDataOffsets")
     for name, values in block.trajectory.items():
-        if leading := _point_axes(name, values, frames, particles):
+        leading = _point_axes(name, values, frames, particles)
+        if leading == 1 or (leading == 2 and block.position != TRUTH):  # other fields are those of the prediction
             _map(data, name, values, leading, dim)
             _write(offsets, name, frame * particles if leading == 2 else np.zeros(len(times)))
 

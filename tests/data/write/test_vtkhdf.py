@@ -55,7 +55,8 @@ def test_vtk_reads_every_frame_exactly(tmp_path, dim):
 
 
 def test_several_trajectories_and_truths_are_blocks(tmp_path):
-    one, other = run(5, truth=run(3, seed=1).position), run(4, seed=2, time=np.arange(4) * 9.0)
+    density = np.arange(20, dtype=np.float32).reshape(5, 4)
+    one, other = run(5, truth=run(5, seed=1).position, density=density), run(4, seed=2, time=np.arange(4) * 9.0)
     write_viewable(tmp_path / "out.h5", [one, other], dt=1)
     steps = [step for _, step in read(tmp_path / "out.h5")]
     names = [steps[0].GetMetaData(i).Get(steps[0].NAME()) for i in range(3)]
@@ -63,8 +64,10 @@ def test_several_trajectories_and_truths_are_blocks(tmp_path):
     for frame, step in enumerate(read(tmp_path / "out.h5")):
         points = [arrays(step[1].GetBlock(block))[0][:, :2] for block in range(3)]
         np.testing.assert_array_equal(points[0], one.position[frame])
-        np.testing.assert_array_equal(points[1], one.fields["truth"][min(frame, 2)])
+        np.testing.assert_array_equal(points[1], one.fields["truth"][frame])
         np.testing.assert_array_equal(points[2], other.position[min(frame, 3)])
+    fields = [sorted(arrays(steps[0].GetBlock(block))[1]) for block in range(3)]
+    assert fields == [["density", "particle_type"], ["particle_type"], ["particle_type"]]
 
 
 def test_the_file_is_still_native_and_determined_by_its_content(tmp_path):
