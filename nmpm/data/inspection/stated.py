@@ -7,15 +7,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, spacing_of
 
-_FIRST_STEPS = 10  # in which particles are looked for that fall freely
+_FIRST_STEPS = 32  # in which particles are looked for that fly freely
 _LEAST_PARTICLES = 8
-_FALLING = 0.7  # of the particles
-_SAME_FALL = 0.1  # of the acceleration
-_ROUNDED = 32.0  # times the rounding of coordinates: smaller accelerations are not seen
 _DIFFERENT = 1.2  # factor of a gravity
 _UNEVEN = 0.01  # of a step of time
 _VOLUME = (2.5, 4.0)  # factors by which a stated particle volume may be too large and too small
@@ -28,24 +26,13 @@ _ROUND_FACTORS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0, 20.0, 25.0, 50.0, 100
 
 
 def free_fall(motion: Motion) -> tuple[float, ...] | None:
-    """The acceleration (D,) in length per frame² that most particles have in the first frames; None where none have."""
-    if len(motion.index) < _LEAST_PARTICLES or len(motion.step) < 2:
+    """The acceleration (D,) of particles in free flight in the first frames, in length per frame²; None if none are."""
+    if len(motion.index) < _LEAST_PARTICLES or len(motion.step) < 2 or not motion.spacing:
         return None
-    falls = []
-    for acceleration in np.diff(motion.step[: _FIRST_STEPS + 1], axis=0):
-        there = acceleration[~np.isnan(acceleration[:, 0])]
-        if len(there) < _LEAST_PARTICLES:
-            continue
-        middle = np.median(there, axis=0)
-        tolerance = max(_SAME_FALL * float(np.linalg.norm(middle)), 4 * motion.rounding)
-        together = float((np.linalg.norm(there - middle, axis=1) < tolerance).mean())
-        if together > _FALLING and np.linalg.norm(middle) > _ROUNDED * motion.rounding:
-            falls.append(middle)
-    if not falls:
-        return None
-    fall = np.median(falls, axis=0)
-    same = np.linalg.norm(falls - fall, axis=1) < 2 * _SAME_FALL * np.linalg.norm(fall)
-    return tuple(fall.tolist()) if same.mean() > 0.5 else None
+    steps = motion.step[:_FIRST_STEPS]
+    path = motion.position[0] + np.concatenate([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)])
+    gravity = find_gravity([Track(path, np.arange(len(path), dtype=np.float64))], motion.spacing, 1.0, closed=False)
+    return gravity.value if gravity.sure == "measured" and gravity.value and any(gravity.value) else None
 
 
 def check_stated(motion: Motion) -> Iterator[Finding]:
