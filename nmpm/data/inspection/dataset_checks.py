@@ -13,6 +13,7 @@ from nmpm.data.inspection import comparisons
 from nmpm.data.inspection.findings import Finding
 from nmpm.data.inspection.irregular_motion import find_disorder, find_irregular_motion
 from nmpm.data.inspection.motion import Motion, spacing_of
+from nmpm.data.inspection.noise import find_noise
 from nmpm.data.inspection.particles import find_odd_particles, never_moving
 from nmpm.data.inspection.stated import check_stated, free_fall, recorded_dt
 from nmpm.data.statistics import Extent
@@ -35,7 +36,7 @@ class DatasetChecks:
         self._extents: dict[str, np.ndarray] = {}
         self._stays: dict[str, np.ndarray] = {}
         self._extent, self._walls = Extent(metadata.dim), Extent(metadata.dim)  # of moving and static particles
-        self._spacing, self._rounding = math.inf, 0.0
+        self.spacing, self._rounding = math.inf, 0.0
         self._frames, self._still, self._moving = Counter[int](), Counter[int](), Counter[int]()
         self._crossings, self._wraps, self._bounces = np.zeros((3, metadata.dim), dtype=int)
 
@@ -51,7 +52,7 @@ class DatasetChecks:
         if disorder := list(find_disorder(motion)):  # then everything else that would be found means nothing
             self.findings += disorder
             return
-        self.findings += [*find_odd_particles(motion), *find_irregular_motion(motion)]
+        self.findings += [*find_odd_particles(motion), *find_irregular_motion(motion), *find_noise(motion)]
         try:
             self.findings += check_stated(motion)
             self._measure(motion)
@@ -66,7 +67,7 @@ class DatasetChecks:
             later = spacing_of(motion.position[len(motion.position) // 2], self.metadata)
             self._spacings[motion.where] = motion.spacing, later or motion.spacing
             self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
-        self._spacing = min(self._spacing, motion.spacing or math.inf)
+        self.spacing = min(self.spacing, motion.spacing or math.inf)
         self._rounding = max(self._rounding, motion.rounding)
         types, still = motion.trajectory.particle_type[motion.index], never_moving(motion)
         self._still.update(types[still].tolist())
@@ -80,11 +81,11 @@ class DatasetChecks:
         findings: list[Finding] = []
         for steps in self._steps.values():
             findings += comparisons.compare_time_steps(steps)
-        findings += comparisons.check_precision(self._spacing, self._rounding, self._extent)
+        findings += comparisons.check_precision(self.spacing, self._rounding, self._extent)
         findings += comparisons.check_boundary(self.metadata, self._crossings, self._wraps, self._bounces)
         findings += comparisons.check_types(self.metadata, self._still, self._moving)
         findings += comparisons.compare_spacings(self._spacings)
-        findings += comparisons.compare_domains(self._extents, self._stays, self._spacing)
+        findings += comparisons.compare_domains(self._extents, self._stays, self.spacing)
         if np.isfinite(self._extent.lower).all():
             findings += comparisons.compare_bounds(self._extent, self._walls, self.metadata)
         findings += comparisons.check_lengths(self._frames, WINDOW)
@@ -94,7 +95,7 @@ class DatasetChecks:
 def _dt_of_fall(motion: Motion) -> float | None:
     """The time step by which particles fall freely by the stated gravity, or by 1 where none is stated."""
     fall = free_fall(motion)
-    if fall is None:
+    if fall is None or not any(fall):
         return None
     stated = trajectory_gravity(motion.trajectory.attributes, motion.metadata, motion.where)
     gravity = float(np.linalg.norm(stated)) if stated is not None else 1.0

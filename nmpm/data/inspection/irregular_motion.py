@@ -40,7 +40,7 @@ def find_disorder(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if between two frames many particles move to places where others were."""
     if len(motion.step) < 2 or not motion.spacing:
         return
-    change = lengths(np.diff(motion.step, axis=0)) > motion.spacing
+    change = motion.change > motion.spacing
     sudden = np.ones(motion.speed.shape, dtype=bool)  # acceleration before and after the step
     sudden[1:] &= change
     sudden[:-1] &= change
@@ -77,8 +77,10 @@ def _is_shuffled(motion: Motion, frame: int, moved: np.ndarray) -> bool:
 
 def find_jumps(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if particles are displaced, but neither their velocity nor their neighbours are."""
-    jumps = _interrupted_paths(motion)
+    sudden = np.flatnonzero((motion.change > _JUMP / 2 * motion.spacing).any(axis=0))
     wraps = motion.crossings[motion.crossings.sum(axis=(1, 2)) >= FEW_CROSSINGS].any(axis=0)
+    jumps = np.zeros(motion.speed.shape)
+    jumps[:, sudden] = _interrupted_paths(motion.step[:, sudden])
     frames, indices = np.nonzero((jumps > _JUMP * motion.spacing) & ~wraps)
     order = np.argsort(-jumps[frames, indices], kind="stable")
     for place in order[:_COMPARED].tolist():
@@ -99,22 +101,21 @@ def find_jumps(motion: Motion) -> Iterator[Finding]:
             return
 
 
-def _interrupted_paths(motion: Motion) -> np.ndarray:
-    """(T - 1, N): by how much a step leaves the path that goes on after it; 0 where the path changes there anyway.
+def _interrupted_paths(step: np.ndarray) -> np.ndarray:
+    """(T - 1, N): by how much one of the steps (T - 1, N, D) leaves the path that goes on after it, or 0.
 
     It leaves it for good, so that the velocities before and after the step are the same, or for one frame, so that the
-    two velocities after the next step are.
+    velocity after the next step is.
     """
-    step, jumps = motion.step, np.zeros(motion.speed.shape)
+    jumps = np.zeros(step.shape[:2])
     if len(step) > 2:
         away = lengths(step[1:-1] - (step[:-2] + step[2:]) / 2)
         jumps[1:-1] = np.where(away > _CONTINUOUS * lengths(step[2:] - step[:-2]), away, 0.0)
     if len(step) > 3:
         middle = (step[1:-2] + step[2:-1]) / 2
         away = lengths(step[1:-2] - middle)
-        rest = lengths(middle - (step[:-3] + step[3:]) / 2)
-        rest = np.maximum(rest, lengths(step[3:] - step[:-3]))
-        jumps[1:-2] = np.maximum(jumps[1:-2], np.where(away > _CONTINUOUS * rest, away, 0.0))
+        changes = np.maximum(lengths(middle - (step[:-3] + step[3:]) / 2), lengths(step[3:] - step[:-3]))
+        jumps[1:-2] = np.maximum(jumps[1:-2], np.where(away > _CONTINUOUS * changes, away, 0.0))
     return jumps
 
 

@@ -53,6 +53,11 @@ class Motion:
         return lengths(self.step)
 
     @cached_property
+    def change(self) -> np.ndarray:
+        """(T - 2, N) lengths of the differences of successive displacements."""
+        return lengths(np.diff(self.step, axis=0))
+
+    @cached_property
     def typical(self) -> np.ndarray:
         """(T - 1,) root mean square displacement of all particles between successive frames; 0 where none is there."""
         count = np.maximum(1, np.isfinite(self.speed).sum(axis=1))

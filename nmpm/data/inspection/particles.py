@@ -94,7 +94,8 @@ def find_absences(motion: Motion) -> Iterator[Finding]:
 def never_moving(motion: Motion) -> np.ndarray:
     """(N,) whether a particle stays where it is all the time, while others move; False everywhere if nothing moves."""
     position = motion.position
-    extent = (np.fmax.reduce(position, axis=0) - np.fmin.reduce(position, axis=0)).max(axis=-1)
+    sides = np.fmax.reduce(position, axis=0) - np.fmin.reduce(position, axis=0)
+    extent = np.maximum.reduce(list(sides.T))
     if not extent.size or not motion.spacing or not np.nanmax(extent) > _MOVES * motion.spacing:
         return np.zeros(position.shape[1], dtype=bool)
     return np.asarray(extent <= _STILL * motion.spacing)

@@ -13,7 +13,6 @@ from nmpm.data.format import Metadata, Split
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.errors import DataError
 
-_MOST = 500  # trajectories of a split that are compared
 _PARTICLES = 32  # that move, and as many that do not
 _SAME_RUN = 0.3  # spacings that a particle of two runs may be apart
 _SAME_START = 1e-3
@@ -34,13 +33,15 @@ class _Run:
 _Pairs = dict[tuple[str, str], list[tuple[_Run, _Run]]]
 
 
-def find_shared_runs(splits: Mapping[str, Split], metadata: Metadata, spacing: float) -> Iterator[Finding]:
+def find_shared_runs(
+    splits: Mapping[str, Split], metadata: Metadata, spacing: float, most: int = 500
+) -> Iterator[Finding]:
     """Yields findings about trajectories of different splits, or of one, that are the same or start the same.
 
-    Compared are some particles in the first two frames and in the last one, of up to 500 trajectories of each split.
+    Compared are some particles in the first two frames and in the last one, of so many trajectories of each split.
     """
     groups: dict[tuple[int, ...], list[_Run]] = {}
-    for run, particles in _read_runs(splits, metadata):
+    for run, particles in _read_runs(splits, metadata, most):
         groups.setdefault((particles, *run.start.shape), []).append(run)
     same, starts = _Pairs(), _Pairs()
     for runs in groups.values():
@@ -55,9 +56,9 @@ def find_shared_runs(splits: Mapping[str, Split], metadata: Metadata, spacing: f
     yield from _describe(starts, splits, "shared starts", "have the same first two frames")
 
 
-def _read_runs(splits: Mapping[str, Split], metadata: Metadata) -> Iterator[tuple[_Run, int]]:
+def _read_runs(splits: Mapping[str, Split], metadata: Metadata, most: int) -> Iterator[tuple[_Run, int]]:
     for name, split in splits.items():
-        for index in range(0, len(split), -(-len(split) // _MOST)):
+        for index in range(0, len(split), -(-len(split) // most)):
             try:
                 start = split.read(index, 0, 2)
                 end = split.read(index, split.frames(index) - 1).position[0]

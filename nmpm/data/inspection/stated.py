@@ -26,13 +26,17 @@ _ROUND_FACTORS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0, 10.0, 20.0, 25.0, 50.0, 100
 
 
 def free_fall(motion: Motion) -> tuple[float, ...] | None:
-    """The acceleration (D,) of particles in free flight in the first frames, in length per frame²; None if none are."""
+    """The acceleration (D,) of particles in free flight in the first frames, in length per frame²; None if none are.
+
+    It is zero if they fly straight.
+    """
     if len(motion.index) < _LEAST_PARTICLES or len(motion.step) < 2 or not motion.spacing:
         return None
     steps = motion.step[:_FIRST_STEPS]
     path = motion.position[0] + np.concatenate([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)])
     gravity = find_gravity([Track(path, np.arange(len(path), dtype=np.float64))], motion.spacing, 1.0, closed=False)
-    return gravity.value if gravity.sure == "measured" and gravity.value and any(gravity.value) else None
+    straight = gravity.value is not None and not any(gravity.value)
+    return gravity.value if gravity.sure == "measured" or straight else None
 
 
 def check_stated(motion: Motion) -> Iterator[Finding]:
@@ -87,6 +91,12 @@ def check_gravity(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if particles do not fall freely by the stated gravity; then it is wrong, or dt is."""
     stated, fall = trajectory_gravity(motion.trajectory.attributes, motion.metadata, motion.where), free_fall(motion)
     if stated is None or fall is None:
+        return
+    if not any(fall):
+        if any(stated):
+            straight = f"gravity is stated as {_vector(stated)}, but in the first frames particles fly straight."
+            zero = correction(f"--gravity={_comma(np.zeros(len(fall)))}")
+            yield Finding("gravity", Severity.ODDITY, f"{straight} {zero}", motion.where)
         return
     recorded = recorded_dt(motion)
     dt = recorded or motion.metadata.dt

@@ -41,9 +41,13 @@ class Data:
         """Changes positions of runs of the train split."""
         self.runs["train"][runs] = [change(run.copy()) for run in self.runs["train"][runs]]
 
+    def change_all(self, change: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Changes positions of all runs."""
+        self.runs = {name: [change(run.copy()) for run in runs] for name, runs in self.runs.items()}
+
     def move(self, shift: float) -> None:
         """Moves everything."""
-        self.runs = {name: [run + shift for run in runs] for name, runs in self.runs.items()}
+        self.change_all(lambda run: run + shift)
         self.state(
             bounds=tuple((low + shift, high + shift) for low, high in self.metadata.bounds),
             domain=tuple((low + shift, high + shift) for low, high in self.metadata.domain or ()),
@@ -148,6 +152,12 @@ def noisy(run: np.ndarray) -> np.ndarray:
     return run
 
 
+def straight(run: np.ndarray) -> np.ndarray:
+    steps = np.arange(len(run))[:, None, None] * (run[1, : SIDE**2] - run[0, : SIDE**2])
+    run[:, : SIDE**2] = reflect(run[0, : SIDE**2] + steps)
+    return run
+
+
 def absent(run: np.ndarray) -> np.ndarray:
     run[:6, 2] = run[-3:, 4] = np.nan
     return run
@@ -162,6 +172,7 @@ LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
     "gravity in km": (lambda data: data.state(gravity=(0.0, -0.00981)), "gravity: .*1000 times too small", 1e-3),
     "gravity by half": (lambda data: data.state(gravity=(0.0, -4.905)), "gravity: .*2 times too small.*-9.81", 0.5),
     "gravity of zero": (lambda data: data.state(gravity=(0.0, 0.0)), "gravity: .*there is one", None),
+    "gravity where there is none": (lambda data: data.change_all(straight), "fly straight.*--gravity=0,0", None),
     "dt": (lambda data: data.state(dt=2.5 * DT), "dt: .*2.5 times too large.*--dt 0.01", 2.5),
     "dt of frames": (lambda data: data.state(dt=1.0), "dt: .*100 times too large", 100),
     "dt in ms": (lambda data: data.state(dt=DT / 1000), "dt: .*1000 times too small", 1e-3),
@@ -199,6 +210,7 @@ LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
                    "different resolution: .*train 00002.* 1.5 times", 1.5),
     "far from the origin": (lambda data: data.move(1000.0), "float32: .*Subtract about .1000, 1000.", None),
     "short": (lambda data: data.change(lambda run: run[:12], slice(0, 2)), "short trajectories: 2 of 9", 2 / 9),
+    "noise": (lambda data: data.change_all(noisy), "measurement noise: .* errors of about 0.01.*--smooth 13", None),
     "overlap": (lambda data: data.change(doubled, ONE), "overlapping particles: .*train 00002", None),
     "teleport": (lambda data: data.change(teleported, ONE), "jumps: .*train 00002, frame 12, particle 5", None),
     "glitch": (lambda data: data.change(glitched, ONE), "jumps: .*train 00002, frame 12, particle 5", None),
