@@ -26,6 +26,8 @@ from nmpm.cli.early_checks import UsageError
 from nmpm.cli.options import check_folder
 from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.inspection.quick import contradictions_warning
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
@@ -209,6 +211,8 @@ class EmulatorCLI(LightningCLI):
         if resumed is None or not self.run_folder.holds(Path(config["ckpt_path"])):
             self.run_folder.check_new()
         self._print_start(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
+        if resumed is None and isinstance(self.datamodule.data_source, FolderSource):
+            sys.stderr.write(contradictions_warning(self.datamodule.data_source))
 
     def before_validate(self) -> None:
         self._load_checkpoint()

@@ -38,7 +38,7 @@ class Finding:
     badness: float = 0.0
 
     def __str__(self) -> str:
-        return f"{self.kind}: {self.sentence}"
+        return ": ".join(filter(None, (self.kind, ", ".join(filter(None, (self.where, self.details))), self.sentence)))
 
 
 def sort_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -61,5 +61,4 @@ def _merge(group: list[Finding], trajectories: int) -> Finding:
         return replace(worst, sentence=worst.sentence + more)
     count = len({finding.where for finding in group})
     many = f"in {count} of {trajectories} trajectories, worst in " if trajectories > 1 else ""
-    details = f", {worst.details}" if worst.details else ""
-    return replace(worst, sentence=f"{many}{worst.where}{details}: {worst.sentence}")
+    return replace(worst, where=many + worst.where)

@@ -6,22 +6,51 @@ from dataclasses import replace
 
 import numpy as np
 
+from nmpm._support.messages import one_line
 from nmpm.data.format import Split, Trajectory, split_paths
 from nmpm.data.hdf5 import open_hdf5
 from nmpm.data.inspection.dataset_checks import DatasetChecks
 from nmpm.data.inspection.findings import Finding, Severity, merge_findings
 from nmpm.data.inspection.shared_runs import find_shared_runs
-from nmpm.data.loading.sources import DataSource
+from nmpm.data.loading.sources import FolderSource
+from nmpm.errors import DataError
 
 _TRAJECTORIES = {"train": 2, "valid": 1, "test": 1}
 _BYTES = 4 * 2**20  # of positions of a trajectory; of larger ones the first frames are read
 _FRAMES = 40  # at least
 _COMPARED = 20  # trajectories of a split
+_SHOWN, _WIDTH = 3, 120  # findings in a warning, and characters of a line
 _NEED_ALL_FRAMES = frozenset({"still particles", "far bounds", "different domains"})
 
 
-def find_contradictions(source: DataSource) -> tuple[Finding, ...]:
-    """Contradictions in a sample of a source's folder, one of each kind; raises a DataError if it cannot be read."""
+def contradictions_warning(source: FolderSource) -> str:
+    """Up to five lines that name contradictions in a sample of a dataset; empty if there are none."""
+    try:
+        findings = find_contradictions(source)
+    except DataError:  # the training names what cannot be read
+        return ""
+    if not findings:
+        return ""
+    shown = [f"  - {one_line(f'{finding.kind}: {finding.sentence}', _WIDTH)}" for finding in findings[:_SHOWN]]
+    more = f" (and {len(findings) - _SHOWN} more)" if len(findings) > _SHOWN else ""
+    command = " ".join(["nmpm inspect", str(source.path), *_stated_options(source)])
+    return "\n".join(["Warning: these data contradict themselves:", *shown, f"  All of it{more}: {command}", ""])
+
+
+def _stated_options(source: FolderSource) -> list[str]:
+    """The options of `nmpm inspect` by which it reads a dataset as this source does."""
+    options = source.options
+    stated = {
+        "family": options.family,
+        "gravity": options.gravity and ",".join(f"{value:g}" for value in options.gravity),
+        "boundary": options.boundary and ",".join(options.boundary),
+        "bounds": options.bounds and ",".join(f"{low:g}:{high:g}" for low, high in options.bounds),
+    }
+    return [f"--{name}={value}" for name, value in stated.items() if value]
+
+
+def find_contradictions(source: FolderSource) -> tuple[Finding, ...]:
+    """Contradictions in a sample of a dataset, one of each kind; raises a DataError if it cannot be read."""
     splits = {name: Split(path) for name, path in split_paths(source.folder).items()}
     checks, complete = DatasetChecks(source.metadata), True
     for name, split in splits.items():

@@ -12,6 +12,7 @@ import pytest
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 from nmpm.data.inspection import inspect
 from nmpm.data.inspection.findings import Finding, Severity, merge_findings
+from nmpm.data.inspection.quick import contradictions_warning
 from nmpm.data.loading.sources import FolderSource
 
 DT, GRAVITY, SPACING, SIDE, FRAMES = 0.01, 9.81, 0.02, 10, 32
@@ -90,7 +91,7 @@ def thrown_block(
 
 @pytest.fixture
 def data() -> Data:
-    splits = {"train": range(6), "valid": range(6, 8), "test": range(8, 9)}
+    splits = {"train": range(3), "valid": range(3, 4), "test": range(4, 5)}
     types = np.r_[np.full(SIDE**2, 7), np.full(2 * SIDE, 3)]
     return Data(WALL, types, {name: [thrown_block(seed) for seed in seeds] for name, seeds in splits.items()})
 
@@ -189,14 +190,14 @@ LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
                         "boundary: along x, y .*not periodic.*--boundary periodic,periodic", None),
     "periods that are walls": (lambda data: data.state(boundary=("periodic", "wall"), domain=((0, 1), (-0.1, 1.1))),
                                "boundary: along x .* periodic.*--boundary wall,wall", None),
-    "shared runs": (lambda data: data.runs["valid"].__setitem__(0, data.runs["train"][3]),
-                    "shared trajectories: .*1 of 2.*train 00003 and valid 00000", 0.5),
+    "shared runs": (lambda data: data.runs["valid"].__setitem__(0, data.runs["train"][1]),
+                    "shared trajectories: .*1 of 1.*train 00001 and valid 00000", 1),
     "same splits": (lambda data: data.runs.update(test=data.runs["train"][:1]), "test: .*test says nothing", 1),
-    "shared starts": (lambda data: data.runs["valid"].__setitem__(0, drifted(data.runs["train"][3])),
-                      "shared starts: .*train 00003 and valid 00000", 0.5),
+    "shared starts": (lambda data: data.runs["valid"].__setitem__(0, drifted(data.runs["train"][1])),
+                      "shared starts: .*train 00001 and valid 00000", 1),
     "walls as material": (lambda data: data.state(static_types=frozenset(), particle_types={3: "sand", 7: "goop"}),
-                          "still particles: 180 of 180 particles of type 3, sand,.*--static 3", 1),
-    "one type for both": (lambda data: data.change(stuck), "still particles: 60 of 900", None),
+                          "still particles: 100 of 100 particles of type 3, sand,.*--static 3", 1),
+    "one type for both": (lambda data: data.change(stuck), "still particles: 30 of 500", None),
     "walls that move": (lambda data: data.change(wall_moves, ONE), "moving walls: .*train 00002, particle 119", None),
     "named a wall": (lambda data: data.state(particle_types={3: "boundary", 7: "moving wall"}), "walls that are", None),
     "mixed time steps": (lambda data: data.change(lambda run: thrown_block(2, 2 * FRAMES)[::2], ONE),
@@ -209,7 +210,7 @@ LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
     "resolution": (lambda data: data.change(lambda run: thrown_block(9, spacing=0.03), ONE),
                    "different resolution: .*train 00002.* 1.5 times", 1.5),
     "far from the origin": (lambda data: data.move(1000.0), "float32: .*Subtract about .1000, 1000.", None),
-    "short": (lambda data: data.change(lambda run: run[:12], slice(0, 2)), "short trajectories: 2 of 9", 2 / 9),
+    "short": (lambda data: data.change(lambda run: run[:12], slice(0, 2)), "short trajectories: 2 of 5", 0.4),
     "noise": (lambda data: data.change_all(noisy), "measurement noise: .* errors of about 0.01.*--smooth 13", None),
     "overlap": (lambda data: data.change(doubled, ONE), "overlapping particles: .*train 00002", None),
     "teleport": (lambda data: data.change(teleported, ONE), "jumps: .*train 00002, frame 12, particle 5", None),
@@ -225,6 +226,37 @@ def test_a_lie_is_the_first_finding(lie, data, tmp_path):
     assert re.search(words, str(first)), (first, others)
     if factor is not None:
         assert first.factor == pytest.approx(factor, rel=0.08)
+
+
+def test_other_units_change_no_finding(data, tmp_path):
+    data.change(teleported, ONE)
+    data.state(gravity=(0.0, 4 * GRAVITY))
+    length, time = 1000.0, 1e-3
+    findings = data.findings(tmp_path)
+    data.change_all(lambda run: length * run)
+    data.state(
+        dt=time * DT,
+        gravity=(0.0, 4 * GRAVITY * length / time**2),
+        particle_volume=(length * SPACING) ** 2,
+        bounds=((0.0, length),) * 2,
+        domain=((-0.1 * length, 1.1 * length),) * 2,
+    )
+    others = data.findings(tmp_path / "others")
+    assert [(one.kind, one.where, one.details) for one in findings] == [
+        (other.kind, other.where, other.details) for other in others
+    ]
+    assert findings[0].factor == pytest.approx(others[0].factor)
+
+
+def test_a_training_warns_of_contradictions_in_few_lines(data, tmp_path):
+    data.findings(tmp_path)
+    assert contradictions_warning(FolderSource(tmp_path)) == ""
+    data.state(gravity=(0.0, GRAVITY), dt=2 * DT, particle_volume=1.0, boundary=("periodic", "wall"))
+    data.state(domain=((0.0, 1.0), (-0.1, 1.1)), static_types=frozenset())
+    data.findings(tmp_path)
+    _, *findings, command = contradictions_warning(FolderSource(tmp_path)).splitlines()
+    assert len(findings) == 3
+    assert command == f"  All of it (and 2 more): nmpm inspect {tmp_path}"
 
 
 def test_particles_that_come_and_go_are_noted(data, tmp_path):
