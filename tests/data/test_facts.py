@@ -104,13 +104,13 @@ class TestBounds:
         (left, right), (floor, top) = facts.bounds.value
         assert (left, right, floor) == pytest.approx((0.0, 10.0, 0.0), abs=1e-6)
         assert top > 6
-        assert facts.walls[0] == (True, True)
+        assert "x: particles stop or turn at 0 (" in facts.bounds.how
         assert facts.boundary.value == ("wall", "wall")
 
     def test_a_free_block_touches_nothing(self, rng):
         facts = facts_of(*[thrown(rng, (0.0, -1.0), frames=8) for _ in range(3)])
-        assert facts.walls == ((False, False), (False, False))
-        assert facts.bounds.sure == "guessed"
+        assert facts.bounds.sure == facts.boundary.sure == "guessed"
+        assert "stop or turn" not in facts.bounds.how
 
     def test_a_period_from_jumps(self, rng):
         start = rng.uniform(0, 1, (300, 2)) * (4, 1)
@@ -244,6 +244,9 @@ class TestConversion:
         assert metadata.sequence_length == 59
         assert set(metadata.extra["found"]) >= EVERYTHING
         assert any("gravity (0, -2) (measured: free flight" in note for note in notes)
+        assert any(
+            "3 particles of moving types never move (in trajectory 0, e.g. particle 0)" in note for note in notes
+        )
         scene = infer_scene(tmp_path / "a")
         assert scene.materials == ("particles",)
         assert scene.gravity == pytest.approx((0.0, -2.0), abs=1e-3)

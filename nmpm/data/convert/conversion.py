@@ -138,12 +138,19 @@ class _Log:
 
     def find_unknown(self, split: Split) -> None:
         """Completes the metadata by facts about the trajectories; `split` is the first one, as written."""
-        self.metadata = self._finder.facts().complete(self.metadata, self.unknown)
+        facts = self._finder.facts()
+        self.metadata = facts.complete(self.metadata, self.unknown)
         self._facts = [
             f"{name} {_short(getattr(self.metadata, name))} ({how.rstrip('.')})."
             for name, how in self.metadata.extra[FOUND].items()
             if getattr(self.metadata, name) != frozenset() and name != "sequence_length"
         ]
+        if facts.unmoving:
+            first, count = facts.unmoving[0], sum(each.count for each in facts.unmoving)
+            self._facts.append(
+                f"{count} particles of moving types never move (in trajectory {first.trajectory}, e.g. particle"
+                f" {first.particle}). If they are walls, give them a type of their own."
+            )
         if self.unknown & _MOVE_STATISTICS:
             self.motion = MotionStatistics(self.metadata)
             for index in split.sample(_SAMPLE_BYTES):

@@ -137,7 +137,7 @@ def boundary_fact(axes: Sequence[Axis], openings: Openings) -> Fact[tuple[Bounda
     if names and openings.anywhere:
         parts.append(f"{names}: {openings.ends} tracks end and {openings.starts} begin on the way, anywhere")
     elif names:
-        parts.append(f"{names}: {openings.ends} tracks end there, {openings.starts} begin on the way")
+        parts.append(f"{names}: {openings.ends} tracks end near its ends, {openings.starts} begin on the way")
     if walls := [axis.name for axis in axes if axis.boundary == "wall" and (axis.lower or axis.upper)]:
         parts.append(f"{', '.join(walls)}: particles stop or turn at walls")
     if rest := [axis.name for axis in axes if axis.boundary == "wall" and not (axis.lower or axis.upper)]:

@@ -33,6 +33,8 @@ def domain_fact(
             continue
         outer = obstacles[axis] if obstacles else (low, high)
         intervals.append(_whole_cells(min(low - cell, outer[0]), max(high + cell, outer[1]), cell))
+    if "wall" not in boundary:
+        return Fact(tuple(intervals), "the bounds: no axis has walls.", "measured")
     number = round(max(high - low for low, high in intervals) / cell)
     how = f"a cell of wall beyond the bounds, with about {number} cells along the longest side."
     return Fact(tuple(intervals), how, "likely")

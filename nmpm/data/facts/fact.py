@@ -52,7 +52,6 @@ class Facts:
     particle_volume: Fact[float | None]  # None where it is not known
     sequence_length: Fact[int]
     unmoving: tuple[Unmoving, ...] = ()  # particles of materials that never move where others do
-    walls: tuple[tuple[bool, bool], ...] = ()  # per axis, whether particles met a wall at the lower and upper end
 
     def complete(self, metadata: Metadata, unknown: Collection[str]) -> Metadata:
         """The metadata with the `unknown` fields replaced by these facts, and notes on them under the key `found`.
@@ -63,6 +62,8 @@ class Facts:
         names = {*unknown, *({"prescribed_types"} if "static_types" in unknown else ())}
         if "bounds" in unknown and metadata.domain is None:
             names.add("domain")
+        if set(self.particle_types.value) <= set(metadata.particle_types):
+            names.discard("particle_types")
         facts: Mapping[str, Fact[Any]] = {name: fact for name, fact in vars(self).items() if name in names}
         values = {name: fact.value for name, fact in facts.items()}
         if "particle_types" in values:

@@ -62,7 +62,7 @@ class FactFinder:
         reach = (high - low).max(axis=1).astype(np.float64)
         seen_once = np.isfinite(position[..., 0]).sum(axis=0) < 2
         reach[seen_once] = np.nan
-        self._motion.add(types[present], reach[present], mean_spacing(low[present], high[present]))
+        self._motion.add(types, present, reach, mean_spacing(low[present], high[present]))
         self._samples.add(trajectory)
 
     def facts(self) -> Facts:
@@ -92,7 +92,6 @@ class FactFinder:
             particle_volume=volume,
             sequence_length=self._length(),
             unmoving=self._motion.unmoving(materials),
-            walls=tuple((axis.lower is not None, axis.upper is not None) for axis in axes),
         )
 
     def _paths_by_type(self, types: frozenset[int]) -> dict[int, list[np.ndarray]]:

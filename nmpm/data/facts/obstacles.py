@@ -24,11 +24,18 @@ class TypeMotion:
         self._unmoving: dict[int, list[Unmoving]] = {}
         self.count = 0
 
-    def add(self, types: np.ndarray, reach: np.ndarray, spacing: float) -> None:
-        """Adds a trajectory: (N,) types, and the extent (N,) of each particle's path, NaN where seen only once."""
+    def add(self, types: np.ndarray, present: np.ndarray, reach: np.ndarray, spacing: float) -> None:
+        """Adds a trajectory.
+
+        Args:
+            types: (N,) type ids.
+            present: (N,) whether a particle is ever there.
+            reach: (N,) extent of each particle's path, NaN where it is there in less than two frames.
+            spacing: Mean distance of particles.
+        """
         paths_of_movers = reach[reach > _STILL * spacing]
         moving = len(paths_of_movers) > 0 and float(np.median(paths_of_movers)) > _MOVES * spacing
-        for kind in np.unique(types).tolist():
+        for kind in np.unique(types[present]).tolist():
             of_kind = np.flatnonzero(types == kind)
             paths = reach[of_kind]
             self.types[kind] = self.types.get(kind, 0) + 1

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 _ZONE = 0.1  # of the extent at each end: where particles that leave an axis are seen last
+_GONE = 5  # frames after which an absent particle has left; another may be in its place later
 _MOST = 0.6  # of the ends of tracks: if so many are in the zones of some axes, those axes explain them
 _ENRICHED = 2.0  # times as many ends of tracks in the zones as positions
 
@@ -44,8 +45,9 @@ def find_openings(positions: Sequence[np.ndarray], low: np.ndarray, high: np.nda
 
 
 def _track_ends(position: np.ndarray) -> np.ndarray:
-    """The last positions (K, D) of particles that are absent from then on."""
+    """The last positions (K, D) of particles that are then absent for five frames, or until the end."""
     present = np.isfinite(position).all(axis=2)
-    last = len(present) - 1 - present[::-1].argmax(axis=0)
-    ends = present.any(axis=0) & (last < len(present) - 1)
-    return np.asarray(position[last[ends], np.flatnonzero(ends)], np.float64)
+    ends = present[:-1].copy()
+    for later in range(1, _GONE + 1):
+        ends[: len(present) - later] &= ~present[later:]
+    return np.asarray(position[:-1][ends], np.float64)
