@@ -7,7 +7,7 @@ import json
 import sys
 import tempfile
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,10 +18,12 @@ from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
+    from nmpm.data.grid_rule import GridCost
     from nmpm.data.inspection import Inspection, Range
     from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
+_GRIDS_ASIDE = 3  # of the recommended one, on either side
 _MOST_FINDINGS = 9
 _TITLES = {"contradiction": "contradictions: models of these data will be wrong", "oddity": "odd: look at it"}
 _EXAMPLES = """\
@@ -66,10 +68,12 @@ def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namesp
     inspection = inspect(source, arguments.trajectories)
     damaged = (Finding("unreadable", Severity.CONTRADICTION, problem) for problem in damage)
     inspection = replace(inspection, path=str(arguments.path), findings=(*damaged, *inspection.findings))
+    inspection, costs = _with_costs(inspection)
     if arguments.json:
-        sys.stdout.write(json.dumps(asdict(inspection), indent=1) + "\n")
+        plain = asdict(inspection) | {"costs": {cells: asdict(cost) for cells, cost in costs.items()}}
+        sys.stdout.write(json.dumps(plain, indent=1) + "\n")
         return
-    sys.stdout.write("\n".join(_lines(inspection)) + "\n")
+    sys.stdout.write("\n".join(_lines(inspection, costs)) + "\n")
     if arguments.no_picture:
         return
     from nmpm.data.inspection.reading import open_dataset
@@ -85,6 +89,21 @@ def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namesp
         sys.stdout.write(f"\nwrote {out}\n")
     except (NmpmError, OSError) as error:
         sys.stdout.write(f"\nno picture: {error}\n")
+
+
+def _with_costs(inspection: Inspection) -> tuple[Inspection, dict[int, GridCost]]:
+    """The inspection with the cells that are recommended for this machine, and what a training on each grid costs."""
+    from nmpm.data.grid_rule import grid_cost, recommended_cells, training_size
+    from nmpm.evaluation.pace import measure_machine
+
+    machine = measure_machine(inspection.dim)
+    particles = max(split.particles[1] for split in inspection.splits.values())
+    shapes = {grid.cells: grid.shape for grid in inspection.grids}
+    costs = {
+        cells: grid_cost(shape, particles, machine, training_size(shape, particles, machine))
+        for cells, shape in shapes.items()
+    }
+    return replace(inspection, recommended=recommended_cells(inspection.grids, particles, machine)), costs
 
 
 def _open(path: Path, format_name: str | None, options: Options, native: Path) -> tuple[FolderSource, list[str]]:
@@ -115,7 +134,7 @@ def _dataset_of(path: Path) -> Path:
     return path.parent if path in split_paths(path.parent).values() else path
 
 
-def _lines(inspection: Inspection) -> Iterator[str]:
+def _lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[str]:
     """The lines of the summary, at most 100 characters wide."""
     yield f"{inspection.path}: {inspection.dim}-D, {inspection.dt:g} s between frames"
     yield from _finding_lines(inspection)
@@ -148,21 +167,28 @@ def _lines(inspection: Inspection) -> Iterator[str]:
         for number, line in enumerate(text.splitlines()):
             start = f"  {'' if number else label:<10}"
             yield from textwrap.wrap(line, _WIDTH, initial_indent=start, subsequent_indent=" " * 14)
-    yield ""
-    yield "  grid          particles per    cells per frame"
-    yield "                occupied cell    median    99.9%      max"
-    for grid in inspection.grids:
-        mark = "  <- recommended" if grid.cells == inspection.recommended else ""
-        shape = " x ".join(map(str, grid.shape))
-        yield (
-            f"  {shape:<14}{grid.per_cell:>10.2f}    {grid.median_speed:>9.3f}{grid.high_speed:>9.2f}"
-            f"{grid.most_speed:>9.2f}{mark}"
-        )
+    yield from _grid_lines(inspection, costs)
     notes = [*inspection.notes, *(str(note) for note in _merged(inspection) if note.severity == "note")]
     if notes:
         yield from ("", "  notes")
     for note in notes:
         yield from textwrap.wrap(note, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+
+
+def _grid_lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[str]:
+    """A table of the grids around the recommended one."""
+    yield ""
+    yield "  grid          particles per    cells per frame               training here, 15 minutes"
+    yield "                occupied cell    median    99.9%      max      s a step     steps"
+    first = max(0, [grid.cells for grid in inspection.grids].index(inspection.recommended) - _GRIDS_ASIDE)
+    for grid in inspection.grids[first : first + 2 * _GRIDS_ASIDE + 1]:
+        cost = costs[grid.cells]
+        mark = "  <- recommended" if grid.cells == inspection.recommended else ""
+        mark = mark if cost.fits else f"  needs {cost.memory / 1e9:.0f} GB of memory"
+        yield (
+            f"  {' x '.join(map(str, grid.shape)):<14}{grid.per_cell:>10.2f}    {grid.median_speed:>9.3f}"
+            f"{grid.high_speed:>9.2f}{grid.most_speed:>9.2f}{cost.seconds:>14.2g}{cost.steps:>10}{mark}"
+        )
 
 
 def _finding_lines(inspection: Inspection) -> Iterator[str]:

@@ -24,6 +24,7 @@ def test_one_screen_and_a_picture(dataset, tmp_path, capsys):
     assert max(len(line.replace(str(tmp_path), "")) for line in lines) <= 100
     assert "train     2 trajectories of 12 frames, 40-50 particles + 4 at rest" in said
     assert "<- recommended" in said
+    assert "training here, 15 minutes" in said
     assert "nothing contradictory or odd found" in said
     with Image.open(tmp_path / "look.png") as picture:
         assert min(picture.size) > 200
@@ -34,6 +35,7 @@ def test_json_is_all_there_is_on_standard_output(dataset, tmp_path, monkeypatch,
     assert main(["inspect", str(dataset), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["splits"]["train"]["particles"] == [40, 50]
+    assert summary["costs"][str(summary["recommended"])]["steps"] > 0
     assert not list(tmp_path.glob("*.png"))
 
 
