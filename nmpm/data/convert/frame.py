@@ -33,6 +33,7 @@ class Frame:
         step: Number of the simulator's step; None where the file does not state it.
         box: (lower, upper) per axis, of the simulator; None where the file does not state it.
         boundary: Of the box, per axis.
+        left_out: Names of what else is in the file.
     """
 
     position: np.ndarray
@@ -41,6 +42,7 @@ class Frame:
     step: int | None = None
     box: tuple[Interval, ...] | None = None
     boundary: tuple[Boundary, ...] | None = None
+    left_out: tuple[str, ...] = ()
 
 
 def flat_axes(frames: Sequence[Frame]) -> dict[int, float]:
@@ -60,26 +62,36 @@ class Layout:
         axes: The axes of the files that are kept.
         constant: Values of the axes that are left out, which are the same for all particles.
         type_ids: Type ids by the names in the files, where types have names.
+        id_name: The array of the particles' ids; None if there is none.
+        left_out: Names of what else is in the files.
     """
 
     axes: tuple[int, ...]
     constant: Mapping[int, float]
     type_ids: Mapping[str, int]
+    id_name: str | None
+    left_out: tuple[str, ...]
 
     @classmethod
     def of(cls, frames: Sequence[Frame], type_ids: Mapping[str, int]) -> Layout:
-        """The layout of frames; an axis in which nothing has an extent is left out."""
-        constant = flat_axes(frames)
-        return cls(
-            tuple(axis for axis in range(frames[0].position.shape[1]) if axis not in constant), constant, type_ids
-        )
+        """The layout of frames: an axis in which nothing has an extent is left out; ids differ in the first frame."""
+        constant, first = flat_axes(frames), frames[0]
+        axes = tuple(axis for axis in range(first.position.shape[1]) if axis not in constant)
+        id_name = _name_of(first.arrays, "id", _identities)
+        texts = ParticleArrays.of(first, axes, id_name).texts
+        return cls(axes, constant, type_ids, id_name, (*first.left_out, *texts))
 
     def notes(self) -> tuple[str, ...]:
         """For the user."""
-        return tuple(
+        flat = tuple(
             f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {' and '.join(AXES[i] for i in self.axes)}."
             for axis, value in self.constant.items()
         )
+        ids = f"Particles are matched by the array {self.id_name!r}." if self.id_name else ""
+        left_out = (
+            f"Left out, as they are not numbers of particles: {', '.join(self.left_out)}." if self.left_out else ""
+        )
+        return tuple(note for note in (*flat, ids, left_out) if note)
 
 
 def wrap(position: np.ndarray, box: Sequence[Interval] | None, boundary: Sequence[Boundary] | None) -> np.ndarray:
@@ -103,36 +115,53 @@ class ParticleArrays:
     present: np.ndarray | None  # (N,) bool
     velocity: np.ndarray | None  # (N, D) of the axes that are kept
     scalars: Mapping[str, np.ndarray]  # (N,) each
+    texts: tuple[str, ...]  # names of other arrays that have no numbers
 
     @classmethod
-    def of(cls, frame: Frame, axes: Sequence[int]) -> ParticleArrays:
+    def of(cls, frame: Frame, axes: Sequence[int], id_name: str | None) -> ParticleArrays:
         """Sorts arrays by their usual names; what has another name, or does not fit its name, is a field.
 
-        `axes` are those of the positions that are kept; a velocity has them, too.
+        Args:
+            frame: The frame.
+            axes: The axes of the positions that are kept; a velocity has them, too.
+            id_name: The array of ids; None if there is none.
         """
         left = {name: values for name, values in frame.arrays.items() if not _is_position(name, values)}
-        identity, present = _take(left, "id", _integers), _take(left, "active", _integers)
+        identity = _integers(left.pop(id_name)) if id_name in left else None
+        present = _take(left, "active", _integers)
         types, type_names = _take(left, "types", _integers), _take(left, "types", _strings)
         velocity = _take(left, "velocity", partial(_vectors, axes=axes))
         velocity = _take_components(left, axes) if velocity is None else velocity
         scalars = {name: scalar for key, values in left.items() for name, scalar in _scalars(key, values)}
-        return cls(identity, types, type_names, None if present is None else present != 0, velocity, scalars)
+        texts = tuple(name for name, values in left.items() if values.dtype.kind not in "biuf")
+        return cls(identity, types, type_names, None if present is None else present != 0, velocity, scalars, texts)
 
 
 def _is_position(name: str, values: np.ndarray) -> bool:
     return plain_name(name) in (AXES if values.ndim == 1 else USUAL_NAMES["position"])
 
 
+def _name_of(
+    arrays: Mapping[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
+) -> str | None:
+    """The first array whose name has a meaning and that fits; None if there is none."""
+    by_name = {plain_name(name): name for name in reversed([*arrays])}
+    names = (by_name[usual] for usual in USUAL_NAMES[meaning] if usual in by_name)
+    return next((name for name in names if convert(arrays[name]) is not None), None)
+
+
 def _take(
     arrays: dict[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
 ) -> np.ndarray | None:
     """Removes the first array whose name has a meaning and that fits, and returns it; None if there is none."""
-    by_name = {plain_name(name): name for name in reversed(arrays)}
-    for name in USUAL_NAMES[meaning]:
-        if name in by_name and (values := convert(arrays[by_name[name]])) is not None:
-            del arrays[by_name[name]]
-            return values
-    return None
+    name = _name_of(arrays, meaning, convert)
+    return None if name is None else convert(arrays.pop(name))
+
+
+def _identities(values: np.ndarray) -> np.ndarray | None:
+    """Integers of which none occurs twice."""
+    integers = _integers(values)
+    return integers if integers is not None and len(np.unique(integers)) == len(integers) else None
 
 
 def _integers(values: np.ndarray) -> np.ndarray | None:

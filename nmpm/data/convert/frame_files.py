@@ -28,7 +28,6 @@ import numpy as np
 from nmpm._support.messages import counted
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import (
-    UNKNOWN_LENGTH,
     DatasetFormat,
     ForeignDataset,
     Options,
@@ -37,8 +36,8 @@ from nmpm.data.convert.base import (
 )
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes
 from nmpm.data.convert.frame_stack import FrameStack
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide, keep_whole
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide, keep_whole, placeholder_metadata
+from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
 
 _DEPTH = 3  # of folders
@@ -96,8 +95,12 @@ class FrameFormat(DatasetFormat):
         first = self._first_frames(next(iter(splits.values()))[0])
         layout = Layout.of(first, self._type_ids(first, runs))
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
-        unknown = EVERYTHING_UNKNOWN - {name for name, value in stated.items() if value is not None}
-        metadata, unknown = apply_family(_metadata(layout, first[0]), unknown, options)
+        facts = {
+            name: tuple(value[axis] for axis in layout.axes) for name, value in stated.items() if value is not None
+        }
+        names = {number: name for name, number in layout.type_ids.items()}
+        metadata = placeholder_metadata(len(layout.axes), particle_types=names, **facts)
+        metadata, unknown = apply_family(metadata, EVERYTHING_UNKNOWN - set(facts), options)
         dataset = ForeignDataset(
             options.apply_to(metadata),
             {split: partial(self._read_all, each, layout) for split, each in splits.items()},
@@ -166,7 +169,7 @@ class FrameFormat(DatasetFormat):
         """Type ids by the names in the first frame of all runs, where types have names; those of the files, or new."""
 
         def ids(frame: Frame) -> dict[str, int]:
-            arrays = ParticleArrays.of(frame, range(frame.position.shape[1]))
+            arrays = ParticleArrays.of(frame, range(frame.position.shape[1]), None)
             if arrays.type_names is None:
                 return {}
             names, index = np.unique(arrays.type_names, return_index=True)
@@ -180,9 +183,9 @@ class FrameFormat(DatasetFormat):
         if named:
             others = (frame for run in runs for frame in islice(self.frames(run.present[0]), 1))
             named = {name: number for frame in (*others, *first) for name, number in ids(frame).items()}
-        if len(set(named.values())) < len(named):
-            named = {name: number for number, name in enumerate(sorted(named))} if set(named.values()) == {-1} else {}
-        return named
+        if set(named.values()) == {-1}:
+            return {name: number for number, name in enumerate(sorted(named))}
+        return named if len(set(named.values())) == len(named) else {}
 
     def _read_all(self, runs: Sequence[FrameRun], layout: Layout) -> Iterator[Trajectory]:
         for run in runs:
@@ -275,15 +278,3 @@ def _split_of(file: Path, path: Path) -> str | None:
     if splits[1:-1].count(None) < len(splits[1:-1]) and splits[0] is None:
         raise DataError(f"{path}: there are datasets in its folders. Give one of them: {path / names[0]}.")
     return splits[0] if splits else None
-
-
-def _metadata(layout: Layout, frame: Frame) -> Metadata:
-    """What the first frame states; the rest is unknown."""
-    return Metadata(
-        bounds=tuple((0.0, 1.0) if frame.box is None else frame.box[axis] for axis in layout.axes),
-        dt=1.0,
-        dim=len(layout.axes),
-        sequence_length=UNKNOWN_LENGTH,
-        particle_types={index: name for name, index in layout.type_ids.items()},
-        boundary=() if frame.boundary is None else tuple(frame.boundary[axis] for axis in layout.axes),
-    )

@@ -31,6 +31,7 @@ class FrameStack:
 
     def __init__(self, layout: Layout, frames: int | None = None) -> None:
         self._axes, self._constant, self._type_ids = list(layout.axes), layout.constant, layout.type_ids
+        self._id_name = layout.id_name
         self._frames, self._count = frames or _FRAMES, 0
         self._values: dict[str, np.ndarray] = {}  # (frames, particles, …), with room for more
         self._particles = self._room = 0
@@ -41,6 +42,7 @@ class FrameStack:
         self._times: list[float] = []
         self._first = ""  # the first frame with particles
         self._empty = ""
+        self._left_out: set[str] = set()
 
     def add_absent(self) -> None:
         """Adds a frame in which there is no particle, at an unknown time."""
@@ -62,7 +64,7 @@ class FrameStack:
         self._times[-1] = np.nan if frame.time is None else frame.time
 
     def _add_particles(self, frame: Frame, where: str) -> None:
-        arrays = ParticleArrays.of(frame, self._axes)
+        arrays = ParticleArrays.of(frame, self._axes, self._id_name)
         position = self._position(frame.position, where)
         first = not self._first
         if first:
@@ -84,7 +86,8 @@ class FrameStack:
             self._set("velocity", t, slots, arrays.velocity, first)
         for name, values in arrays.scalars.items():
             self._set(name, t, slots, values, first)
-        self._drop_incomplete({"position", "velocity", *arrays.scalars}, arrays.velocity is not None, where)
+        velocity = set() if arrays.velocity is None else {"velocity"}
+        self._leave_out({"position", *velocity, *arrays.scalars}, where)
 
     def _position(self, values: np.ndarray, where: str) -> np.ndarray:
         """(N, D) float32 of the axes that are kept."""
@@ -157,12 +160,12 @@ class FrameStack:
         if name in self._values:
             self._values[name][t, slots] = values
 
-    def _drop_incomplete(self, names: set[str], velocity: bool, where: str) -> None:
-        for name in set(self._values) - (names if velocity else names - {"velocity"}):
-            _log.warning(
-                "%s: there is no array %r, which the first frame has; it is left out.", where, one_line(name, 60)
-            )
-            del self._values[name]
+    def _leave_out(self, names: set[str], where: str) -> None:
+        """Drops arrays that are not in all frames, with a warning; `names` are those of a frame."""
+        for name in sorted((set(self._values) ^ names) - self._left_out):
+            _log.warning("%s: the array %r is not in all frames; it is left out.", where, one_line(name, 60))
+            self._left_out.add(name)
+            self._values.pop(name, None)
 
     def _frame_types(self, arrays: ParticleArrays, where: str) -> np.ndarray | None:
         """(N,) type ids of a frame."""

@@ -48,7 +48,11 @@ def _frame(content: Any, file: Path) -> Frame:
     position = np.stack([vertices[axis].astype(np.float64) for axis in axes], axis=1)
     arrays = {name: np.array(vertices[name]) for name in names if name not in axes and vertices[name].dtype != object}
     times = (_TIME.search(comment) for comment in (*content.comments, *content.obj_info))
-    return Frame(position, arrays, next((_number(match[1]) for match in times if match), None))
+    left_out = (
+        *(name for name in elements if name != "vertex"),
+        *(name for name in names if vertices[name].dtype == object),
+    )
+    return Frame(position, arrays, next((_number(match[1]) for match in times if match), None), left_out=left_out)
 
 
 def _number(text: str) -> float | None:

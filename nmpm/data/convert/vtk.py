@@ -43,6 +43,9 @@ class Vtk(FrameFormat):
                 hint = " It is the last of the list: if it is still being written, leave it out."
                 raise DataError(f"{error}{hint if number == len(entries) - 1 else ''}") from error
 
+    def count(self, file: Path) -> int:
+        return len(_entries(file)) if file.suffix.lower() == ".pvd" else 1
+
 
 def _read(path: Path, time: float | None) -> Frame:
     """The points of a file; `time` overrides that in the file."""
@@ -74,11 +77,13 @@ def _read(path: Path, time: float | None) -> Frame:
     position = np.zeros((0, 3)) if points is None else vtk_to_numpy(points.GetData()).copy()
     data, cells = output.GetPointData(), output.GetCellData()
     arrays = _arrays(data, vtk_to_numpy)
-    if output.GetNumberOfCells() == len(position):
-        arrays = _arrays(cells, vtk_to_numpy) | arrays
+    cell_arrays = _arrays(cells, vtk_to_numpy)
+    fit = output.GetNumberOfCells() == len(position)  # a vertex for each point
+    arrays = cell_arrays | arrays if fit else arrays
     if (ids := data.GetGlobalIds()) is not None:
         arrays["GlobalIds"] = vtk_to_numpy(ids).copy()
-    return Frame(position, arrays, _time(output) if time is None else time)
+    left_out = () if fit else tuple(f"{name} of cells" for name in cell_arrays)
+    return Frame(position, arrays, _time(output) if time is None else time, left_out=left_out)
 
 
 def _arrays(data: Any, convert: Any) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.convert import convert, open_dataset
-from nmpm.data.format import Split, Trajectory
+from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.errors import DataError
 
 T, N = 12, 6
@@ -168,7 +168,7 @@ def test_times_and_an_array_that_some_frames_lack(tmp_path, caplog):
         fields = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out").fields
     assert fields["time"].tolist() == (0.5 * np.arange(T)).tolist()
     assert "heat" not in fields
-    assert "frame 2: there is no array 'heat'" in caplog.text
+    assert "frame 2: the array 'heat' is not in all frames" in caplog.text
 
 
 TWO = [[0, 0, 0], [1, 1, 1]]
@@ -179,7 +179,6 @@ ONE_MORE = [*TWO, [0.5, 0.5, 0.6]]
     ("second", "message"),
     [
         (frame_text(np.array(ONE_MORE), "pos:R:3"), "frame 1: 3 particles, but 2 in .*frame 0. .*id array"),
-        (frame_text(np.array(TWO), "pos:R:3:id:I:1", id=[1, 2]), "frame 1: only some frames have ids"),
         (frame_text(np.array(TWO), "pos:R:3:type:I:1", id=[1, 2]), "frame 1: only some frames have types"),
         (frame_text(np.array([[0, 0, np.inf], [1, 1, 1]])), r"frame 1: position of particle 0 is \[0.0, 0.0, inf\]"),
         (frame_text(np.array(TWO)[:, :2], "pos:R:2"), "frame 1: 2 axes, unlike the first frame"),
@@ -188,12 +187,41 @@ ONE_MORE = [*TWO, [0.5, 0.5, 0.6]]
         ("2\nProperties=where:R:3\n0 0 0\n1 1 1\n", "Properties=where:R:3 does not list names, kinds and widths, or"),
         ("2\nProperties=pos:R:3\n0 0 0\n1 1\n", "frame 1: .*column"),
     ],
-    ids=["number", "ids", "types", "infinite", "axes", "cut", "no number", "no positions", "columns"],
+    ids=["number", "types", "infinite", "axes", "cut", "no number", "no positions", "columns"],
 )
 def test_frames_that_do_not_fit_are_named(tmp_path, second, message):
     write_frames(tmp_path / "run.xyz", frame_text(np.array(TWO)), second)
     with pytest.raises(DataError, match=f"run.xyz.*{message}"):
         convert(tmp_path / "run.xyz", tmp_path / "out")
+
+
+def test_ids_in_some_frames_only_are_refused(tmp_path):
+    first = frame_text(np.array(TWO), "pos:R:3:id:I:1", id=[1, 2])
+    with pytest.raises(DataError, match="frame 1: only some frames have ids"):
+        convert(write_frames(tmp_path / "run.xyz", first, frame_text(np.array(TWO))), tmp_path / "out")
+
+
+def test_equal_ids_in_the_first_frame_are_no_ids(tmp_path):
+    """They are the number of a body, or of a process."""
+    frames = [frame_text(p, "pos:R:3:tag:I:1", tag=[1, 1, 1, 2, 2, 2]) for p in positions()]
+    trajectory = read(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+    assert trajectory.fields["tag"][0].tolist() == [1, 1, 1, 2, 2, 2]
+
+
+def test_texts_that_are_no_types_are_left_out_with_a_note(tmp_path):
+    frames = [frame_text(p, "pos:R:3:colour:S:1", colour=["red"] * N) for p in positions()]
+    notes = convert(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
+    assert any(note.startswith("Left out") and "colour" in note for note in notes)
+
+
+def test_one_type_with_a_name(tmp_path):
+    frames = [frame_text(p, "material:S:1:pos:R:3", p=["honey"] * N) for p in positions()]
+    lines = [frame.split("\n", 2) for frame in frames]  # the name is the first column
+    texts = [f"{n}\n{keys}\n" + "".join(f"honey {' '.join(row.split()[:3])}\n" for row in rows.splitlines())
+             for n, keys, rows in lines]  # fmt: skip
+    trajectory = read(write_frames(tmp_path / "run.xyz", *texts), tmp_path / "out")
+    assert trajectory.particle_type.tolist() == [0] * N
+    assert read_metadata(tmp_path / "out").particle_types == {0: "honey"}
 
 
 def test_a_type_that_changes_is_named(tmp_path):
