@@ -159,10 +159,10 @@ def test_rows_without_a_track_are_left_out_with_a_warning(tmp_path, caplog):
 
 
 def test_a_sample_of_tracks_is_read(recorded):
-    run = read(recorded / "third-party" / "ptv-tracks")
-    assert run.position.shape[0] == 160
-    assert np.isnan(run.position[..., 0]).all(axis=1).sum() == 2
-    assert np.isfinite(run.position[..., 0]).sum() == 65_577
+    runs = [read(recorded / "third-party" / "ptv-tracks", split) for split in ("train", "valid", "test")]
+    assert [len(run.position) for run in runs] == [128, 16, 16]
+    assert sum(np.isnan(run.position[..., 0]).all(axis=1).sum() for run in runs) == 2
+    assert sum(np.isfinite(run.position[..., 0]).sum() for run in runs) == 65_577
 
 
 def test_tables_of_pandas_and_of_track_mate_are_read(tmp_path):
