@@ -14,7 +14,7 @@ from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
-DESCRIPTION = ("scene", "particle_types", "static_types")
+DESCRIPTION = ("scene", "particle_types", "static_types", "prescribed_types")
 """Names of these attributes."""
 
 

@@ -81,8 +81,9 @@ def add_vtkhdf(file: Any, dt: float) -> None:
 def _blocks(trajectories: list[Any]) -> Iterator[_Block]:
     for trajectory in trajectories:
         number = "" if len(trajectories) == 1 else "_" + trajectory.name.strip("/")
-        yield _Block("trajectory" + number, trajectory)
-        if _is_like_position(trajectory.get(TRUTH), trajectory["position"].shape):
+        has_truth = _is_like_position(trajectory.get(TRUTH), trajectory["position"].shape)
+        yield _Block(("prediction" if has_truth else "trajectory") + number, trajectory)
+        if has_truth:
             yield _Block(TRUTH + number, trajectory, TRUTH)
 
 

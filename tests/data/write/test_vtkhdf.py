@@ -60,7 +60,7 @@ def test_several_trajectories_and_truths_are_blocks(tmp_path):
     write_viewable(tmp_path / "out.h5", [one, other], dt=1)
     steps = [step for _, step in read(tmp_path / "out.h5")]
     names = [steps[0].GetMetaData(i).Get(steps[0].NAME()) for i in range(3)]
-    assert names == ["trajectory_00000", "truth_00000", "trajectory_00001"]
+    assert names == ["prediction_00000", "truth_00000", "trajectory_00001"]
     for frame, step in enumerate(read(tmp_path / "out.h5")):
         points = [arrays(step[1].GetBlock(block))[0][:, :2] for block in range(3)]
         np.testing.assert_array_equal(points[0], one.position[frame])
