@@ -233,9 +233,9 @@ def test_absent_particles_everywhere_are_an_error():
 
 class TestConversion:
     def test_bare_positions_become_a_scene(self, rng, tmp_path):
-        runs = [
-            Trajectory(thrown(rng, (0.0, -2.0)), np.full(144, 4), {}, {"time": 0.1 * np.arange(60)}) for _ in range(3)
-        ]
+        positions = [thrown(rng, (0.0, -2.0)) for _ in range(3)]
+        positions[0][:, :3] = positions[0][0, :3]
+        runs = [Trajectory(each, np.full(144, 4), {}, {"time": 0.1 * np.arange(60)}) for each in positions]
         source = ForeignDataset(PLACEHOLDERS, {"train": lambda: iter(runs)}, unknown=EVERYTHING)
         notes = write_native(source, tmp_path / "a")
         metadata = read_metadata(tmp_path / "a")
