@@ -96,6 +96,11 @@ def _load(arguments: argparse.Namespace) -> ModelUnderTest:
 
     model = load_model(arguments.model, arguments.device, arguments.root).optimized(arguments.runtime)
     choose_threads(model, arguments.threads)
+    if "open" in model.scene.boundary:
+        raise ConfigError(
+            f"{arguments.model}: these tests are of closed boxes, and the model's scenes have open axes."
+            " `nmpm compare` and `nmpm rollout --data` measure it on recordings."
+        )
     preset = arguments.preset or (model.preset if model.preset in preset_names() else None)
     emulator = model.emulator.unconstrained() if arguments.free else model.emulator
     return ModelUnderTest(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -40,8 +41,16 @@ def _state_numbers(particles: Particles) -> list[_Numbers]:
             for name, values in (vectors | numbers).items()
         ),
         _Numbers("obstacle particle {}: its position", particles.obstacle, particles.obstacle_mask),
+        *_optional_numbers(particles),
         _Numbers("its gravity", particles.gravity.unsqueeze(1), torch.ones_like(real[:, :1])),
     ]
+
+
+def _optional_numbers(particles: Particles) -> Iterator[_Numbers]:
+    if particles.volume is not None:
+        yield _Numbers("particle {}: its volume", particles.volume.unsqueeze(-1), particles.mask)
+    if particles.obstacle_velocity is not None:
+        yield _Numbers("obstacle particle {}: its velocity", particles.obstacle_velocity, particles.obstacle_mask)
 
 
 def check_inputs(emulator: Emulator, particles: Particles) -> None:

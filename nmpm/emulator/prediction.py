@@ -81,7 +81,7 @@ class TensorSteps(Steps):
     def _solids_ahead(self, particles: Particles) -> Tensor | None:
         """(B, m, *S) solid fraction at each frame, of obstacles that keep their velocity; None where none moves."""
         model, velocity = self.emulator, particles.obstacle_velocity
-        if not (model.scene.moving_obstacles and model.constraints.solids) or model.training or velocity is None:
+        if velocity is None or model.training or not (model.scene.obstacles and model.constraints.solids):
             return None
         at_frames = (
             dataclasses.replace(particles, obstacle=particles.obstacle + frame * velocity)
@@ -159,15 +159,15 @@ class TrainingSteps(TensorSteps):
 def steps_for(emulator: Emulator, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
-    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`), particles of one size, and
-    outside of `without_kernels`: in training mode those with gradients, if neither obstacles nor gravity need any; in
-    evaluation mode those without. Graphs that `torch.compile` traces take tensor operations.
+    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`), particles of one size and
+    obstacles at rest, outside of `without_kernels`: in training mode those with gradients, if neither obstacles nor
+    gravity need any; in evaluation mode those without. Graphs that `torch.compile` traces take tensor operations.
     """
     motion, fixed = (particles.position, particles.velocity), (particles.gravity, solid)
     parameters, is_float32 = emulator.kernel_parameters, emulator.precision == torch.float32
     if parameters is None or not is_float32 or not kernels_take(*motion, particles.gravity):
         return TensorSteps(emulator)
-    if particles.volume is not None:
+    if particles.volume is not None or particles.obstacle_velocity is not None:
         return TensorSteps(emulator)
     if torch.compiler.is_compiling() or _need_gradients(fixed):
         return TensorSteps(emulator)

@@ -89,6 +89,7 @@ class Pretrained:
         dtype: torch.dtype = torch.float32,
         fields: Mapping[str, ArrayLike | Tensor] | None = None,
         bodies: Bodies | None = None,
+        volume: ArrayLike | Tensor | None = None,
     ) -> Particles:
         """A state to start a rollout from, of N particles in each of B scenes, in D dimensions.
 
@@ -105,13 +106,15 @@ class Pretrained:
                 scene has one of. One that is left out has its mean over the training data.
             bodies: Obstacles of `nmpm.obstacles`, of D dimensions: a list for all scenes, or a list for each of B. To
                 their parameters, such as angles and sizes, gradients flow.
+            volume: (N,) or (B, N) volumes of the particles, as multiples of `scene.particle_volume`; 1 when left out.
 
         Returns:
             The state on the model's device, with velocities and gravity converted to frames.
 
         Raises:
             DataError: if shapes do not fit together, values are not finite, a particle is outside of the domain or far
-                faster than the model was calibrated for, a material is unknown, or gravity is not the model's.
+                faster than the model was calibrated for, a material is unknown, gravity is not the model's, or a volume
+                not positive.
             ConfigError: if a body is impossible, or outside of the domain.
 
         Warns:
@@ -119,7 +122,7 @@ class Pretrained:
                 fields that the model does not have.
         """
         builder = StateBuilder(self.emulator, position, dtype)
-        return builder.build(velocity, material, obstacle, gravity, fields, bodies).to(self.emulator.device)
+        return builder.build(velocity, material, obstacle, gravity, fields, bodies, volume).to(self.emulator.device)
 
     def start(self, trajectory: Trajectory, frame: int = 1, materials: Mapping[str, str] | None = None) -> Particles:
         """The state of a recorded trajectory at a frame, to start a rollout from.

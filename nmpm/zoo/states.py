@@ -62,6 +62,7 @@ class StateBuilder:
         gravity: Any,
         fields: Mapping[str, Any] | None,
         bodies: Bodies | None,
+        volume: Any = None,
     ) -> Particles:
         """The state, with velocities and gravity converted to frames; raises as `Pretrained.state`."""
         solid, share = self._obstacle(obstacle), None
@@ -78,6 +79,7 @@ class StateBuilder:
             gravity=self.gravity(gravity),
             fields=self._fields(fields or {}),
             obstacle_share=share,
+            volume=None if volume is None else self._volume(volume),
         )
         check_inputs(self.emulator, state)
         self._check_speeds(speed, kind)
@@ -96,6 +98,18 @@ class StateBuilder:
             shape = (self.batch, count)
             fields[name] = self._expand(name, values, [(), shape[1:], shape], shape).to(self.dtype)
         return fields
+
+    def _volume(self, given: Any) -> Tensor:
+        """(B, N) multiples of the scene's particle volume."""
+        shape = (self.batch, self.count)
+        values = self._expand("volume", given, [(), shape[1:], shape], shape)
+        if not bool((values > 0).all()):
+            scene, particle = map(int, (~(values > 0)).nonzero()[0])
+            raise DataError(
+                f"Scene {scene}, particle {particle}: volume = {float(values[scene, particle]):g} must be positive: a"
+                f" multiple of scene.particle_volume, {self.scene.particle_volume:g}."
+            )
+        return values.to(self.dtype)
 
     def _velocity(self, given: Any) -> Tensor:
         shape = (self.batch, self.count, self.scene.dim)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.initial_states import lattice
+from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Absolute
 from nmpm.emulator import EmulatorRecipe, Prescribed, predict_rollout, rollout, unroll
 from nmpm.emulator.constraints import Constraints, mass_shares
@@ -15,12 +15,14 @@ from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.prescribed import predict_from_entries, predicted_particles, with_predicted
 from nmpm.emulator.rasterise import grid_state
-from nmpm.errors import DataError
+from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.comparison import Comparison, still
 from nmpm.metrics import MSE, EarthMover
 from nmpm.particles import Particles, Window
 from nmpm.processors import Pointwise
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, without_kernels
+from nmpm.zoo.export.parts import Network
+from nmpm.zoo.pretrained import Pretrained
 from tests.scenes import box, cloud, emulator_of, silenced, with_obstacle
 
 FRAMES = 4
@@ -225,8 +227,9 @@ def test_a_rollout_goes_on_from_its_state_to_the_bit():
     assert torch.equal(again.velocity, second.velocity)
 
 
-def test_a_paddle_pushes_particles_before_it_and_never_lets_them_through():
-    emulator = silenced(emulator_of(PADDLE, cells=42, frames=FRAMES, decoder=Absolute())).requires_grad_(False)
+@pytest.mark.parametrize("scene", [PADDLE, box(obstacles=True, gravity=(0.0, 0.0))], ids=["trained on it", "not"])
+def test_a_paddle_pushes_particles_before_it_and_never_lets_them_through(scene):
+    emulator = silenced(emulator_of(scene, cells=42, frames=FRAMES, decoder=Absolute())).requires_grad_(False)
     frames = paddle_frames(0.006, 4 * FRAMES + 1)
     block = lattice(((0.38, 0.46), (0.4, 0.6)), 0.02).float()
     state = cloud(PADDLE, len(block)).with_motion(block.unsqueeze(0), torch.zeros(1, len(block), 2))
@@ -281,3 +284,38 @@ def test_two_particles_in_one_place_are_one_of_twice_the_size():
         rollout(emulator, dataclasses.replace(one, volume=torch.ones(1, 10)), 8).round(decimals=5),
         rollout(emulator, one, 8).round(decimals=5),
     )
+
+
+def test_what_has_no_kernels_or_programs_is_refused_with_the_reason():
+    moving, opened = emulator_of(PADDLE), emulator_of(box(**OPEN))
+    assert moving.kernel_parameters is None
+    assert opened.kernel_parameters is not None
+    assert emulator_of(box(**OPEN), rest_speed=0.1).kernel_parameters is None
+    for emulator, what in ((moving, "obstacles that move"), (opened, "open axes")):
+        with pytest.raises(ConfigError, match=f"scenes have {what}, which exported files do not carry"):
+            Network(emulator)
+
+
+def test_states_with_volumes_or_obstacle_velocities_that_are_not_finite_are_rejected():
+    emulator = emulator_of(PADDLE).requires_grad_(False)
+    state = with_obstacle(cloud(PADDLE, 4), paddle(0.3))
+    broken = torch.full_like(state.obstacle, torch.nan)
+    with pytest.raises(DataError, match="obstacle particle 0: its velocity"):
+        rollout(emulator, dataclasses.replace(state, obstacle_velocity=broken), 4)
+    with pytest.raises(DataError, match="particle 0: its volume"):
+        rollout(emulator, dataclasses.replace(state, volume=torch.full((1, 4), torch.inf)), 4)
+    model = Pretrained(emulator, {})
+    assert model.state(state.position[0], volume=2.0).volume.tolist() == [[2.0] * 4]
+    with pytest.raises(DataError, match="volume = 0 must be positive"):
+        model.state(state.position[0], volume=[1.0, 0.0, 1.0, 1.0])
+
+
+def test_what_nothing_holds_falls_along_an_open_axis_and_lies_on_obstacles():
+    scene = box(boundary=("wall", "open"), domain=((0.08, 0.92), (0.1, 0.9)), obstacles=True)
+    emulator = silenced(emulator_of(scene, decoder=Absolute(), rest_speed=0.01)).requires_grad_(False)
+    beam = lattice(((0.3, 0.7), (0.3, 0.4)), 0.01)
+    lying, hanging = (lattice(((0.4, 0.6), ends), 0.02) for ends in ((0.42, 0.5), (0.12, 0.16)))
+    state = state_at_rest(scene, torch.cat([lying, hanging]), beam)
+    made = rollout(emulator, state, 4)[0, -1]
+    assert ((state.position[0] - made)[: len(lying), 1].abs() < 1e-6).all()
+    assert ((state.position[0] - made)[len(lying) :, 1] > 1e-5).all()
