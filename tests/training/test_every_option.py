@@ -63,10 +63,11 @@ CHANGED_DATA: dict[str, Any] = {
     "boundary": ["periodic", "wall"],
     "bounds": [(0.05, 0.95), (0.05, 0.95)],
     "fields": [],
+    "prescribed": [3],
     "limit_eval": 1,
     "eval_batch_size": 1,
 }
-ELSEWHERE = {"gravity", "family", "path", "name", "source", "generate"}
+ELSEWHERE = {"gravity", "family", "path", "name", "source", "generate", "resample", "smooth"}
 """Options of data that tests of their own change."""
 IN_EACH_RUN = ("gradient_discount", "emphasis", "density_cap")
 

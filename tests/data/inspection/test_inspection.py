@@ -188,9 +188,7 @@ def test_foreign_data_that_convert_refuses_are_inspected(tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["splits"]["train"]["trajectories"] == 2
     assert any("Particle type 9 is not in the metadata" in finding["sentence"] for finding in found["findings"])
-    assert any(
-        "trajectory 2" in finding["sentence"] and "not read" in finding["sentence"] for finding in found["findings"]
-    )
+    assert any("record 2" in finding["sentence"] and "not read" in finding["sentence"] for finding in found["findings"])
 
 
 @pytest.mark.parametrize(
