@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
-_GRIDS_ASIDE = 3  # of the recommended one, on either side
-_MOST_FINDINGS = 9
+_GRIDS_ASIDE = 2  # of the recommended one, on either side
+_MOST_FINDINGS = 7
+_NOTE_LINES = 10
 _TITLES = {"contradiction": "contradictions: models of these data will be wrong", "oddity": "odd: look at it"}
 _EXAMPLES = """\
 examples:
@@ -150,7 +151,8 @@ def _lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[st
     rows["fields"] = ", ".join(f"{name} {shape}" for name, shape in inspection.fields.items())
     rows["channels"] = "\n".join(f"{name} {text}" for name, text in inspection.channels.items())
     rows["varies"] = ", ".join(inspection.varies) or "nothing but the initial state"
-    rows["bounds"] = f"{_box(inspection.stated_bounds)} stated\n{_box(inspection.observed)} observed"
+    bounds = "found" if "bounds" in inspection.found else "stated"
+    rows["bounds"] = f"{_box(inspection.stated_bounds)} {bounds}\n{_box(inspection.observed)} observed"
     rows["domain"] = f"{_box(inspection.domain)} for a grid; {', '.join(inspection.boundary)}"
     measured = ", ".join(f"{value:.3g}" for value in inspection.first_acceleration)
     gravity = "not stated" if inspection.gravity is None else ", ".join(f"{value:g}" for value in inspection.gravity)
@@ -168,11 +170,24 @@ def _lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[st
             start = f"  {'' if number else label:<10}"
             yield from textwrap.wrap(line, _WIDTH, initial_indent=start, subsequent_indent=" " * 14)
     yield from _grid_lines(inspection, costs)
-    notes = [*inspection.notes, *(str(note) for note in _merged(inspection) if note.severity == "note")]
-    if notes:
-        yield from ("", "  notes")
-    for note in notes:
-        yield from textwrap.wrap(note, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    yield from _note_lines(inspection)
+
+
+def _note_lines(inspection: Inspection) -> Iterator[str]:
+    """Notes, in which facts that were found in the trajectories are one."""
+    levels: dict[str, list[str]] = {}
+    for name, how in inspection.found.items():
+        levels.setdefault(how.partition(":")[0], []).append(name)
+    sure = "; ".join(f"{level} {', '.join(names)}" for level, names in levels.items())
+    notes = [f"Found in the trajectories: {sure} (--json says how)."] if sure else []
+    notes += [note for note in inspection.notes if note.partition(" ")[0] not in inspection.found]
+    merged = [note for note in _merged(inspection) if note.severity == "note"]
+    notes += [str(note) for note in merged if note.sentence not in inspection.notes]
+    lines = [line for note in notes for line in _item(note)]
+    if lines:
+        yield from ("", "  notes", *lines[:_NOTE_LINES])
+    if len(lines) > _NOTE_LINES:
+        yield "    … more by --json"
 
 
 def _grid_lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[str]:
@@ -198,10 +213,14 @@ def _finding_lines(inspection: Inspection) -> Iterator[str]:
         if some := [finding for finding in findings[:_MOST_FINDINGS] if finding.severity == severity]:
             yield from ("", f"  {title}")
             for finding in some:
-                yield from textwrap.wrap(str(finding), _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+                yield from _item(str(finding))
     if more := findings[_MOST_FINDINGS:]:
         yield f"  … and {', '.join(finding.kind for finding in more)}: see --json."
     yield from ("",) if findings else ("  nothing contradictory or odd found", "")
+
+
+def _item(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
 def _merged(inspection: Inspection) -> tuple[Finding, ...]:

@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from nmpm._support.progress import progress_bar
+from nmpm.data.facts import FOUND
 from nmpm.data.fields import FieldFacts, Kind, add_fields
 from nmpm.data.format import Metadata, Split
 from nmpm.data.gravity import distinct_gravities, trajectory_gravity
@@ -71,6 +72,7 @@ class Inspection:
     occupied_each: float  # the same in one trajectory, median
     rest: tuple[int, int, int] | None  # first frame at rest: median, smallest, largest; None where none comes to rest
     restless: int  # trajectories that still move at their end
+    found: dict[str, str]  # facts that were found in the trajectories by the conversion: how, and how sure
     notes: tuple[str, ...]  # they need no action
     findings: tuple[Finding, ...]  # contradictions first; of each trajectory
     channels: dict[str, str]  # for each field how it differs, and the input channels that it makes
@@ -161,6 +163,7 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         occupied_each=occupied_each,
         rest=(int(np.median(rests)), min(rests), max(rests)) if rests else None,
         restless=len(measured.rests) - len(rests),
+        found=dict(metadata.extra.get(FOUND, {})),
         notes=tuple(_notes(source, data.source, metadata)),
         findings=sort_findings(findings),
         channels={name: _describe_channels(name, field, metadata, materials) for name, field in facts.items()},

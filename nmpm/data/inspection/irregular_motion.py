@@ -146,9 +146,9 @@ def find_repeated_frames(motion: Motion) -> Iterator[Finding]:
 
 def _interruptions(typical: np.ndarray, least: float) -> np.ndarray:
     """Indices of steps (T - 1,) without motion, between steps with motion of about the same size, at least `least`."""
-    moves = np.flatnonzero(typical > _STILL * typical.max(initial=0.0))
+    moves = np.flatnonzero(~(typical <= _STILL * np.nanmax(typical, initial=0.0)))  # or nobody knows
     last, following = moves[:-1], moves[1:]
-    low, high = np.minimum(typical[last], typical[following]), np.maximum(typical[last], typical[following])
+    low, high = np.fmin(typical[last], typical[following]), np.fmax(typical[last], typical[following])
     interrupted = np.flatnonzero((following > last + 1) & (low > np.maximum(least, _GOES_ON * high)))
     return np.concatenate([np.arange(last[i] + 1, following[i]) for i in interrupted] or [np.empty(0, dtype=int)])
 

@@ -59,9 +59,9 @@ class Motion:
 
     @cached_property
     def typical(self) -> np.ndarray:
-        """(T - 1,) root mean square displacement of all particles between successive frames; 0 where none is there."""
-        count = np.maximum(1, np.isfinite(self.speed).sum(axis=1))
-        return np.asarray(np.sqrt(np.nansum(self.speed**2, axis=1) / count))
+        """(T - 1,) root mean square displacement between successive frames; NaN where no particle is in both."""
+        count = np.isfinite(self.speed).sum(axis=1)
+        return np.asarray(np.sqrt(np.nansum(self.speed**2, axis=1) / np.where(count, count, np.nan)))
 
     @cached_property
     def present(self) -> np.ndarray:

@@ -87,7 +87,7 @@ def find_absences(motion: Motion) -> Iterator[Finding]:
         f"{enter} of {there.shape[1]} particles come after the first frame and {leave} are gone in the last one, in the"
         f" mean {there.sum(axis=1).mean():.4g} are there{nobody}.",
         motion.where,
-        badness=enter + leave,
+        badness=enter + leave + there.shape[1] * empty,
     )
 
 
