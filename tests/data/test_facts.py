@@ -1,9 +1,11 @@
 """Facts that are found in trajectories, on motions that are known in closed form."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 
-from nmpm.data.convert import ForeignDataset, Options, convert
+from nmpm.data.convert import ForeignDataset, Options, convert, open_dataset
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.facts import FactFinder, Facts, find_facts
 from nmpm.data.facts.domain import domain_fact
@@ -283,3 +285,28 @@ def test_facts_of_a_split_in_the_units_that_metadata_state(rng, tmp_path):
     assert find_facts(split).gravity.value == pytest.approx((0.0, -0.02), abs=1e-4)
     stated = Metadata(((0.0, 10.0),) * 2, 0.1, 2, 59, {0: "sand"})
     assert find_facts(split, stated).gravity.value == pytest.approx((0.0, -2.0), abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("folder", "dt", "gravity", "boundary"),
+    [
+        ("lammps-grains", 1.0, (0.0, -0.00981), ("wall", "wall")),
+        ("taichi-mpm128", 1.0, (0.0, -30 * 0.004**2), ("wall", "wall")),
+        ("warp-sph-vtk", 0.6, (0.0, -0.1, 0.0), ("wall",) * 3),
+        ("ptv-tracks", 0.004, None, ("open",) * 3),
+    ],
+)
+def test_facts_of_recordings_by_other_programs(recorded, folder, dt, gravity, boundary):
+    if not (recorded / "third-party" / folder).is_dir():
+        pytest.skip(f"there is no third-party/{folder}")
+    if folder == "warp-sph-vtk":
+        pytest.importorskip("pyvista")
+    dataset = open_dataset(recorded / "third-party" / folder)
+    finder = FactFinder(dataset.metadata.dim)
+    for trajectory in islice(dataset.splits["train"](), 3):
+        finder.add(trajectory)
+    facts = finder.facts()
+    assert facts.dt.value == pytest.approx(dt, rel=1e-3)
+    assert facts.gravity.value == (None if gravity is None else pytest.approx(gravity, rel=2e-3))
+    assert facts.boundary.value == boundary
+    assert facts.static_types.value == ({3} if folder == "lammps-grains" else frozenset())
