@@ -71,6 +71,7 @@ def add_configuration(options: Sequence[Option]) -> list[Option]:
     from nmpm.data.new_configuration import OPTIONS
 
     stated = {name: yaml.safe_load(given.get(f"--data.{name}") or "null") for name in OPTIONS}
+    stated["prescribed"] = stated["prescribed"] and frozenset(stated["prescribed"])
     root = Path(given.get(ROOT) or f"runs/{dataset_name(Path(path))}")
     minutes = _minutes(given.get("--trainer.max_time") or "") or MINUTES
     return [Option("--config", str(write_for_fit(Path(path), Options(**stated), root, minutes))), *options]

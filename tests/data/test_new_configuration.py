@@ -75,8 +75,17 @@ def test_energy_is_not_limited_where_it_comes_in(tmp_path, run, changes, reason)
 def test_noisy_positions_are_smoothed(tmp_path, monkeypatch):
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     config, text = written(tmp_path / "data", falling(noise=0.002))
-    assert config["data"]["smooth"] == 7
+    assert config["data"]["smooth"] == 13
     assert "positions have a noise of 0.002," in text
+
+
+def test_uneven_frames_are_resampled(tmp_path, monkeypatch):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    run = falling()
+    times = 0.0025 * np.delete(np.arange(61), 30)
+    run = Trajectory(run.position, run.particle_type, {}, {"time": times})
+    config, _ = written(tmp_path / "data", run)
+    assert config["data"]["resample"] == 0.0025
 
 
 def test_short_trajectories_are_unrolled_over_fewer_bundles(tmp_path):

@@ -23,15 +23,10 @@ def find_noise(motion: Motion) -> Iterator[Finding]:
     The second difference of independent errors of standard deviation σ has the variance 6 σ², and that of successive
     ones correlate by -2/3.
     """
-    acceleration = np.diff(motion.step, axis=0)
-    if len(motion.step) < _LEAST_FRAMES:
+    noise, typical = white_noise(motion.step)
+    if noise < _LOUD * typical or not noise:
         return
-    square = float(np.nanmean(acceleration**2))
-    product = float(np.nanmean(acceleration[1:] * acceleration[:-1]))
-    noise, typical = math.sqrt(square / 6), math.sqrt(float(np.nanmean(motion.step**2)))
-    if not square or product / square > _WHITE or noise < _LOUD * typical:
-        return
-    frames = next((n for n in range(5, _MOST_FRAMES, 2) if _slope_error(n) * noise < _ENOUGH * typical), _MOST_FRAMES)
+    frames = smoothing_frames(noise / typical)
     yield Finding(
         "measurement noise",
         Severity.ODDITY,
@@ -41,6 +36,25 @@ def find_noise(motion: Motion) -> Iterator[Finding]:
         factor=noise / typical,
         badness=noise / typical,
     )
+
+
+def white_noise(step: np.ndarray) -> tuple[float, float]:
+    """The standard deviation of errors of positions, 0 where there are none, and the typical displacement in a frame.
+
+    Of displacements (T, N, D), NaN where a particle is absent.
+    """
+    typical = math.sqrt(float(np.nanmean(step**2)))
+    if len(step) < _LEAST_FRAMES:
+        return 0.0, typical
+    acceleration = np.diff(step, axis=0)
+    square = float(np.nanmean(acceleration**2))
+    product = float(np.nanmean(acceleration[1:] * acceleration[:-1]))
+    return (math.sqrt(square / 6) if square and product / square <= _WHITE else 0.0), typical
+
+
+def smoothing_frames(noise: float) -> int:
+    """Frames of local fits that take noise, in typical displacements, out of velocities."""
+    return next((n for n in range(5, _MOST_FRAMES, 2) if _slope_error(n) * noise < _ENOUGH), _MOST_FRAMES)
 
 
 def _slope_error(frames: int) -> float:

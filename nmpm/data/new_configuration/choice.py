@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from nmpm.data.facts import FOUND, find_facts
 from nmpm.data.format import Split, find_split, split_paths
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, TrainingSize, grid_cost, recommended_cells, training_size
+from nmpm.data.inspection.noise import smoothing_frames
 from nmpm.data.inspection.reading import open_dataset
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import FAMILIES
@@ -14,10 +16,8 @@ from nmpm.data.new_configuration.survey import Survey, survey
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
-OPTIONS = ("family", "gravity", "boundary", "bounds", "fields", "resample", "smooth")
+OPTIONS = ("family", "gravity", "boundary", "bounds", "fields", "prescribed", "resample", "smooth")
 """Facts that a configuration can state in its section data."""
-SMOOTH = 7
-"""Frames of the local fits that replace noisy positions."""
 FRAMES = 8
 MOST_GAIN = 0.05
 """Energy, of the initial one, that may be gained by rounding and elasticity where nothing feeds the scene."""
@@ -55,16 +55,19 @@ class CompletedSource:
         return cls(opened, hows)
 
     def look(self) -> tuple[CompletedSource, Survey]:
-        """The dataset, smoothed along time where its positions are noisy, and facts about its trajectories."""
-        facts = survey(self.data)
-        if not facts.noise or self.data.options.smooth is not None:
+        """The dataset at even times, and smoothed where its positions are noisy, and facts about its trajectories."""
+        facts, options, hows = survey(self.data), self.data.options, {}
+        if facts.uneven and options.resample is None:
+            options = replace(options, resample=float(f"{facts.uneven:.6g}"))
+            hows["resample"] = "frames are at uneven times: positions are interpolated to even ones"
+        if facts.noise and options.smooth is None:
+            options = replace(options, smooth=smoothing_frames(facts.noise_share))
+            noise = f"{facts.noise:.2g}, {facts.noise_share:.0%} of a typical step"
+            hows["smooth"] = f"positions have a noise of {noise}: local fits replace them"
+        if not hows:
             return self, facts
-        how = (
-            f"positions have a noise of {facts.noise:.2g}, {facts.noise_share:.0%} of a step: local fits replace them"
-            " (for errors, too)"
-        )
-        smoothed = FolderSource(self.data.path, replace(self.data.options, smooth=SMOOTH))
-        return CompletedSource(smoothed, self.hows | {"smooth": how}), survey(smoothed)
+        changed = FolderSource(self.data.path, options)
+        return CompletedSource(changed, self.hows | hows), survey(changed)
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,8 @@ class Choice:
             return "particles come and go"
         if survey.gain is None:
             return "gravity acts along a periodic axis"
-        return f"energy rises in the data, by {survey.gain:.0%} of the initial" if survey.gain > MOST_GAIN else ""
+        share = f", by {survey.gain:.0%} of the initial" if math.isfinite(survey.gain) else ""
+        return f"energy rises in the data{share}" if survey.gain > MOST_GAIN else ""
 
     @property
     def transient(self) -> bool:

@@ -13,12 +13,13 @@ from nmpm.data.format import Metadata, Split, Trajectory, find_split, split_path
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.grid_rule import GridFacts, candidates
 from nmpm.data.inspection.measurements import Measurements
+from nmpm.data.inspection.noise import white_noise
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.statistics import displacements
+from nmpm.data.times import uneven_step
 from nmpm.scene import Scene
 
 TRAJECTORIES = 8
-_WHITE = -0.6  # correlation of successive accelerations of noise: -2/3
 _ROUNDING = 1e-3  # of the spacing: less noise is that of float32
 _NOISY = 0.1  # of a typical step
 _STATIONARY = 1.5  # ratio of mean speeds early and late
@@ -40,6 +41,7 @@ class Survey:
     early_speed: float = 0.0  # mean over the first tenth of the frames, per frame
     late_speed: float = 0.0  # median over the last tenth
     mean_late_speed: float = 0.0
+    uneven: float = 0.0  # usual time between frames, where it is uneven
     noise: float = 0.0  # standard deviation of positions, where they are noisy
     noise_share: float = 0.0  # of a typical step
     grids: tuple[GridFacts, ...] = ()
@@ -79,6 +81,9 @@ def survey(source: FolderSource) -> Survey:
             trajectory = split.read(index)
             gravity = trajectory_gravity(trajectory.attributes, scene, split.where(index))
             measured.add(trajectory)
+            time = split.time(index)
+            if time is not None and uneven_step(time) is not None:
+                facts.uneven = float(np.median(np.diff(time)))
             _add(facts, trajectory, metadata, replace(scene, gravity=gravity))
             advance()
     facts.rests = sum(rest is not None for rest in measured.rests)
@@ -104,9 +109,9 @@ def _add(facts: Survey, trajectory: Trajectory, metadata: Metadata, scene: Scene
         ("late_speed", np.nanmedian(speed[-tenth:])),
     ):
         setattr(facts, name, (1 - share) * getattr(facts, name) + share * float(value))
-    noise = _noise(step)
-    if noise > max(_NOISY * float(np.nanmedian(speed)), _ROUNDING * scene.particle_spacing):
-        facts.noise, facts.noise_share = noise, noise / float(np.nanmedian(speed))
+    noise, typical = white_noise(step)
+    if noise > max(_NOISY * typical, _ROUNDING * scene.particle_spacing):
+        facts.noise, facts.noise_share = noise, noise / typical
     gain = None if facts.comings else energy_gain(position, step, scene)
     facts.gain = gain if facts.looked_at == 1 or facts.gain is None or gain is None else max(facts.gain, gain)
 
@@ -125,24 +130,6 @@ def energy_gain(position: np.ndarray, step: np.ndarray, scene: Scene) -> float |
     energy = ((step**2).sum(axis=2) / 2 - height).mean(axis=1)
     initial = energy[0] - lowest
     return float((energy.max() - energy[0]) / initial) if initial > 0 else math.inf
-
-
-def _noise(step: np.ndarray) -> float:
-    """Standard deviation of white noise on positions, from steps (T, N, D); 0 where accelerations are not noise.
-
-    Second differences of white noise of variance s² have the variance 6 s², successive ones a correlation of -2/3.
-    """
-    acceleration = np.diff(step, axis=0)
-    if len(acceleration) < 8:
-        return 0.0
-    square, product = (acceleration**2).sum(axis=2), (acceleration[1:] * acceleration[:-1]).sum(axis=2)
-    seen = np.isfinite(product).sum(axis=0) >= 8
-    power = np.nanmean(square[:, seen], axis=0) if seen.any() else np.zeros(1)
-    if not power.any():
-        return 0.0
-    correlation = np.nanmean(product[:, seen], axis=0)[power > 0] / power[power > 0]
-    deviation = math.sqrt(float(np.median(power)) / (6 * step.shape[2]))
-    return deviation if np.median(correlation) < _WHITE else 0.0
 
 
 def _linear_counts(cells: np.ndarray, shape: Sequence[int]) -> np.ndarray:
