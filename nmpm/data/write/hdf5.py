@@ -28,7 +28,7 @@ class NativeHdf5(TrajectoryWriter):
     ) -> Path:
         volume = particle_spacing(trajectory, metadata) ** metadata.dim
         described = replace(trajectory, attributes=description(trajectory, metadata, volume) | trajectory.attributes)
-        write_viewable(path, [described], metadata.dt)
+        write_viewable(path, [described])
         for _ in trajectory.position:
             step()
         return path

@@ -8,6 +8,7 @@ LagrangeBench takes each group of a file for a trajectory, so that the files of 
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -41,29 +42,23 @@ class _Block:
         return int(self.trajectory[self.position].shape[0])
 
 
-def write_viewable(path: Path, trajectories: Iterable[Trajectory], dt: float) -> None:
-    """As `nmpm.data.format.write_split`, with what VTK needs to show them; `dt` is the time between frames."""
+def write_viewable(path: Path, trajectories: Iterable[Trajectory]) -> None:
+    """As `nmpm.data.format.write_split`, with what VTK needs to show them."""
     # The earliest format that has virtual datasets.
     with writable_hdf5(path, libver=("earliest", "v110")) as (file, check_written):
         add_trajectories(file, trajectories, check_written, path)
-        add_vtkhdf(file, dt)
+        add_vtkhdf(file)
 
 
-def add_vtkhdf(file: Any, dt: float) -> None:
+def add_vtkhdf(file: Any) -> None:
     """Adds what VTK needs to show the trajectories of an open HDF5 file, the first `MOST_TRAJECTORIES` of them.
 
     One trajectory alone becomes VTK's poly data; several, or one with its truth, become a data set with a block for
-    each. A block that is shorter than others stays at its last frame.
-
-    Args:
-        file: Open for writing, with the format's upper bound at least "v110".
-        dt: Time between frames, where a trajectory has no `time` (T,).
+    each. A block that is shorter than others stays at its last frame. Times are the longest trajectory's.
     """
     blocks = list(_blocks([file[name] for name in list(file)[:MOST_TRAJECTORIES]]))
     longest = max(blocks, key=lambda block: block.frames)
-    stated = longest.trajectory.get("time")
-    is_stated = isinstance(stated, h5py.Dataset) and stated.shape == (longest.frames,)
-    times = np.asarray(stated[()], dtype=np.float64) if is_stated else np.arange(longest.frames) * dt
+    times = _times(longest.trajectory, longest.frames)
     root = _ordered_group(file, VTKHDF)
     if len(blocks) == 1:
         _set_type(root, "PolyData", _POLY_DATA_VERSION)
@@ -76,6 +71,15 @@ def add_vtkhdf(file: Any, dt: float) -> None:
         _set_type(group, "PolyData", _COLLECTION_VERSION)
         assembly[block.name] = h5py.SoftLink(group.name)
         _write_block(group, block, times)
+
+
+def _times(trajectory: Any, frames: int) -> np.ndarray:
+    """(T,) recorded times, or else those of frames that are `dt` of the described scene apart, or 1 without one."""
+    stated = trajectory.get("time")
+    if isinstance(stated, h5py.Dataset) and stated.shape == (frames,):
+        return np.asarray(stated[()], dtype=np.float64)
+    scene = trajectory.attrs.get("scene")
+    return np.arange(frames) * float(1.0 if scene is None else json.loads(scene)["dt"])
 
 
 def _blocks(trajectories: list[Any]) -> Iterator[_Block]:

@@ -238,6 +238,6 @@ class PredictionWriter(BasePredictionWriter):
         if trainer.is_global_zero:
             path = Path(trainer.default_root_dir) / "predictions.h5"
             predicted = dict(pair for rank in by_rank for pair in rank.items())
-            write_viewable(path, [predicted[index] for index in sorted(predicted)], pl_module.emulator.scene.dt)  # type: ignore[union-attr,arg-type]  # (an EmulatorModule)
+            write_viewable(path, [predicted[index] for index in sorted(predicted)])
             sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
         self._predicted = {}
