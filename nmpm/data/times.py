@@ -29,6 +29,12 @@ def uneven_step(time: np.ndarray) -> tuple[int, float] | None:
     return frame + 1, float(factors[frame])
 
 
+def usual_step(time: np.ndarray) -> float:
+    """The mean step of (T,) times where the steps are even, so that rounding does not count, else the median."""
+    steps = np.diff(np.asarray(time, dtype=np.float64))
+    return float(np.median(steps) if uneven_step(time) else steps.mean())
+
+
 def _rounding(time: np.ndarray, step: float) -> float:
     """How much steps of rounded times may differ from even ones; 0 where the times are not rounded to a part of one."""
     for decimals in _DECIMALS:
@@ -42,8 +48,7 @@ def check_times(time: np.ndarray | None, where: str) -> None:
     """Raises a DataError that names the most unusual step if those of (T,) times are uneven."""
     uneven = None if time is None else uneven_step(time)
     if time is not None and uneven is not None:
-        frame, factor = uneven
-        usual = float(np.median(np.diff(time)))
+        (frame, factor), usual = uneven, usual_step(time)
         raise DataError(
             f"{where}: its steps in time are uneven: frame {frame} is {factor:.3g} usual steps of {usual:.4g} after the"
             f" one before; models need even ones. Resample the positions: --resample {usual:.4g} (fit: --data.resample"

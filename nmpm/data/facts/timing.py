@@ -9,6 +9,7 @@ import numpy as np
 from nmpm.data.facts.fact import Fact
 from nmpm.data.facts.periodic import roundest
 from nmpm.data.facts.sample import Sample
+from nmpm.data.times import uneven_step, usual_step
 
 _EVEN = 0.01  # of a step
 _ALIKE = 0.02  # of the time step: another differs by more
@@ -20,40 +21,39 @@ class TimeSteps:
     """Accumulates the recorded steps in time of trajectories."""
 
     def __init__(self) -> None:
-        self._medians: list[float] = []
+        self._usual: list[float] = []
         self._uneven = 0
 
     def add(self, time: np.ndarray | None) -> None:
         """Adds the (T,) times of the frames of a trajectory, if it has any."""
         if time is None or np.ndim(time) != 1 or len(time) < 2 or not np.isfinite(time).all():
             return
-        steps = np.diff(np.asarray(time, dtype=np.float64))
-        median = float(np.median(steps))
-        if median > 0:
-            self._medians.append(median)
-            self._uneven += bool((np.abs(steps - median) > _EVEN * median).any())
+        step = usual_step(time)
+        if step > 0:
+            self._usual.append(step)
+            self._uneven += uneven_step(time) is not None
 
     def fact(self, samples: Sequence[Sample]) -> Fact[float]:
         """The time between frames; 1, so that the frame is the unit of time, where nothing tells it."""
         by_velocity = _step_by_velocities(samples)
         per_frame = by_velocity is not None and abs(by_velocity - 1) < _ALIKE
-        if not self._medians:
+        if not self._usual:
             if by_velocity is not None and not per_frame:
                 return Fact(by_velocity, "displacements over recorded velocities.", "measured")
             if per_frame:
                 return Fact(1.0, "displacements between frames equal the recorded velocities.", "measured")
             return Fact(1.0, "no times are recorded, so the unit of time is the frame.", "guessed")
-        step = float(np.median(self._medians))
+        step = float(np.median(self._usual))
         step = roundest(step * (1 - 1e-6), step * (1 + 1e-6))
         if by_velocity is not None and not per_frame and abs(by_velocity / step - 1) > _ALIKE:
             how = f"displacements over recorded velocities; recorded times step by {step:.6g}, in another unit."
             return Fact(by_velocity, how, "likely")
-        return Fact(step, f"the median step of the recorded times, in their unit{self._notes(step)}.", "measured")
+        return Fact(step, f"the usual step of the recorded times, in their unit{self._notes(step)}.", "measured")
 
     def _notes(self, step: float) -> str:
-        low, high = min(self._medians), max(self._medians)
+        low, high = min(self._usual), max(self._usual)
         mixed = f"; it differs between trajectories, from {low:.4g} to {high:.4g}" if high - low > _EVEN * step else ""
-        count = len(self._medians)
+        count = len(self._usual)
         uneven = f"; in {self._uneven} of {count} trajectories steps are uneven" if self._uneven else ""
         return mixed + uneven
 

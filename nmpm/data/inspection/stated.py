@@ -11,6 +11,7 @@ from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, spacing_of
+from nmpm.data.times import uneven_step, usual_step
 
 _FIRST_STEPS = 32  # in which particles are looked for that fly freely
 _LEAST_PARTICLES = 8
@@ -47,11 +48,11 @@ def check_stated(motion: Motion) -> Iterator[Finding]:
 
 
 def recorded_dt(motion: Motion) -> float | None:
-    """The median step of the recorded times; None where none are recorded."""
+    """The usual step of the recorded times; None where none are recorded."""
     time = np.asarray(motion.trajectory.fields.get("time", ()), dtype=np.float64)
     if time.ndim != 1 or len(time) != len(motion.trajectory.position) or len(time) < 2 or not np.isfinite(time).all():
         return None
-    dt = float(np.median(np.diff(time)))
+    dt = usual_step(time)
     return dt if dt > 0 else None
 
 
@@ -62,7 +63,7 @@ def check_times(motion: Motion) -> Iterator[Finding]:
         return
     steps = np.diff(np.asarray(motion.trajectory.fields["time"], dtype=np.float64))
     off = np.abs(steps / dt - 1)
-    if off.max() > _UNEVEN:
+    if uneven_step(motion.trajectory.fields["time"]) is not None:
         frame = int(np.argmax(off))
         yield Finding(
             "uneven time steps",

@@ -8,7 +8,7 @@ from nmpm.data.convert.retiming import resample, smooth
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.loading.sources import FolderSource
-from nmpm.data.times import uneven_step
+from nmpm.data.times import uneven_step, usual_step
 from nmpm.errors import ConfigError, DataError
 from tests.made_up import made_up_metadata
 
@@ -92,6 +92,11 @@ def test_smoothing_takes_the_known_part_of_the_noise():
 )
 def test_uneven_steps_are_told_from_rounding(time, expected):
     assert uneven_step(time) == (pytest.approx(expected) if expected else None)
+
+
+def test_the_usual_step_of_rounded_times_is_exact():
+    assert usual_step(np.round(np.arange(481) / 240, 4)) == pytest.approx(1 / 240, rel=1e-6)
+    assert usual_step(np.delete(np.arange(50) * 0.004, 20)) == pytest.approx(0.004)
 
 
 @pytest.mark.usefixtures("home")
