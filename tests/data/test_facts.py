@@ -12,7 +12,7 @@ from nmpm.data.facts.domain import domain_fact
 from nmpm.data.facts.periodic import roundest
 from nmpm.data.format import Metadata, Split, Trajectory, read_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
-from nmpm.errors import DataError
+from nmpm.errors import ConfigError, DataError
 
 PLACEHOLDERS = Metadata(((0.0, 1.0),) * 2, 1.0, 2, 0, {})
 EVERYTHING = frozenset(
@@ -271,6 +271,14 @@ class TestConversion:
         assert (metadata.dt, metadata.gravity, scene.materials) == (0.5, (0.0, -7.0), ("jelly",))
         assert scene.domain[0] == scene.bounds[0]
         assert {"gravity", "dt", "boundary"}.isdisjoint(metadata.extra["found"])
+
+    def test_types_without_names_are_renumbered(self, rng, tmp_path):
+        runs = np.stack([thrown(rng, (0.0, -2.0)) for _ in range(3)])
+        np.savez(tmp_path / "a.npz", positions=runs, types=np.repeat([0, 1], 72))
+        convert(tmp_path / "a.npz", tmp_path / "b", ids={0: 5})
+        assert read_metadata(tmp_path / "b").particle_types == {1: "type1", 5: "type5"}
+        with pytest.raises(ConfigError, match="type 1 occurs"):
+            convert(tmp_path / "a.npz", tmp_path / "c", ids={0: 1})
 
     def test_gravities_of_trajectories_are_kept(self, rng, tmp_path):
         run = Trajectory(thrown(rng, (0.0, -2.0)), np.zeros(144, int), {"gravity": [0.0, -5.0]})

@@ -199,33 +199,33 @@ def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDat
     """
     metadata = source.metadata
     unknown = sorted(set(ids) - set(metadata.particle_types))
-    if unknown:
+    if unknown and "particle_types" not in source.unknown:
         names = ", ".join(f"{i} {name}" for i, name in sorted(metadata.particle_types.items()))
         raise ConfigError(f"There is no particle type {', '.join(map(str, unknown))}; known: {names}.")
     # A type whose id is requested for another and that is not renumbered itself is dropped; `_renumber` checks that it
     # does not occur.
-    kept = {i: name for i, name in metadata.particle_types.items() if i in ids or i not in ids.values()}
+    dropped = frozenset(ids.values()) - frozenset(ids)
+    kept = {i: name for i, name in metadata.particle_types.items() if i not in dropped}
     types = {ids.get(i, i): name for i, name in kept.items()}
-    if len(types) < len(kept):
+    if len(types) < len(kept) or len(set(ids.values())) < len(ids):
         raise ConfigError(f"{dict(ids)} gives two particle types the same id.")
-    static = frozenset(ids.get(i, i) for i in metadata.static_types if i in kept)
-    prescribed = frozenset(ids.get(i, i) for i in metadata.prescribed_types if i in kept)
+    static = frozenset(ids.get(i, i) for i in metadata.static_types if i not in dropped)
+    prescribed = frozenset(ids.get(i, i) for i in metadata.prescribed_types if i not in dropped)
     return replace(
         source,
         metadata=replace(metadata, particle_types=types, static_types=static, prescribed_types=prescribed),
-        splits={name: partial(_renumber, start, ids, kept) for name, start in source.splits.items()},
+        splits={name: partial(_renumber, start, ids, dropped) for name, start in source.splits.items()},
     )
 
 
 def _renumber(
-    start: Callable[[], Iterator[Trajectory]], ids: Mapping[int, int], kept: Mapping[int, str]
+    start: Callable[[], Iterator[Trajectory]], ids: Mapping[int, int], dropped: frozenset[int]
 ) -> Iterator[Trajectory]:
     for trajectory in start():
         old = trajectory.particle_type
-        dropped = sorted(set(np.unique(old).tolist()) - set(kept))
-        if dropped:
+        if occurring := sorted(dropped.intersection(np.unique(old).tolist())):
             raise ConfigError(
-                f"Particle type {dropped[0]} occurs, but its id is given to another type; give it a new one."
+                f"Particle type {occurring[0]} occurs, but its id is given to another type; give it a new one."
             )
         new = old.copy()
         for before, after in ids.items():
