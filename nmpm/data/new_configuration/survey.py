@@ -23,7 +23,7 @@ TRAJECTORIES = 8
 _ROUNDING = 1e-3  # of the spacing: less noise is that of float32
 _NOISY = 0.1  # of a typical step
 _STATIONARY = 1.5  # ratio of mean speeds early and late
-_LATE = 0.9  # of a trajectory
+_NUMBERS = 2**24  # coordinates of a trajectory that are looked at
 _FULL = 0.995  # of the occupied cells that are not fuller than the density cap
 
 
@@ -92,13 +92,14 @@ def survey(source: FolderSource) -> Survey:
 
 
 def _add(facts: Survey, trajectory: Trajectory, metadata: Metadata, scene: Scene) -> None:
-    position = trajectory.position[:, metadata.is_moving(trajectory.particle_type)].astype(np.float64)
-    present = np.isfinite(position[..., 0])
+    every = trajectory.position[:, metadata.is_moving(trajectory.particle_type)]
+    present = np.isfinite(every[..., 0])
     facts.looked_at += 1
     facts.particles = max(facts.particles, int(present.sum(axis=1).max(initial=0)))
     facts.comings |= not bool(present.all())
-    facts.late += [frame[there] for frame, there in zip(position[-3:], present[-3:], strict=True)]
-    step = displacements(position.astype(np.float32), metadata)
+    facts.late += [frame[there].astype(np.float64) for frame, there in zip(every[-3:], present[-3:], strict=True)]
+    position = every[:, :: -(-every.size // _NUMBERS) or 1]  # some particles of large trajectories
+    step = displacements(position, metadata)
     if len(step) < 3 or not np.isfinite(step).any():
         return
     speed, tenth = np.linalg.norm(step, axis=2), -(-len(step) // 10)
@@ -112,7 +113,7 @@ def _add(facts: Survey, trajectory: Trajectory, metadata: Metadata, scene: Scene
     noise, typical = white_noise(step)
     if noise > max(_NOISY * typical, _ROUNDING * scene.particle_spacing):
         facts.noise, facts.noise_share = noise, noise / typical
-    gain = None if facts.comings else energy_gain(position, step, scene)
+    gain = None if facts.comings else energy_gain(position.astype(np.float64), step, scene)
     facts.gain = gain if facts.looked_at == 1 or facts.gain is None or gain is None else max(facts.gain, gain)
 
 
