@@ -52,7 +52,7 @@ def render_configuration(path: str, source: CompletedSource, choice: Choice, roo
         title=_title(path, choice),
         root=_scalar(root),
         steps=steps,
-        pace=f"{choice.cost.seconds:.2g} s a step here; a quarter more steps than the time holds, which ends the training",
+        pace=f"{choice.cost.seconds:.2g} s a step here; a quarter more than the time holds, which ends it",
         time=_duration(machine.minutes),
         validated="valid" in survey.counts,
         interval=_duration(machine.minutes / 5),
