@@ -34,7 +34,7 @@ BUDGETS: dict[str, dict[str, object]] = {
     "new_processor": {"STEPS": 2, "COUNTS": {"train": 1, "valid": 1, "test": 1}, "FRAMES": 40},
     "quickstart": {"FRAMES": 16},
     "speed_accuracy": {"TABLES": str(NOTEBOOKS.parent / "benchmarks" / "trade"), "FRAMES": 4, "ROUNDS": 1},
-    "your_own_data": {"RUNS": {"train": 2, "valid": 1, "test": 1}, "FRAMES": 24, "PARTICLES": 60, "STEPS": 2},
+    "your_own_data": {"RUNS, FRAMES, PARTICLES": (4, 60, 60), "STEPS": 2},
 }
 """Constants of the notebooks, by what they are here; only how much is computed changes."""
 if not NOTEBOOKS.is_dir():
@@ -145,11 +145,17 @@ def test_speed_and_accuracy_read_the_committed_tables(run):
     assert all(len(taken) == 1 for taken in names["seconds"].values())
 
 
-def test_your_own_data_become_a_model_that_anybody_can_load(run):
+@pytest.mark.parametrize("data", ["made up", pytest.param("sample", marks=pytest.mark.slow)])
+def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(data, run, monkeypatch, request):
+    if data == "sample":
+        request.getfixturevalue("recorded")
+    else:
+        monkeypatch.delenv("NMPM_TEST_DATA", raising=False)
     names = run("your_own_data")
-    assert names["predicted"].shape == (22, 60, 2)
-    assert names["theirs"].card["name"] == "dust/mine"
-    assert Image.open("dust.png").width > 300
+    assert names["predicted"].shape == (58, 60, 2)
+    assert names["theirs"].card["name"] == "blocks/mine"
+    assert Image.open("blocks.png").width > 300
+    assert Image.open("film.gif").n_frames > 1
 
 
 def test_fine_tuning_changes_what_it_says_and_leaves_a_picture(run):

@@ -87,11 +87,16 @@ class FolderSource(DataSource):
 
     @cached_property
     def metadata(self) -> Metadata:
-        return self.options.apply_to(read_metadata(self.folder, self.options.family))
+        return self._unapplied.apply_to(read_metadata(self.folder, self._unapplied.family))
 
     @cached_property
     def scene(self) -> Scene:
-        return infer_scene(self.folder, self.options)
+        return infer_scene(self.folder, self._unapplied)
+
+    @property
+    def _unapplied(self) -> Options:
+        """Options that the folder's metadata do not have yet: of a converted copy none."""
+        return self.options if self.folder == self.path else Options()
 
 
 @dataclass(frozen=True)

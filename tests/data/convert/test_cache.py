@@ -6,6 +6,7 @@ import pytest
 from nmpm.data.convert import Options, native_folder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import read_metadata
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError
 from tests.data.convert import records
 
@@ -51,3 +52,15 @@ def test_a_gravity_that_is_only_assumed_may_be_stated(tmp_path):
     flow = dmcf.write(tmp_path / "flow" / "a.msgpack.zst", dmcf.frames()).parent
     assert read_metadata(native_folder(flow)).gravity == (0.0, -9.81, 0.0)
     assert read_metadata(native_folder(flow, Options(gravity=(0.0, -1.0, 0.0)))).gravity == (0.0, -1.0, 0.0)
+
+
+def test_types_that_are_found_to_rest_do_so_under_the_names_that_a_user_states(tmp_path):
+    rng = np.random.default_rng(0)
+    position = rng.uniform(0, 1, (4, 1, 40, 2)) + 1e-3 * rng.normal(size=(4, 30, 40, 2)).cumsum(axis=1)
+    position[:, :, 30:] = position[:1, :1, 30:]
+    np.savez(tmp_path / "a.npz", position=position, types=np.repeat([0, 1], [30, 10]))
+    data = TrajectoryDataModule(path=str(tmp_path / "a.npz"))
+    assert data.data_source.metadata.static_types == {1}
+    source = FolderSource(tmp_path / "a.npz", Options(types={0: "dust", 1: "grate"}))
+    assert source.metadata.static_types == {1}
+    assert (source.scene.materials, source.scene.obstacles) == (("dust",), True)
