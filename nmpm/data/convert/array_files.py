@@ -21,7 +21,7 @@ import numpy as np
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
 from nmpm._support.messages import one_line
 from nmpm.data.convert.base import split_files
-from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, plain_name
+from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, describe, plain_name
 from nmpm.data.convert.run_arrays import RunArrays, group_runs
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles, placeholder_metadata
 from nmpm.data.format import Metadata, Trajectory
@@ -38,8 +38,8 @@ class ArrayFiles(RunFiles):
 
     def recognises(self, path: Path) -> bool:
         try:
-            first = next(iter(self.files(path).values()), ())[:1]
-            return any(self.runs(file) for file in first)
+            first = next(iter(self.files(path).values()), ())
+            return bool(first) and bool(self.runs(first[0]))
         except (NmpmError, OSError):
             return False
 
@@ -53,6 +53,8 @@ class ArrayFiles(RunFiles):
     def runs(self, file: Path) -> Sequence[Run]:
         with open_arrays(file) as arrays:
             groups = list(group_runs(arrays, str(file)))
+            if not groups:
+                raise DataError(f"{file}: no array can be positions ({describe(arrays)}). Move it to another folder.")
         numbered = [group for group in groups for _ in range(group.count)]
         return [Run(file, index, split=group.split) for index, group in enumerate(numbered)]
 
@@ -140,13 +142,32 @@ def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
         for name, value in group.attrs.items():
             if name not in group and np.asarray(value).dtype.kind in "biuf":
                 yield prefix + name, np.asarray(value)
+        groups = []
         for name in group:
             item = group.get(name)
             if isinstance(item, h5py.Dataset) and item.shape is not None:
-                check_stored_size(item, f"{path}: {prefix}{name}")
-                yield prefix + name, item
-        groups = [group[name] for name in group if isinstance(group.get(name), h5py.Group) and name != "VTKHDF"]
+                yield prefix + name, Hdf5Array(item, f"{path}: {prefix}{name}")
+            elif isinstance(item, h5py.Group) and name != "VTKHDF":
+                groups.append(item)
         pending += reversed(groups)
+
+
+class Hdf5Array:
+    """A dataset of an open HDF5 file.
+
+    Args:
+        dataset: The dataset.
+        where: For messages.
+    """
+
+    def __init__(self, dataset: Any, where: str) -> None:
+        self._dataset, self._where = dataset, where
+        self.shape: tuple[int, ...] = dataset.shape
+        self.dtype: np.dtype[Any] = dataset.dtype
+
+    def __getitem__(self, rows: Any) -> Any:
+        check_stored_size(self._dataset, self._where)
+        return self._dataset[rows]
 
 
 class NpzArray:

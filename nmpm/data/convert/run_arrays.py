@@ -274,8 +274,9 @@ def group_runs(arrays: Arrays, where: str) -> Iterator[RunArrays]:
         folder, _, leaf = name.rpartition("/")
         folders.setdefault(folder, {})[leaf] = array
     for folder, inside in folders.items():
-        outside = [outer for outer in folders if outer != folder and (not outer or folder.startswith(f"{outer}/"))]
-        shared = {name: array for outer in outside for name, array in folders[outer].items()}
+        parts = folder.split("/")
+        outside = ["/".join(parts[:depth]) for depth in range(len(parts)) if folder]
+        shared = {name: array for outer in outside for name, array in folders.get(outer, {}).items()}
         shared = {name: array for name, array in shared.items() if not can_be_positions(array)}
         yield from _runs_in_folder(inside, shared, f"{where}: {folder}" if folder else where, _split_name(folder))
 

@@ -92,6 +92,14 @@ def test_runs_have_groups_or_numbers(tmp_path):
     assert open_dataset(tmp_path / "groups.h5").metadata.dt == 0.02
 
 
+def test_files_without_positions_among_others_are_named(tmp_path):
+    for index in range(3):
+        np.save(tmp_path / f"{index}.npy", made())
+    np.savez(tmp_path / "stats.npz", mean=np.zeros(4))
+    with pytest.raises(DataError, match=r"stats\.npz: no array can be positions \(mean float64 \(4,\)\)"):
+        open_dataset(tmp_path, "arrays")
+
+
 def test_names_and_folders_divide_runs(tmp_path):
     np.savez(tmp_path / "parts.npz", train=made(runs=(3,)), val=made(runs=(2,)))
     assert splits(tmp_path / "parts.npz") == {"train": 3, "valid": 2}
