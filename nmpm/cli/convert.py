@@ -108,7 +108,9 @@ def _export(arguments: argparse.Namespace, options: Options, ids: dict[int, int]
     from nmpm.data.convert.export import export, open_complete
     from nmpm.data.write import find_writer
 
-    writer = find_writer("DESTINATION", arguments.destination)
+    writer, source = find_writer("DESTINATION", arguments.destination), arguments.source.resolve()
+    if source in (arguments.destination.resolve(), arguments.destination.with_suffix("").resolve()):
+        raise ConfigError(f"DESTINATION {arguments.destination}: it would replace the source; choose another name.")
     with open_complete(arguments.source, arguments.format, options) as opened:
         dataset = renumber_types(opened, ids) if ids else opened
         exported = export(dataset, arguments.destination, arguments.split, arguments.trajectory)

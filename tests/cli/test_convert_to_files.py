@@ -49,6 +49,12 @@ def test_what_cannot_be_is_refused(dataset, tmp_path, words, message, capsys):
     assert not (tmp_path / words[0]).exists()
 
 
+def test_the_source_is_never_replaced(dataset, capsys):
+    for source, destination in ((dataset, f"{dataset}.vtp"), (dataset / "test.h5", dataset / "test.h5")):
+        assert main(["convert", str(source), str(destination)]) == 1
+        assert "it would replace" in capsys.readouterr().err.replace("its frames would", "it would")
+
+
 def test_fields_that_a_form_cannot_hold_are_named(dataset, capsys):
     run = Split(dataset / "test.h5").read(0)
     write_split(dataset / "test.h5", [Trajectory(run.position, run.particle_type, {}, {"noise": np.zeros(99)})])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
@@ -39,10 +40,12 @@ class VtpSeries(TrajectoryWriter):
         return collection
 
     def obstacle(self, path: Path) -> str:
-        folder = path.with_suffix("")
-        if folder.is_file() or (folder.is_dir() and any(file.suffix != ".vtp" for file in folder.iterdir())):
-            return f"its frames would replace {folder}, which is not a folder of .vtp files."
-        return file_obstacle(path.with_suffix(".pvd"))
+        folder, collection = path.with_suffix(""), path.with_suffix(".pvd")
+        names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
+        is_series = collection.is_file() and all(re.fullmatch(r"\d{6,}\.vtp", name) for name in names)
+        if folder.is_file() or (names and not is_series):
+            return f"its frames would replace {folder}, which is not such a series; choose another name."
+        return file_obstacle(collection)
 
 
 def vtp(frame: Frame) -> bytes:

@@ -159,7 +159,7 @@ def test_what_cannot_be_written_is_refused_first(tmp_path):
     for name, message in (
         ("out.xyz", r"--out .*out.xyz: nothing is written by that suffix; there are .h5, .vtkhdf, .vtp, .usda"),
         ("out", "nothing is written by that suffix"),
-        ("out.vtp", "its frames would replace .*out, which is not a folder of .vtp files"),
+        ("out.vtp", "its frames would replace .*out, which is not such a series"),
         ("missing/out.csv", "does not exist; create it first"),
     ):
         with pytest.raises(ConfigError, match=message):
