@@ -228,6 +228,13 @@ def test_the_roundest_number_of_an_interval(low, high, expected):
     assert roundest(low, high) == expected
 
 
+@pytest.mark.parametrize("frames", [2, 4])
+def test_recordings_of_a_few_frames_have_facts(frames):
+    finder = FactFinder(2)
+    finder.add(Trajectory(np.random.default_rng(0).random((frames, 5, 2)).astype("f4"), np.zeros(5, np.int64)))
+    assert finder.facts().sequence_length.value == frames - 1
+
+
 def test_absent_particles_everywhere_are_an_error():
     with pytest.raises(DataError, match="no trajectory has a particle"):
         FactFinder(2).facts()

@@ -11,14 +11,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from nmpm._support.bounded_files import check_regular, read_bounded
+from nmpm._support.bounded_files import check_regular, expansion_limit, read_bounded
 from nmpm._support.messages import one_line
 from nmpm.data.convert.frame import Frame
 from nmpm.data.convert.frame_files import FrameFormat
 from nmpm.errors import ConfigError, DataError
 
 _LIST_BYTES = 2**26
-_HEADER_BYTES = 4096
+_HEADER_BYTES = 2**16
 _POINT_BYTES = 6  # "0 0 0 "
 _TIMES = ("timevalue", "time")
 
@@ -57,8 +57,7 @@ def _read(path: Path, time: float | None) -> Frame:
     except ImportError as error:
         raise ConfigError(f'{path}: reading VTK needs pyvista: pip install "nmpm[vtk]".') from error
     legacy = path.suffix.lower() == ".vtk"
-    if legacy:
-        _check_size(path)
+    _check_size(path)
     reader = vtkGenericDataObjectReader() if legacy else vtkXMLGenericDataObjectReader()
     if legacy:
         for switch in ("Scalars", "Vectors", "Normals", "Tensors", "TCoords", "Fields"):
@@ -126,12 +125,18 @@ def _messages() -> Iterator[Any]:
 
 
 def _check_size(path: Path) -> None:
-    """Refuses a legacy file that declares more points than fit into it, before vtk takes memory for them."""
+    """Refuses a file that declares more points or cells than fit into it: for lack of memory vtk ends the process."""
+    size = path.stat().st_size
     with path.open("rb") as file:
-        declared = re.search(rb"^POINTS\s+(\d{1,18})", file.read(_HEADER_BYTES), re.MULTILINE | re.IGNORECASE)
-    count, size = int(declared.group(1)) if declared else 0, path.stat().st_size
-    if count * _POINT_BYTES > size:
-        raise DataError(f"{path}: it declares {count:,} points but has only {size:,} bytes. Is it complete?")
+        start = file.read(_HEADER_BYTES)
+    if path.suffix.lower() == ".vtk":
+        most, declared = size // _POINT_BYTES, re.findall(rb"^POINTS\s+(\d{1,18})", start, re.MULTILINE)
+    else:
+        most, declared = expansion_limit(size) // _POINT_BYTES, re.findall(rb'NumberOf\w+="\s*(-?\d{1,18})', start)
+    counts = [int(number) for number in declared]
+    if counts and not 0 <= min(counts) <= max(counts) <= most:
+        wrong = min(counts) if min(counts) < 0 else max(counts)
+        raise DataError(f"{path}: it declares {wrong:,} points or cells but has {size:,} bytes. Is it complete?")
 
 
 def _entries(path: Path) -> list[tuple[Path, float]]:

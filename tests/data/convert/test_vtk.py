@@ -77,7 +77,12 @@ def replace_by_grid(path: Path) -> None:
 
 
 def declare_more(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b"POINTS 7", b"POINTS 700000000"))
+    for few, many in ((b"POINTS 7", b"POINTS 700000000"), (b'OfPoints="7"', b'OfPoints="700000000"')):
+        path.write_bytes(path.read_bytes().replace(few, many))
+
+
+def declare_fewer_than_none(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b'OfPoints="7"', b'OfPoints="-7"'))
 
 
 @pytest.mark.parametrize(
@@ -87,9 +92,11 @@ def declare_more(path: Path) -> None:
         (".vtk", cut, r"cannot be read as VTK \(.*\). Is it complete\?"),
         (".vtu", lambda path: path.write_bytes(b""), r"cannot be read as VTK \(.*\). Is it complete\?"),
         (".vtk", replace_by_grid, "it has a StructuredPoints; particles are points"),
-        (".vtk", declare_more, "it declares 700,000,000 points but has only"),
+        (".vtk", declare_more, "it declares 700,000,000 points or cells but has"),
+        (".vtp", declare_more, "it declares 700,000,000 points or cells but has"),
+        (".vtu", declare_fewer_than_none, "it declares -7 points or cells but has"),
     ],
-    ids=["vtp", "vtk", "empty", "grid", "size"],
+    ids=["vtp", "vtk", "empty", "grid", "size", "XML size", "negative"],
 )
 @pytest.mark.parametrize("frame", [1, T - 1])
 def test_damaged_files_are_named(tmp_path, capfd, suffix, damage, message, frame):
