@@ -138,17 +138,17 @@ class PaddedRecordings:
         scene, each = row[:, None, None], column[:, None]
         there = real[:, None] & (nearest == frame[:, :, None])
         return Window(
-            frames=self.frames[scene, nearest, each],
+            frames=_take(self.frames, scene, nearest, each),
             material=self.material[row[:, None], column],
             mask=real,
             obstacle=self.obstacle[row],
             obstacle_mask=self.obstacle_mask[row],
             gravity=self.gravity[row],
             fields={
-                name: values[scene, nearest if values.shape[1] > 1 else 0, each if values.shape[2] > 1 else 0]
+                name: _take(values, scene, nearest if values.shape[1] > 1 else 0, each if values.shape[2] > 1 else 0)
                 for name, values in self.fields.items()
             },
-            present=there if self.present is None else there & self.present[scene, nearest, each],
+            present=there if self.present is None else there & _take(self.present, scene, nearest, each),
             volume=None if self.volume is None else self.volume[row[:, None], column],
         )
 
@@ -189,6 +189,13 @@ def displacements(frames: Tensor, scene: Scene) -> Tensor:
             period, along = high - low, steps[..., axis]
             along -= torch.round(along / period) * period
     return steps
+
+
+def _take(values: Tensor, row: Tensor, frame: Tensor | int, column: Tensor | int) -> Tensor:
+    """Entries of (S, T, N, …) values at indices that broadcast; several times as fast as indexing by three tensors."""
+    index = (row * values.shape[1] + frame) * values.shape[2] + column
+    taken: Tensor = values.flatten(0, 2).index_select(0, index.flatten()).unflatten(0, index.shape)
+    return taken
 
 
 def _stack_fields(recordings: Sequence[Recording]) -> dict[str, Tensor]:
