@@ -52,7 +52,7 @@ def test_what_cannot_be_is_refused(dataset, tmp_path, words, message, capsys):
 def test_the_source_is_never_replaced(dataset, capsys):
     for source, destination in ((dataset, f"{dataset}.vtp"), (dataset / "test.h5", dataset / "test.h5")):
         assert main(["convert", str(source), str(destination)]) == 1
-        assert "it would replace" in capsys.readouterr().err.replace("its frames would", "it would")
+        assert "would replace" in capsys.readouterr().err
 
 
 def test_fields_that_a_form_cannot_hold_are_named(dataset, capsys):
