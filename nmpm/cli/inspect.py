@@ -40,7 +40,7 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["inspect", "ramps"]."""
     parser = argparse.ArgumentParser(
         prog="nmpm inspect",
-        description="Summarise a dataset on one screen, list suspicious values, and draw its first trajectory.",
+        description="Summarise a dataset on one screen, what contradicts itself first, and draw its first trajectory.",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )

@@ -131,7 +131,7 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
             advance()
     if not np.isfinite(measured.observed.lower).all():
         raise DataError(f"{data.source.folder}: none of its trajectories could be read. {problems[0].sentence}")
-    findings = [*problems, *checks.compare(), *find_shared_runs(splits, metadata, spacing), *checks.findings]
+    findings = [*problems, *find_shared_runs(splits, metadata, spacing), *checks.result()]
     if len(samples[first]) == len(splits[first]):  # stated are those of the whole first split
         differences = find_disagreements(statistics.result(), metadata.extra)
         findings += [Finding("statistics", Severity.ODDITY, sentence) for sentence in differences]

@@ -19,7 +19,8 @@ _RESOLUTIONS = 1.3  # factor between spacings
 _FINE = 1000.0  # roundings of coordinates in a spacing
 _WALL_LAYER = 0.025  # of the bounds: positions beyond it are not in a wall layer
 _TOO_LARGE, _FAR_TOO_LARGE = 3.0, 10.0  # times the extent of all positions
-_FEW_BOUNCES = 3
+_FEW_BOUNCES = 5
+_SOLID = 2.0  # spacings from an end
 _STILL_SHARE = 0.01  # of the particles of a type
 _SAME_END = 2.0  # spacings between the ends of trajectories that end at the same wall
 _END_SHARE = 0.4  # of the trajectories that end at a wall
@@ -28,8 +29,8 @@ _BEYOND = 0.1  # of the extent, beyond such a wall
 _WALL_NAMES = ("wall", "boundary", "static", "obstacle", "fixed", "frozen")
 
 
-def compare_time_steps(steps: Mapping[str, float]) -> Iterator[Finding]:
-    """Yields a finding if time steps, by trajectory, differ; they may have any unit, which is the same for all."""
+def compare_time_steps(steps: Mapping[str, float], what: str) -> Iterator[Finding]:
+    """Yields a finding if time steps, by trajectory and in any unit, differ; `what` names them."""
     if not steps:
         return
     values = np.array(list(steps.values()))
@@ -42,7 +43,7 @@ def compare_time_steps(steps: Mapping[str, float]) -> Iterator[Finding]:
     yield Finding(
         "mixed time steps",
         Severity.CONTRADICTION,
-        f"the time step of {many} of {len(values)} trajectories differs from the others', e.g. in {list(steps)[odd]} it"
+        f"the {what} of {many} of {len(values)} trajectories differs from the others', e.g. in {list(steps)[odd]} it"
         f" is {ratios[odd]:.3g} times as long. Make a dataset of each, or leave frames out.",
         factor=float(ratios[odd]),
     )
@@ -127,40 +128,46 @@ def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterato
         )
 
 
-def check_boundary(
-    metadata: Metadata, crossings: np.ndarray, wraps: np.ndarray, bounces: np.ndarray
+def check_crossings(metadata: Metadata, crossings: np.ndarray) -> Iterator[Finding]:
+    """Yields a finding if particles cross walls: (D,) steps from one end of all positions to the other."""
+    crossed = (crossings >= FEW_CROSSINGS) & ~np.asarray(metadata.periodic)
+    if crossed.any():
+        yield Finding(
+            "boundary",
+            Severity.CONTRADICTION,
+            f"along {_axes(crossed)} it is stated as not periodic, but {int(crossings.sum())} times a particle leaves"
+            f" at one end and is at the other. {correction('--boundary ' + _boundary(metadata, crossed, 'periodic'))}",
+        )
+
+
+def check_periods(
+    metadata: Metadata, wraps: np.ndarray, bounces: np.ndarray, walls: Extent, spacing: float
 ) -> Iterator[Finding]:
-    """Yields a finding if particles cross walls, or never cross the ends of periodic axes.
+    """Yields a finding if particles never cross the ends of a periodic axis, but turn back from them.
 
     Args:
         metadata: As stated.
-        crossings: (D,) steps that lead from one end of all positions to the other, on axes that do not wrap.
-        wraps: (D,) the same on axes that wrap.
-        bounces: (D,) particles that would cross an end of a periodic axis in the next step, but stay.
+        wraps: (D,) number of steps across the ends.
+        bounces: (D, 2) how often particles turn back from the lower and the upper end.
+        walls: Of static particles; where these are at the ends, a model may do without the wall.
+        spacing: Distance of particles.
     """
-    crossed = (crossings >= FEW_CROSSINGS) & ~np.asarray(metadata.periodic)
-    bounced = (wraps == 0) & (bounces >= _FEW_BOUNCES) & np.asarray(metadata.periodic)
-    for axes, stated, what, kind in (
-        (
-            crossed,
-            "not periodic",
-            f"{int(crossings.sum())} times a particle leaves at one end and is at the other",
-            "periodic",
-        ),
-        (
-            bounced,
-            "periodic",
-            f"nobody ever crosses the ends, and {int(bounces.sum())} times a particle turns there",
-            "wall",
-        ),
-    ):
-        if axes.any():
-            right = ",".join(kind if axis else old for axis, old in zip(axes, metadata.boundary, strict=True))
-            yield Finding(
-                "boundary",
-                Severity.CONTRADICTION,
-                f"along {_axes(axes)} it is stated as {stated}, but {what}. {correction(f'--boundary {right}')}",
-            )
+    lower, upper = np.asarray(metadata.bounds).T
+    solid = (walls.lower < lower + _SOLID * spacing) | (walls.upper > upper - _SOLID * spacing)
+    closed = (wraps == 0) & (bounces.sum(axis=1) >= _FEW_BOUNCES)
+    if closed.any():
+        yield Finding(
+            "boundary",
+            Severity.ODDITY if solid[closed].all() else Severity.CONTRADICTION,
+            f"along {_axes(closed)} it is stated as periodic, but nobody ever crosses the ends, and"
+            f" {int(bounces.sum())} times a particle turns back there."
+            f" {correction('--boundary ' + _boundary(metadata, closed, 'wall'))}",
+        )
+
+
+def _boundary(metadata: Metadata, axes: np.ndarray, kind: str) -> str:
+    """The stated kinds of boundaries, but on some (D,) axes another one."""
+    return ",".join(kind if axis else old for axis, old in zip(axes, metadata.boundary, strict=True))
 
 
 def check_precision(spacing: float, rounding: float, extent: Extent) -> Iterator[Finding]:
@@ -199,8 +206,8 @@ def check_types(metadata: Metadata, still: Mapping[int, int], moving: Mapping[in
         yield Finding(
             "walls that are predicted",
             Severity.CONTRADICTION,
-            f"type {', '.join(f'{i}, {names[i]},' for i in walls)} moves and counts as a material. If its motion is"
-            " prescribed, name it in prescribed_types of metadata.json.",
+            f"type {', '.join(f'{i}, {names[i]},' for i in walls)} moves and counts as a material. If it is an obstacle"
+            f" that moves as recorded: nmpm convert FOLDER NEW --prescribed {','.join(map(str, walls))}.",
         )
 
 

@@ -30,15 +30,17 @@ class DatasetChecks:
     def __init__(self, metadata: Metadata) -> None:
         self.metadata = metadata
         self.trajectories = 0
-        self.findings: list[Finding] = []  # about single trajectories
-        self._steps: dict[bool, dict[str, float]] = {True: {}, False: {}}  # time steps: recorded, or from free fall
+        self._findings: list[Finding] = []  # about single trajectories
+        self._recorded_steps: dict[str, float] = {}  # time steps by trajectory
+        self._steps_of_fall: dict[str, float] = {}
         self._spacings: dict[str, tuple[float, float]] = {}
         self._extents: dict[str, np.ndarray] = {}
         self._stays: dict[str, np.ndarray] = {}
         self._extent, self._walls = Extent(metadata.dim), Extent(metadata.dim)  # of moving and static particles
         self.spacing, self._rounding = math.inf, 0.0
         self._frames, self._still, self._moving = Counter[int](), Counter[int](), Counter[int]()
-        self._crossings, self._wraps, self._bounces = np.zeros((3, metadata.dim), dtype=int)
+        self._crossings, self._wraps = np.zeros((2, metadata.dim), dtype=int)
+        self._bounces = np.zeros((metadata.dim, 2), dtype=int)
 
     def add(self, trajectory: Trajectory, where: str) -> None:
         """Adds a trajectory with its fields, called `where`."""
@@ -50,19 +52,21 @@ class DatasetChecks:
             return
         self._extent.add(motion.position)
         if disorder := list(find_disorder(motion)):  # then everything else that would be found means nothing
-            self.findings += disorder
+            self._findings += disorder
             return
-        self.findings += [*find_odd_particles(motion), *find_irregular_motion(motion), *find_noise(motion)]
+        irregular = list(find_irregular_motion(motion))
+        self._findings += [*find_odd_particles(motion), *irregular, *(() if irregular else find_noise(motion))]
         try:
-            self.findings += check_stated(motion)
+            self._findings += check_stated(motion)
             self._measure(motion)
         except DataError:  # a wrong attribute, which is named elsewhere
             return
 
     def _measure(self, motion: Motion) -> None:
-        dt = recorded_dt(motion) or _dt_of_fall(motion)
-        if dt is not None:
-            self._steps[recorded_dt(motion) is not None][motion.where] = dt
+        if (recorded := recorded_dt(motion)) is not None:
+            self._recorded_steps[motion.where] = recorded
+        elif (dt := _dt_of_fall(motion)) is not None:
+            self._steps_of_fall[motion.where] = dt
         if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
             later = spacing_of(motion.position[len(motion.position) // 2], self.metadata)
             self._spacings[motion.where] = motion.spacing, later or motion.spacing
@@ -76,13 +80,20 @@ class DatasetChecks:
         self._wraps += motion.wraps
         self._bounces += motion.bounces
 
-    def compare(self) -> list[Finding]:
-        """Findings about all trajectories together."""
+    def result(self) -> list[Finding]:
+        """Findings about all trajectories together, then about single ones."""
+        mixed = [
+            *comparisons.compare_time_steps(self._recorded_steps, "recorded time step"),
+            *comparisons.compare_time_steps(self._steps_of_fall, "time step, or gravity,"),
+        ]
+        kinds = ("dt",) if mixed else ()  # that of some trajectories is right
+        return [*mixed, *self._compare(), *(each for each in self._findings if each.kind not in kinds)]
+
+    def _compare(self) -> list[Finding]:
         findings: list[Finding] = []
-        for steps in self._steps.values():
-            findings += comparisons.compare_time_steps(steps)
         findings += comparisons.check_precision(self.spacing, self._rounding, self._extent)
-        findings += comparisons.check_boundary(self.metadata, self._crossings, self._wraps, self._bounces)
+        findings += comparisons.check_crossings(self.metadata, self._crossings)
+        findings += comparisons.check_periods(self.metadata, self._wraps, self._bounces, self._walls, self.spacing)
         findings += comparisons.check_types(self.metadata, self._still, self._moving)
         findings += comparisons.compare_spacings(self._spacings)
         findings += comparisons.compare_domains(self._extents, self._stays, self.spacing)

@@ -15,6 +15,8 @@ from nmpm.data.statistics import displacements, without_those_gone
 _NEIGHBOURS = 8
 _QUERIES = 2000
 _CROSSING = 0.8  # of the extent of all positions
+_NEAR = 1.5  # spacings
+_OUTWARD = 0.02  # spacings in a frame: slower particles may just come to rest
 _RESTLESS = 0.2  # likewise: particles whose typical step is longer do not cross ends, they are anywhere
 
 
@@ -112,13 +114,14 @@ class Motion:
 
     @cached_property
     def bounces(self) -> np.ndarray:
-        """(D,) number of steps after which a particle on its way across an end of a periodic axis is still within."""
-        counts = np.zeros(self.metadata.dim, dtype=int)
+        """(D, 2) how often particles near the lower or upper end of a periodic axis turn back from it, or stop."""
+        counts = np.zeros((self.metadata.dim, 2), dtype=int)
         for axis in np.flatnonzero(self.metadata.periodic):
-            lower, upper = self.metadata.bounds[axis]
-            x = self.position[..., axis]
-            ahead, inside = x[1:-1] + self.step[:-1, :, axis], (x >= lower) & (x <= upper)
-            counts[axis] = (((ahead < lower) | (ahead > upper)) & inside[1:-1] & inside[2:]).sum()
+            x, step = self.position[1:-1, :, axis], self.step[..., axis]
+            for end, bound in enumerate(self.metadata.bounds[axis]):
+                outward = step if end else -step
+                near = np.abs(x - bound) < _NEAR * self.spacing
+                counts[axis, end] = (near & (outward[:-1] > _OUTWARD * self.spacing) & (outward[1:] <= 0)).sum()
         return counts
 
     @cached_property

@@ -49,7 +49,8 @@ def find_moving_walls(motion: Motion) -> Iterator[Finding]:
         yield Finding(
             "moving walls",
             Severity.CONTRADICTION,
-            f"it moves, though its type {types[mover]}, {name}, is static.",
+            f"it moves, though its type {types[mover]}, {name}, is static. If it is an obstacle that moves as recorded:"
+            f" nmpm convert FOLDER NEW --prescribed {types[mover]}.",
             motion.where,
             f"particle {mover}",
         )

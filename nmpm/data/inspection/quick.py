@@ -59,7 +59,7 @@ def find_contradictions(source: FolderSource) -> tuple[Finding, ...]:
             complete &= len(trajectory.position) == split.frames(index)
             checks.add(trajectory, f"{name} {split.names[index]}")
     shared = find_shared_runs(splits, source.metadata, checks.spacing, _COMPARED)
-    merged = merge_findings([*checks.compare(), *shared, *checks.findings], checks.trajectories)
+    merged = merge_findings([*shared, *checks.result()], checks.trajectories)
     left_out = frozenset[str]() if complete else _NEED_ALL_FRAMES
     return tuple(
         finding for finding in merged if finding.severity == Severity.CONTRADICTION and finding.kind not in left_out
