@@ -23,6 +23,8 @@ PER_AXIS, MINUTES, GROWTH = 2.6, 15.0, 0.13
 """Particles per occupied cell and axis for a training of so many minutes; fewer by this power of the minutes."""
 LEAST_CELLS = {1: 32, 2: 32, 3: 16}
 """Along the longest side, by dimension: walls, and gaps between bodies, are lost on coarser grids."""
+LEAST_ACROSS, LEAST_PER_CELL = 16, 1.4
+"""Along the shortest side, where occupied cells have so many particles then: water on a wide floor has a depth, too."""
 MOST_CELLS = 512
 MOST_SPEED = 2.5
 """Cells per frame that all but the fastest 0.1% of particles should stay below."""
@@ -32,6 +34,7 @@ TRAINING_SHARE = 0.8
 """Of a training's time that its steps take; validations take the rest."""
 MEMORY_SHARE = 0.7
 """Of the free memory that a training may take."""
+_OBLONG = 0.125  # of a cell's width, by which it may be longer along one axis
 _FINEST, _COARSEST, _CANDIDATES = 1.25, 8.0, 12  # spacings of particles to a cell
 _CELL_SECONDS = {1: 1.6e-9, 2: 4.7e-9, 3: 12.5e-9}  # of a core, by dimension; times width²
 _PARTICLE_SECONDS, _STEP_SECONDS = 2e-6, 0.02  # the latter of the optimizer
@@ -139,8 +142,10 @@ def recommended_cells(grids: Sequence[GridFacts], particles: int, machine: Machi
         enough = grid.cells >= LEAST_CELLS[dim] and grid.high_speed <= MOST_SPEED
         return enough and cost.fits and cost.steps >= LEAST_STEPS
 
-    coarsest = [grid for grid in grids if grid.cells >= LEAST_CELLS[dim]] or list(grids)
-    fitting = [grid for grid in grids if suits(grid)] or [min(coarsest, key=lambda grid: grid.cells)]
+    suitable = [grid for grid in grids if suits(grid)]
+    wide = [grid for grid in suitable if min(grid.shape) >= LEAST_ACROSS and grid.per_cell >= LEAST_PER_CELL]
+    enough = [grid for grid in grids if grid.cells >= LEAST_CELLS[dim]] or list(grids)
+    fitting = wide or suitable or [min(enough, key=lambda grid: grid.cells)]
     return min(fitting, key=lambda grid: abs(math.log(max(grid.per_cell, 1.0) / target))).cells
 
 
@@ -155,11 +160,16 @@ def candidates(domain: Sequence[Interval], spacing: float) -> tuple[int, ...]:
 
 
 def grid_shape(domain: Sequence[Interval], periodic: Sequence[bool], cells: int) -> tuple[int, ...]:
-    """Cells along each axis for so many along the longest side: as square as they can be, and enough for the U-Net."""
-    sides = [high - low for low, high in domain]
-    numbers = [cells * side / max(sides) for side in sides]
-    whole = [round(n / MULTIPLE) * MULTIPLE if wraps else round(n) for n, wraps in zip(numbers, periodic, strict=True)]
-    return tuple(max(n, MULTIPLE) for n in whole)
+    """Cells along each axis for so many along the longest side: square, or nearly so where that saves padding."""
+    longest = max(high - low for low, high in domain)
+    numbers = [cells * (high - low) / longest for low, high in domain]
+    return tuple(_whole_cells(number, wraps) for number, wraps in zip(numbers, periodic, strict=True))
+
+
+def _whole_cells(number: float, wraps: bool) -> int:
+    multiple = round(number / MULTIPLE) if wraps else math.floor(number / MULTIPLE)
+    fewer = max(multiple, 1) * MULTIPLE
+    return fewer if wraps or number <= fewer * (1 + _OBLONG) else round(number)
 
 
 def padded_cells(shape: Sequence[int]) -> int:

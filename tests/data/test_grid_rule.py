@@ -41,6 +41,13 @@ def test_memory_bounds_grids_in_three_dimensions():
     assert recommended_cells(cube, 2000, Machine(slowness=0.01, memory=2e9)) == 24
 
 
+def test_slim_boxes_have_cells_across():
+    slim = facts({40: 5.0, 56: 2.3, 72: 1.55, 88: 1.3}, lambda n: (n // 5, n, n // 5), speed=0.02)
+    assert recommended_cells(slim, 2000, Machine(slowness=0.1)) == 40  # 16 across would leave 1.3 to a cell
+    slim = facts({40: 5.0, 56: 2.3, 80: 1.5}, lambda n: (n // 5, n, n // 5), speed=0.02)
+    assert recommended_cells(slim, 2000, Machine(slowness=0.1)) == 80
+
+
 def test_candidates_are_multiples_of_eight_around_the_spacing():
     numbers = candidates(BOX, 0.00714)
     assert all(number % 8 == 0 for number in numbers)
@@ -53,3 +60,4 @@ def test_shapes_are_square_and_periodic_axes_multiples_of_eight():
     assert grid_shape(((0.0, 1.0), (0.0, 0.38)), (True, False), 32) == (32, 12)
     assert grid_shape(((0.0, 1.0), (0.0, 0.38)), (False, True), 32) == (32, 16)
     assert grid_shape(((0.0, 9.0), (0.0, 0.5)), (False, False), 64) == (64, 8)
+    assert grid_shape(((0.0, 9.0), (0.0, 2.5)), (False, False), 64) == (64, 16)  # 17.8, which would be padded to 24
