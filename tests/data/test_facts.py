@@ -180,6 +180,21 @@ class TestTypes:
         (still,) = facts.unmoving
         assert (still.trajectory, still.particle, still.count) == (0, 0, 3)
 
+    def test_rigid_bodies_that_fall_or_differ_between_trajectories_are_free(self, rng):
+        def run(shift):
+            fluid = thrown(rng, (0.0, -2.0), frames=40)
+            return np.concatenate([fluid, rng.uniform(4, 5, (1, 20, 2)) + shift], axis=1)
+
+        types, time = np.repeat([0, 7], [144, 20]), 0.1 * np.arange(40)[:, None, None]
+        falling = time**2 * [0, -1.0]
+        assert facts_of(run(falling), types=types).prescribed_types.value == frozenset()
+        differing = [run(np.sin(phase + time) * [0, 1.0]) for phase in (0.0, 1.0)]
+        fact = facts_of(*differing, types=types).prescribed_types
+        assert fact.value == frozenset()
+        assert "type 7 is rigid" in fact.how
+        paddles = [run(np.sin(time) * [0, 1.0]) for _ in range(2)]
+        assert facts_of(*paddles, types=types).prescribed_types.value == {7}
+
     def test_nothing_is_static_where_nothing_moves(self, rng):
         facts = facts_of(np.repeat(block(rng)[None], 5, axis=0))
         assert facts.static_types.value == facts.prescribed_types.value == frozenset()
@@ -228,11 +243,14 @@ def test_the_roundest_number_of_an_interval(low, high, expected):
     assert roundest(low, high) == expected
 
 
-@pytest.mark.parametrize("frames", [2, 4])
-def test_recordings_of_a_few_frames_have_facts(frames):
-    finder = FactFinder(2)
-    finder.add(Trajectory(np.random.default_rng(0).random((frames, 5, 2)).astype("f4"), np.zeros(5, np.int64)))
-    assert finder.facts().sequence_length.value == frames - 1
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("particles", [1, 2, 50])
+def test_few_frames_and_particles_suffice(rng, frames, particles):
+    position = rng.uniform(size=(frames, particles, 2))
+    position[-1, 1:] = np.nan
+    facts = facts_of(position, time=np.arange(frames))
+    assert all(low < high for low, high in facts.bounds.value)
+    assert facts.gravity.value is None
 
 
 def test_absent_particles_everywhere_are_an_error():

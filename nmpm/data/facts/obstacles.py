@@ -11,6 +11,8 @@ from nmpm.data.facts.fact import Fact, Unmoving
 _STILL = 1e-3  # of the spacing: particles that move less never move
 _MOVES = 0.5  # of the spacing: half of the particles move more where a trajectory moves
 _RIGID = 1e-2  # of the spacing, by which particles of a rigid body may be off
+_SAME = 0.1  # of the spacing, by which motions of one program may differ
+_START = 6  # frames in which free bodies fall as others do
 _FRAMES, _PARTICLES = 12, 200  # in which a rigid motion is fitted
 _MOST = 100  # of a list
 
@@ -67,24 +69,48 @@ class TypeMotion:
 
 
 def prescribed_fact(positions: Mapping[int, Sequence[np.ndarray]], spacing: float) -> Fact[frozenset[int]]:
-    """The types whose particles move as one rigid body, of positions (F, N, D) in each trajectory by type.
+    """The types whose particles move as one rigid body by a program, in positions (F, N, D) of each trajectory by type.
 
-    It is none if all types do: a rigid body alone is what is to be predicted.
+    A program is the same in all trajectories, or goes on at a constant speed; a body that falls as others do is free.
+    None is prescribed if all types are rigid: a rigid body alone is what is to be predicted.
     """
-    rigid = frozenset(
-        kind for kind, paths in positions.items() if paths and all(_is_rigid(each, spacing) for each in paths)
-    )
+    rigid = {kind for kind, paths in positions.items() if paths and all(_is_rigid(each, spacing) for each in paths)}
     if not rigid or len(rigid) == len(positions):
         return Fact(frozenset(), "no type moves as a rigid body among others that do not.", "measured")
-    names = ", ".join(map(str, sorted(rigid)))
-    how = f"the particles of type {names} turn and shift as one in every trajectory, those of other types do not."
-    return Fact(rigid, how, "likely")
+    others = [path for kind, paths in positions.items() if kind not in rigid for path in paths]
+    prescribed = frozenset(kind for kind in rigid if _has_program(positions[kind], others, spacing))
+    free = ", ".join(map(str, sorted(rigid - prescribed)))
+    names = ", ".join(map(str, sorted(prescribed)))
+    parts = [f"the particles of type {names} turn and shift as one, those of others do not"] if names else []
+    parts += (
+        [f"type {free} is rigid, and taken for free bodies: it falls, or differs between trajectories"] if free else []
+    )
+    return Fact(prescribed, f"{'; '.join(parts)}.", "likely")
+
+
+def _has_program(paths: Sequence[np.ndarray], others: Sequence[np.ndarray], spacing: float) -> bool:
+    """Whether bodies (F, N, D) move as others never would: see `prescribed_fact`."""
+    centres = [np.nanmean(path, axis=1) for path in paths]
+    shifts = [centre - centre[0] for centre in centres]
+    length = min(map(len, shifts))
+    same = all(np.abs(shift[:length] - shifts[0][:length]).max() < _SAME * spacing for shift in shifts)
+    steady = all(np.abs(np.diff(centre, 2, axis=0)).max(initial=0.0) < _RIGID * spacing for centre in centres)
+    if len(centres) > 1 and not (same or steady):
+        return False
+    start = np.mean([np.diff(centre[:_START], 2, axis=0).mean(axis=0) for centre in centres], axis=0)
+    falls = np.concatenate([np.diff(other[:_START], 2, axis=0).reshape(-1, len(start)) for other in others])
+    falls = falls[np.isfinite(falls).all(axis=1)]
+    if steady or not len(falls):
+        return True
+    fall = np.median(falls, axis=0)
+    size = float(np.linalg.norm(fall))
+    return size < _STILL / 10 * spacing or float(np.linalg.norm(start - fall)) > _SAME * size
 
 
 def _is_rigid(position: np.ndarray, spacing: float) -> bool:
     points = position[:, np.isfinite(position).all(axis=(0, 2))][:, :_PARTICLES]
-    if points.shape[1] <= points.shape[2] + 1:
-        return False  # any motion of few particles is almost rigid
+    if points.shape[1] <= points.shape[2] + 1 or len(points) < _START:
+        return False  # any motion of few particles in few frames is almost rigid
     rounding = 8 * float(np.finfo(np.float32).eps) * float(np.abs(points).max())
     frames = np.unique(np.linspace(0, len(points) - 1, _FRAMES).astype(int))[1:]
     errors = [_rigid_error(points[0], points[frame]) for frame in frames]

@@ -48,6 +48,6 @@ def _track_ends(position: np.ndarray) -> np.ndarray:
     """The last positions (K, D) of particles that are then absent for five frames, or until the end."""
     present = np.isfinite(position).all(axis=2)
     ends = present[:-1].copy()
-    for later in range(1, min(_GONE, len(present) - 1) + 1):
+    for later in range(1, min(_GONE, len(ends)) + 1):
         ends[: len(present) - later] &= ~present[later:]
     return np.asarray(position[:-1][ends], np.float64)
