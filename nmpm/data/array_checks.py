@@ -58,21 +58,22 @@ def check_positions(position: np.ndarray, where: str, first_frame: int) -> None:
 
 
 def check_end(position: np.ndarray, where: str) -> None:
-    """Raises a DataError, naming the first of these frames, if (T, N, D) positions end in frames without any particle.
+    """Raises a DataError, naming the frame, if the particles of (T, N, D) positions vanish at once and for good.
 
-    A particle that is absent from some frame on has left, or its simulation has diverged; of all particles at once only
-    the latter is likely.
+    A particle that is absent from some frame on has left, or its simulation has diverged; of half of them or more in
+    the same frame only the latter is likely.
     """
     if not np.isnan(position[-1, :, 0]).all():
         return
-    inhabited = np.flatnonzero(~np.isnan(position[..., 0]).all(axis=1))
-    if not len(inhabited):
+    count = position.shape[1] - np.isnan(position[..., 0]).sum(axis=1)
+    if not count.any():
         raise DataError(f"{where}: no particle is there in any frame, all positions are NaN. Remove the trajectory.")
-    frame = int(inhabited[-1]) + 1
-    raise DataError(
-        f"{where}: all positions are NaN from frame {frame} on; the simulation seems to have diverged. Cut the"
-        f" trajectory before that frame: position[:{frame}]."
-    )
+    frame = int(np.flatnonzero(count)[-1]) + 1
+    if 2 * count[frame - 1] >= count.max():
+        raise DataError(
+            f"{where}: all positions are NaN from frame {frame} on; the simulation seems to have diverged. Cut the"
+            f" trajectory before that frame: position[:{frame}]."
+        )
 
 
 def check_axes(position: np.ndarray, particles: int | None, where: str) -> None:

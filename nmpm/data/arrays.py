@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm.data.array_checks import check_axes
+from nmpm.data.array_checks import check_axes, check_end
 from nmpm.data.convert.base import make_options
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.convert.runs_in_memory import Runs, open_runs
@@ -88,6 +88,7 @@ def _check_trajectories(trajectories: Runs, scene: Scene, path: Path, lengths: l
         trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
         position, types = trajectory.position, np.unique(trajectory.particle_type)
         check_axes(position, position.shape[1] if isinstance(item, Trajectory) else None, where)
+        check_end(position, where)
         if position.shape[2] != scene.dim:
             raise DataError(f"{where} has {position.shape[2]} axes, the scene has {scene.dim}.")
         if types.min() < 0 or types.max() >= kinds:

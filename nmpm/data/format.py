@@ -19,7 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm.data.array_checks import CORE, check_arrays, check_end, check_field, check_positions
+from nmpm.data.array_checks import CORE, check_arrays, check_field, check_positions
 from nmpm.data.hdf5 import (
     FILTERS,
     check_self_contained,
@@ -83,11 +83,7 @@ class Trajectory:
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
-    """Writes trajectories, in order, into one file; equal trajectories give equal bytes.
-
-    Raises:
-        DataError: if there are none, writing fails, or one ends in frames without any particle.
-    """
+    """Writes trajectories, in order, into one file; equal trajectories give equal bytes."""
     # The earliest format has no time stamps in groups.
     with writable_hdf5(Path(path), libver=("earliest", "v108")) as (file, check_written):
         add_trajectories(file, trajectories, check_written, Path(path))
@@ -99,7 +95,6 @@ def add_trajectories(
     """As `write_split`, into an empty HDF5 file that `writable_hdf5` has opened."""
     count = 0
     for count, trajectory in enumerate(trajectories, start=1):
-        check_end(trajectory.position, f"{path}, trajectory {count - 1:05d}")
         _write_trajectory(file.create_group(f"{count - 1:05d}"), trajectory)
         check_written()
     if not count:
@@ -223,8 +218,7 @@ class Split:
         """Reads the frames from `start` up to `stop` (to the end when None) of a trajectory, without its fields.
 
         Raises:
-            DataError: if they cannot be read, a position is infinite or NaN in some coordinates only, or the whole
-                trajectory is read and ends in frames without any particle.
+            DataError: if they cannot be read, or a position is infinite or NaN in some coordinates only.
         """
         name = self._entries[index].name  # an IndexError ends iterations, within `open_hdf5` it would be a DataError
         with open_hdf5(self.path) as file:
@@ -233,8 +227,6 @@ class Split:
             particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
             attributes = dict(group.attrs)
         check_positions(position, self.where(index), first_frame=start)
-        if start == 0 and stop is None:
-            check_end(position, self.where(index))
         return Trajectory(position, particle_type, attributes)
 
     @cached_property

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from nmpm.data.array_checks import check_end
 from nmpm.data.format import Split, Trajectory, read_metadata, split_paths, write_split
 from nmpm.errors import DataError
 
@@ -159,13 +160,16 @@ def test_absent_particles_are_nan_in_all_coordinates(tmp_path):
 def test_a_trajectory_that_ends_without_particles_has_diverged(file, last, message):
     with h5py.File(file, "a") as opened:
         opened["00000/position"][last + 1 :] = np.nan
-    with pytest.raises(DataError, match=message):
-        Split(file).read(0)
-    assert np.isnan(Split(file).read(0, 5, 6).position).all()
-    position = Split(file).read(1).position
-    position[last + 1 :] = np.nan
-    with pytest.raises(DataError, match=f"trajectory 00000.*{message}"):
-        write_split(file.parent / "valid.h5", [Trajectory(position, np.zeros(6, int))])
+    position = Split(file).read(0).position
+    with pytest.raises(DataError, match=f"run 1: .*{message}"):
+        check_end(position, "run 1")
+
+
+def test_particles_that_leave_one_by_one_have_not_diverged():
+    position = np.ones((8, 5, 2), np.float32)
+    for particle in range(5):
+        position[particle + 2 :, particle] = np.nan
+    check_end(position, "run 1")
 
 
 def test_recorded_lennard_jones(recorded):

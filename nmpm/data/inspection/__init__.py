@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from nmpm._support.progress import progress_bar
+from nmpm.data.array_checks import check_end
 from nmpm.data.facts import FOUND
 from nmpm.data.fields import FieldFacts, Kind, add_fields
 from nmpm.data.format import Metadata, Split
@@ -117,6 +118,8 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
             split = splits[name]
             try:
                 trajectory = split.read_with_fields(index)
+                moving = metadata.is_moving(trajectory.particle_type)
+                check_end(trajectory.position[:, moving], split.where(index))
                 stored = {key: values.shape for key, values in trajectory.fields.items()}
                 shapes = shapes or stored
                 sizes = (split.frames(index), split.particles(index))

@@ -71,10 +71,11 @@ class RecordingReader:
         moving, obstacle = self.check(trajectory, where)
         self._check_rest(trajectory, where)
         gravity = trajectory_gravity(trajectory.attributes, self.scene, where) or (0.0,) * self.scene.dim
-        position = without_those_gone(trajectory.position[:, moving], self.scene)
+        position = trajectory.position[:, moving]
+        check_end(position, where)
+        position = without_those_gone(position, self.scene)
         presence = Presence.of(position)
         if presence is not None:
-            check_end(position, where)
             presence.check(where)
             moving[moving] = presence.ever
             position = presence.fill(position[:, presence.ever])
@@ -257,7 +258,10 @@ class SplitRecordings(Sequence[Recording]):
         for index in self.indices:
             check_times(self.split.time(index), self.split.where(index))
             for frame in sorted({0, self.split.frames(index) - 1}):
-                self.reader.check(self.split.read(index, frame, frame + 1), self.split.where(index), frame)
+                ends = self.split.read(index, frame, frame + 1)
+                moving, _ = self.reader.check(ends, self.split.where(index), frame)
+            if np.isnan(ends.position[:, moving]).all():
+                check_end(self.split.read(index).position[:, moving], self.split.where(index))
 
     def with_frames(self, least: int, purpose: str) -> SplitRecordings:
         """Those of the trajectories that have enough frames; a warning counts the others.

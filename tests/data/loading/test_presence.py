@@ -149,6 +149,8 @@ def test_recordings_without_a_velocity_or_an_end_are_named(folder):
     write_split(folder / "train.h5", [made_up_trajectory(8, 3), Trajectory(position, np.array([7, 7, 3]))])
     with pytest.raises(DataError, match="trajectory 00001: all positions are NaN from frame 7 on"):
         recordings[1]
+    with pytest.raises(DataError, match="trajectory 00001: all positions are NaN from frame 7 on"):
+        recordings.check_ends()
     position[7, :2] = 0.5
     write_split(
         folder / "train.h5",
