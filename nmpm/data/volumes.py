@@ -7,7 +7,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nmpm.data.format import Metadata, Split
+from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.hdf5 import check_stored_size, open_hdf5
 
 SIZES = ("volume", "radius", "diameter", "size")
@@ -42,9 +42,25 @@ def volumes(split: Split, index: int, metadata: Metadata) -> np.ndarray | None:
             stored = group.get(name)
             if isinstance(stored, h5py.Dataset) and stored.shape in ((particles,), (frames, particles)):
                 check_stored_size(stored, f"{split.where(index)}: {name}")
-                values = _constant(stored)
-                return values if values is None or name == "volume" else values**metadata.dim
+                return _volumes_of(name, stored, metadata.dim)
     return None
+
+
+def relative_volumes(trajectory: Trajectory, moving: np.ndarray) -> np.ndarray | None:
+    """(N',) volumes of the (N,) `moving` particles over their mean; None where all are alike or no field has them."""
+    frames, particles, dim = trajectory.position.shape
+    sizes = {name: values for name, values in trajectory.fields.items() if name in SIZES}
+    fitting = [name for name in SIZES if name in sizes and sizes[name].shape in ((particles,), (frames, particles))]
+    values = _volumes_of(fitting[0], sizes[fitting[0]], dim) if fitting else None
+    if values is None or not (values[moving] > 0).all():
+        return None
+    values = values[moving]
+    return values / values.mean() if values.max() > _VARIES * values.min() else None
+
+
+def _volumes_of(name: str, sizes: Any, dim: int) -> np.ndarray | None:
+    values = _constant(sizes)
+    return values if values is None or name == "volume" else values**dim
 
 
 def _constant(stored: Any) -> np.ndarray | None:

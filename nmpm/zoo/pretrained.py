@@ -131,7 +131,7 @@ class Pretrained:
             model.rollout(model.start(data.test[0]), frames=100)
 
         Velocities are those from the frame before, obstacles are taken apart, and particles that are absent in one of
-        these two frames are left out.
+        these two frames are left out. Sizes of particles are relative to the mean of those that are there.
 
         Args:
             trajectory: From `nmpm.load_trajectories`, which knows the names of its types; one made of arrays suffices

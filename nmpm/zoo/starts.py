@@ -13,6 +13,7 @@ from nmpm._support.messages import suggestion
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.statistics import displacements
+from nmpm.data.volumes import relative_volumes
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Particles
 
@@ -46,6 +47,7 @@ def state_of(
         obstacle=pair[1, obstacle] if obstacle.any() else None,
         gravity=_gravity(model, trajectory, metadata),
         fields=_fields(model, trajectory, frame, moving),
+        volume=relative_volumes(trajectory, moving),
     )
     if not model.scene.moving_obstacles or not obstacle.any():
         return state

@@ -46,6 +46,16 @@ def test_data_of_another_time_step_have_the_same_velocity_in_seconds(model):
     torch.testing.assert_close(state.velocity[0, :, 0], torch.full((4,), 0.001), atol=1e-6, rtol=0)
 
 
+def test_fields_and_sizes_of_particles_are_taken_along():
+    model = model_of(dataclasses.replace(SCENE, evolving=("heat",), parameters=("angle",)))
+    heat, radius = np.arange(30.0).reshape(5, 6), np.array([1.0, 1.0, 2.0, 2.0, 1.0, 1.0])
+    trajectory = dataclasses.replace(recorded(), fields={"heat": heat, "radius": radius}, attributes={"angle": 0.5})
+    state = model.start(trajectory, frame=4)
+    assert state.fields["heat"].tolist() == [heat[4, :4].tolist()]
+    assert state.fields["angle"].tolist() == [[0.5]]
+    torch.testing.assert_close(state.volume, torch.tensor([[0.4, 0.4, 1.6, 1.6]]))
+
+
 def test_materials_of_other_names_are_refused_unless_stated(model):
     trajectory = recorded(particle_types={0: "sand", 1: "watr", 2: "wall"})
     with pytest.raises(DataError, match=r"has watr, the model water, sand\. Did you mean water\?.*materials="):
