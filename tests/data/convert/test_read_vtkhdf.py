@@ -49,9 +49,9 @@ def own_file(path: Path, dim: int = 2) -> Trajectory:
     """Two dimensions, a particle that is absent for a while, a number per particle."""
     position = positions(dim)
     position[1:3, 2] = np.nan
-    fields = {"velocity": 2 * positions(dim), "mass": np.arange(N) + 0.5}
+    fields = {"velocity": 2 * positions(dim), "mass": np.arange(N) + 0.5, "time": 0.25 * np.arange(T)}
     trajectory = Trajectory(position, np.arange(N) % 3, {}, fields)
-    write_viewable(path, [trajectory], dt=0.25)
+    write_viewable(path, [trajectory])
     return trajectory
 
 
