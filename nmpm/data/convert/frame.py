@@ -183,7 +183,9 @@ def _vectors(values: np.ndarray, axes: Sequence[int]) -> np.ndarray | None:
 
 def _take_components(arrays: dict[str, np.ndarray], axes: Sequence[int]) -> np.ndarray | None:
     """Removes a velocity that is stored as an array per axis, and returns it (N, D)."""
-    scalars = {plain_name(name): name for name, values in arrays.items() if values.ndim == 1}
+    scalars = {
+        plain_name(name): name for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "iuf"
+    }
     for components in map(str.split, _COMPONENTS):
         if all(components[axis] in scalars for axis in axes):
             columns = {axis: arrays.pop(scalars[name]) for axis, name in enumerate(components) if name in scalars}

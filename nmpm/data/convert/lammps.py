@@ -94,6 +94,8 @@ def _header(lines: Lines) -> _Header | None:
             count = int(lines.next())
         elif line.startswith("ITEM: BOX BOUNDS"):
             flags = tuple(word for word in line.split()[3:] if len(word) == 2 and set(word) <= set("pfsm"))
+            if len(flags) not in (0, len(AXES)):
+                raise ValueError(f"line {lines.number} has {len(flags)} boundaries, not one for each of three axes")
             box = [_interval(lines.next()) for _ in AXES]
         elif line.startswith("ITEM: UNITS"):
             lines.next()
@@ -126,6 +128,8 @@ def _frame(header: _Header, block: Sequence[bytes], where: str) -> Frame:
         )
     names = [axis + end for axis in AXES if axis + end in columns]
     position = np.stack([columns.pop(name) for name in names], axis=1)
+    if position.dtype.kind != "f":
+        raise DataError(f"{where}: the columns {' '.join(names)} must contain numbers.")
     if end.startswith("s"):
         low, high = np.array(header.box[: len(names)]).T
         position = low + position * (high - low)

@@ -108,7 +108,10 @@ def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.
         raise ValueError("an empty line among those of particles")
     columns = {names[index]: values[:, column] for column, index in enumerate(numbers)}
     for index in texts:
-        columns[names[index]] = np.array([line.split(None, index + 1)[index] for line in lines]).astype(str)
+        words = [line.split(None, index + 1)[index : index + 1] for line in lines]
+        if not all(words):
+            raise ValueError(f"a line has no column {names[index]}")
+        columns[names[index]] = np.array([word for (word,) in words]).astype(str)
     return columns
 
 

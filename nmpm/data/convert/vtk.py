@@ -66,6 +66,8 @@ def _read(path: Path, time: float | None) -> Frame:
     with _messages() as window:
         reader.Update()
         output, problems = reader.GetOutput(), window.GetOutput()
+    # What is no UTF-8 comes as bytes.
+    problems = problems.decode("utf-8", "replace") if isinstance(problems, bytes) else problems
     if output is None or re.search("error", problems, re.IGNORECASE):
         lines = [re.sub(r"^vtk\w+ \(0x\w+\): ", "", line) for line in problems.splitlines()]
         reason = next((line for line in lines if "rror" in line), "it is damaged")

@@ -47,7 +47,7 @@ def _blocks(lines: Lines) -> Iterator[tuple[str, list[bytes]]]:
         start = lines.number - 1
         if not line.strip():
             continue
-        if not line.strip().isdigit():
+        if not line.strip().isdecimal():
             raise ValueError(f"line {lines.number} is {one_line(line, 60)!r}; expected the number of particles")
         yield lines.next(), lines.block(int(line), start)
 
@@ -72,7 +72,7 @@ def _frame(comment: str, block: Sequence[bytes], where: str) -> Frame:
 def _columns(properties: str) -> list[tuple[str, int]]:
     """Names and widths of the columns that `Properties` lists."""
     words = properties.split(":")
-    if len(words) % 3 or not all(width.isdigit() for width in words[2::3]) or "pos" not in words[::3]:
+    if len(words) % 3 or not all(width.isdecimal() and int(width) for width in words[2::3]) or "pos" not in words[::3]:
         raise ValueError(f"Properties={one_line(properties, 60)} does not list names, kinds and widths, or has no pos")
     return [(name, int(width)) for name, width in zip(words[::3], words[2::3], strict=True)]
 
@@ -81,7 +81,7 @@ def _plain_columns(block: Sequence[bytes]) -> list[tuple[str, int]]:
     """Names and widths of the columns of plain XYZ."""
     width = len(block[0].split()) if block else 4
     rest = [("velocity", 3)] if width == 7 else [(f"column{index}", 1) for index in range(5, width + 1)]
-    return [("type", 1), ("pos", min(width - 1, 3)), *rest]
+    return [("type", 1), ("pos", max(1, min(width - 1, 3))), *rest]
 
 
 def _join(columns: Sequence[np.ndarray]) -> np.ndarray:
