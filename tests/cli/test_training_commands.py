@@ -134,8 +134,12 @@ def test_the_console_shows_the_run_and_the_users_warnings_alone(make_dataset):
     run = subprocess.run(
         [sys.executable, "-m", "nmpm", *shown], capture_output=True, text=True, check=True, env=environment
     )
-    assert "look out" in run.stderr
-    assert len(run.stderr.splitlines()) <= 2  # the warning and its line of code
+    contradiction, shared, advice, *others = run.stderr.splitlines()
+    assert contradiction == "Warning: these data contradict themselves:"
+    assert shared.startswith("  - shared trajectories: train and valid: 1 of 1 trajectories are the same")
+    assert "nmpm inspect" in advice
+    assert "look out" in others[0]
+    assert len(others) <= 2  # the warning and its line of code
     lines = run.stdout.replace("\r", "\n").splitlines()
     assert lines.pop(0).startswith("Data: dataset. Model: UNet, ")
     assert computes_bfloat16(torch.device("cpu")) or lines.pop(0).startswith("bfloat16 is emulated ")
