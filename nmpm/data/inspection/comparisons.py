@@ -23,6 +23,8 @@ _FEW_BOUNCES = 5
 _SOLID = 2.0  # spacings from an end
 _STILL_SHARE = 0.01  # of the particles of a type
 _SAME_END = 2.0  # spacings between the ends of trajectories that end at the same wall
+_SAME_PART = 0.03  # of the extent, at most
+_FEW_ENDS = 3
 _END_SHARE = 0.4  # of the trajectories that end at a wall
 _STAYS = 0.3  # of the frames: particles are at a wall
 _BEYOND = 0.1  # of the extent, beyond such a wall
@@ -84,9 +86,9 @@ def compare_domains(
     for axis, end in np.ndindex(values.shape[1:]):
         outward, staying = values[:, axis, end] * (1 if end else -1), near[:, axis, end]
         wall = float(np.median(outward))
-        share = ((np.abs(outward - wall) < _SAME_END * spacing) & staying).mean()
+        same = (np.abs(outward - wall) < min(_SAME_END * spacing, _SAME_PART * sizes[axis])) & staying
         beyond = staying & (outward - wall > max(_BEYOND * sizes[axis], 2 * _SAME_END * spacing))
-        if share > _END_SHARE and beyond.any():
+        if same.sum() >= _FEW_ENDS and same.mean() > _END_SHARE and beyond.any():
             odd = int(np.argmax(np.where(beyond, outward, -np.inf)))
             yield Finding(
                 "different domains",

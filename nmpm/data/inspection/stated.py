@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from nmpm.data.facts import FOUND
 from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection.findings import Finding, Severity
@@ -158,7 +159,8 @@ def _is_earth(gravity: Sequence[float] | np.ndarray) -> bool:
 def check_volume(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if the stated particle volume is far from that of the densest of some frames."""
     stated, dim = motion.metadata.particle_volume, motion.metadata.dim
-    if stated is None or len(motion.index) < _LEAST_PARTICLES:
+    measured = "particle_volume" in motion.metadata.extra.get(FOUND, {})  # in these trajectories
+    if stated is None or measured or len(motion.index) < _LEAST_PARTICLES:
         return
     frames = np.unique(np.linspace(0, len(motion.position) - 1, _VOLUME_FRAMES).astype(int))
     spacings = [spacing_of(motion.position[frame], motion.metadata) for frame in frames]

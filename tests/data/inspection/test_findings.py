@@ -11,6 +11,7 @@ import pytest
 
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 from nmpm.data.inspection import inspect
+from nmpm.data.inspection.comparisons import compare_domains
 from nmpm.data.inspection.findings import Finding, Severity, merge_findings
 from nmpm.data.inspection.quick import contradictions_warning
 from nmpm.data.loading.sources import FolderSource
@@ -264,3 +265,12 @@ def test_particles_that_come_and_go_are_noted(data, tmp_path):
     (note,) = data.findings(tmp_path)
     assert note.severity == Severity.NOTE
     assert "1 of 100 particles come" in note.sentence
+
+
+def test_a_trajectory_in_a_larger_box_is_named():
+    box, stays = np.array([[0.0, 1.0], [0.0, 0.7]]), np.ones((2, 2))
+    extents = {f"train {index}": box + 0.001 * index for index in range(4)}
+    assert not list(compare_domains(extents, dict.fromkeys(extents, stays), SPACING))
+    extents["train 4"] = box * 1.5
+    (finding,) = compare_domains(extents, dict.fromkeys(extents, stays), SPACING)
+    assert "in 1 of 5 trajectories particles stay at x = 1.5, e.g. in train 4" in finding.sentence
