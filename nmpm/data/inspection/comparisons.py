@@ -111,7 +111,7 @@ def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterato
     axis = int(np.argmax(beyond))
     if beyond[axis] > 0:
         serious = beyond[axis] > _WALL_LAYER
-        mend = f" {correction(f'--bounds {_option(extent.intervals)}')}" if serious else " The domain contains them."
+        mend = f" {correction(f'--bounds={_option(extent.intervals)}')}" if serious else " The domain contains them."
         yield Finding(
             "bounds",
             Severity.CONTRADICTION if serious else Severity.NOTE,
